@@ -1,0 +1,39 @@
+# The service alone: no torch, no compiler, no package installer in the last stage.
+#   docker build -t streetfix .
+#   docker run --read-only --tmpfs /tmp -p 127.0.0.1:8000:8000 -v "$PWD/maps:/maps:ro" streetfix
+
+FROM python:3.11-slim AS build
+WORKDIR /src
+# The locked packages first: they change less often than the code.
+COPY locks/service.txt locks/service.txt
+RUN python -m venv --without-pip /opt/streetfix \
+ && pip --python /opt/streetfix/bin/python install --no-cache-dir --only-binary :all: --require-hashes \
+    --requirement locks/service.txt
+COPY pyproject.toml README.md LICENSE ./
+COPY service service
+COPY model_training model_training
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels . \
+ && pip --python /opt/streetfix/bin/python install --no-cache-dir --no-deps --no-index /wheels/*.whl
+
+FROM python:3.11-slim
+LABEL org.opencontainers.image.title="streetfix" \
+      org.opencontainers.image.description="Where is this robot? Street and pose from one RGB and one depth picture." \
+      org.opencontainers.image.licenses="Apache-2.0"
+RUN python -m pip uninstall --yes pip setuptools wheel \
+ && useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin streetfix \
+ && mkdir /maps
+COPY --from=build /opt/streetfix /opt/streetfix
+ENV PATH=/opt/streetfix/bin:$PATH \
+    PYTHONDONTWRITEBYTECODE=1 \
+    PYTHONUNBUFFERED=1 \
+    STREETFIX_MAPS=/maps \
+    STREETFIX_PORT=8000
+USER 10001:10001
+WORKDIR /tmp
+VOLUME ["/maps"]
+EXPOSE 8000
+STOPSIGNAL SIGTERM
+HEALTHCHECK --interval=10s --timeout=3s --start-period=20s --retries=3 \
+  CMD ["python", "-c", "import os, urllib.request as r; r.urlopen('http://127.0.0.1:' + os.environ['STREETFIX_PORT'] + '/readyz', timeout=2)"]
+# Inside a container every address is the container's own; publish the port to loopback or a private network.
+CMD ["streetfix", "serve", "--host", "0.0.0.0"]

@@ -1,0 +1,100 @@
+"""The baseline that learns nothing: nearest neighbour on the range images themselves, at its best setting.
+
+Four ways to compare a query's range view with the map's: L2 of the log ranges over cells that both measured; the same with
+a penalty for cells that one measured and the other did not; cosine of the masked log ranges; cosine after each view's mean
+is taken off. The best of them is what an honest comparison must beat.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.build import BuildSettings, view_ranges
+from service.errors import NoDepthError
+from service.imaging.query_view import query_view
+from service.imaging.view_grid import ViewGrid
+from service.maps.reader import MapBundle
+
+Ranges = NDArray[np.float32]
+SETTINGS = ("masked_l2", "masked_l2_gaps", "cosine", "cosine_centred")
+GAP_PENALTY = 0.15
+CHUNK = 2048
+
+
+def _features(ranges: Ranges) -> tuple[Ranges, Ranges]:
+    """Log range against 10 m, 0 where nothing was measured, and the mask: both (n, cells)."""
+    flat = ranges.reshape(len(ranges), -1).astype(np.float32)
+    mask = (flat > 0).astype(np.float32)
+    return np.log(np.maximum(flat, 0.5) / 10.0).astype(np.float32) * mask, mask
+
+
+def similarities(queries: Ranges, views: Ranges) -> dict[str, Ranges]:
+    """Similarity (Q, V) of range views (Q, rows, columns) and (V, rows, columns) by every setting; larger is nearer."""
+    q, mq = _features(queries)
+    v, mv = _features(views)
+    cells = q.shape[1]
+    both = mq @ mv.T
+    square = (q * q) @ mv.T + mq @ (v * v).T - 2 * q @ v.T
+    l2 = square / np.maximum(both, 1)
+    l2[both < 0.1 * cells] = 1e3
+    gaps = (mq.sum(axis=1)[:, None] + mv.sum(axis=1)[None] - 2 * both) / cells
+
+    def unit(x: Ranges) -> Ranges:
+        return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-6)
+
+    def centred(x: Ranges, mask: Ranges) -> Ranges:
+        return (x - (x.sum(axis=1) / np.maximum(mask.sum(axis=1), 1))[:, None]) * mask
+
+    return {
+        "masked_l2": -l2,
+        "masked_l2_gaps": -(l2 + GAP_PENALTY * gaps),
+        "cosine": unit(q) @ unit(v).T,
+        "cosine_centred": unit(centred(q, mq)) @ unit(centred(v, mv)).T,
+    }
+
+
+def raw_best_views(
+    bundle: MapBundle, dataset: Dataset, names: list[str], *, report: Callable[[str, int, int], None] = lambda *_: None
+) -> dict[str, NDArray[np.int64]]:
+    """Number of the best place of every query of the sets, by every setting; -1 where a query measures nothing."""
+    queries, usable = _query_ranges(bundle, dataset, names)
+    best = {name: np.full(len(usable), -1, np.int64) for name in SETTINGS}
+    score = {name: np.full(len(usable), -np.inf, np.float32) for name in SETTINGS}
+    settings = BuildSettings(
+        name=bundle.name, spacing_m=bundle.manifest.spacing_m, headings=bundle.manifest.headings,
+        expected_lidar_height_m=bundle.manifest.lidar_height_m, remove_weather=bool(bundle.manifest.parameters["weather_removed"]),
+    )  # fmt: skip
+    waiting: list[Ranges] = []
+    first = 0
+    total = bundle.manifest.counts.places
+    for place, fan in enumerate(view_ranges(dataset, settings, bundle.grid, bundle.rows_seen), 1):
+        waiting.append(fan)
+        report("raw range images", place, total)
+        if len(waiting) * len(fan) >= CHUNK or place == total:
+            views = np.concatenate(waiting)
+            for name, similarity in similarities(queries[usable], views).items():
+                at = similarity.argmax(axis=1)
+                top = similarity[np.arange(len(at)), at]
+                better = top > score[name][usable]
+                rows = np.flatnonzero(usable)[better]
+                score[name][rows] = top[better]
+                best[name][rows] = first + at[better] // len(fan)
+            first, waiting = place, []
+    return best
+
+
+def _query_ranges(bundle: MapBundle, dataset: Dataset, names: list[str]) -> tuple[Ranges, NDArray[np.bool_]]:
+    grid: ViewGrid = bundle.grid
+    rows, usable = [], []
+    for name in names:
+        for frame in dataset.queries(name):
+            try:
+                view = query_view(frame.rgb(), frame.depth_m(), frame.camera.pinhole(), grid=grid, rows_seen=bundle.rows_seen)
+                rows.append(view.planes[0])
+                usable.append(True)
+            except NoDepthError:
+                rows.append(np.zeros((grid.rows, grid.columns), np.float32))
+                usable.append(False)
+    return np.stack(rows), np.array(usable)

@@ -1,0 +1,41 @@
+"""``streetfix build-map``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from model_training.cli.progress import bars
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.build import BuildSettings, build_map, describe
+from model_training.stock import ENCODER
+
+
+def command(
+    dataset: Annotated[Path, typer.Argument(help="dataset folder with a survey")],
+    out: Annotated[Path, typer.Option(help="folder of the bundle")],
+    encoder: Annotated[Path, typer.Option(help="ONNX file of `streetfix export` [default: the stock encoder]")] = ENCODER,
+    name: Annotated[str, typer.Option(help="how requests address the map [default: the dataset's name]")] = "",
+    spacing: Annotated[float, typer.Option(help="travelled metres between places")] = 1.0,
+    headings: Annotated[int, typer.Option(help="views of each place; the stock encoder was trained for 24")] = 24,
+    voxel: Annotated[float, typer.Option(help="edge of the cloud's voxels, metres")] = 0.3,
+    lidar_height: Annotated[float, typer.Option(help="of the LiDAR above the ground, roughly, metres")] = 1.8,
+    remove_weather: Annotated[bool, typer.Option(help="drop lone points such as rain and snow by local PCA")] = False,
+    licence: Annotated[str, typer.Option(help="licence text kept in the manifest")] = "",
+    overwrite: Annotated[bool, typer.Option(help="replace a bundle that is there")] = False,
+) -> None:
+    """Build a map bundle of a dataset's survey.
+
+    Example:
+
+      streetfix build-map data/paper --out maps/paper-city
+    """
+    opened = Dataset(dataset)
+    settings = BuildSettings(
+        name=name or opened.name, spacing_m=spacing, headings=headings, voxel_m=voxel, expected_lidar_height_m=lidar_height,
+        remove_weather=remove_weather, licence=licence,
+    )  # fmt: skip
+    with bars() as report:
+        manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)
+    Console().print(f"{describe(manifest)}: {out}")

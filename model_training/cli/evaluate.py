@@ -1,0 +1,92 @@
+"""``streetfix evaluate``."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from model_training.baselines.raw_range import raw_best_views
+from model_training.cli.progress import bars
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.evaluate import evaluate, write_trajectory
+from model_training.evaluation.measures import RIGHT_PLACE_M
+from service.errors import DatasetError
+from service.maps.reader import MapBundle
+
+SHOWN = (
+    ("queries", "queries", "{:d}"), ("localized", "answered", "{:.2%}"), ("street_accuracy", "street right", "{:.2%}"),
+    ("mean_distance_error_m", "mean error", "{:.3f} m"), ("median_distance_error_m", "median error", "{:.3f} m"),
+    ("p95_distance_error_m", "95th percentile", "{:.3f} m"), ("rms_distance_error_m", "RMS error", "{:.3f} m"),
+    ("mse_m2", "MSE", "{:.3f} m2"), ("within_0_5_m", "within 0.5 m", "{:.2%}"), ("within_1_m", "within 1 m", "{:.2%}"),
+    ("within_5_m", "within 5 m", "{:.2%}"), ("recall_at_1_5m", "R@1 at 5 m", "{:.2%}"), ("recall_at_5_5m", "R@5 at 5 m", "{:.2%}"),
+    ("recall_at_10_5m", "R@10 at 5 m", "{:.2%}"), ("raw_recall_at_1_5m", "raw range image R@1", "{:.2%}"),
+    ("median_heading_error_deg", "median heading error", "{:.2f} deg"), ("ms_per_query", "time per query", "{:.1f} ms"),
+)  # fmt: skip
+
+
+def command(
+    bundle: Annotated[Path, typer.Argument(help="map bundle")],
+    dataset: Annotated[Path, typer.Argument(help="dataset with query sets that have truth")],
+    queries: Annotated[list[str] | None, typer.Option(help="query set; repeat for several [default: all with truth]")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write all figures here")] = None,
+    raw_baseline: Annotated[bool, typer.Option("--raw-baseline", help="compare with the raw range image's nearest neighbour")] = False,
+    trajectory: Annotated[Path | None, typer.Option(help="write the answered poses in TUM format (one query set)")] = None,
+    predictions: Annotated[Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")] = None,
+    workers: Annotated[int, typer.Option(help="queries at a time")] = 2,
+) -> None:
+    """Measure a map against queries whose truth is known.
+
+    Example:
+
+      streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
+    """
+    opened, data = MapBundle.open(bundle), Dataset(dataset)
+    with bars() as report:
+        result = evaluate(opened, data, queries, workers=workers, report=report)
+        figures = result.figures
+        if trajectory is not None and len(result.predictions) != 1:
+            raise DatasetError(f"trajectory: one query set is wanted, not {len(result.predictions)}: name it by --queries", field="queries")
+        if raw_baseline:
+            _add_raw(figures, opened, data, list(result.predictions), report)
+    if trajectory is not None:
+        write_trajectory(trajectory, next(iter(result.predictions.values())))
+    if predictions is not None:
+        predictions.mkdir(parents=True, exist_ok=True)
+        for name, answers in result.predictions.items():
+            answers.save(predictions / f"{name}.npz")
+    if json_file is not None:
+        part = json_file.with_name(json_file.name + ".part")
+        part.write_text(json.dumps(figures, indent=1) + "\n")
+        part.rename(json_file)
+    Console().print(_table(figures))
+
+
+def _add_raw(figures: dict[str, Any], bundle: MapBundle, dataset: Dataset, names: list[str], report: Any) -> None:
+    """The raw range image's R@1 at its best setting, which is named."""
+    truth = np.concatenate([np.array([f.T_map_camera[:2, 3] for f in dataset.queries(n) if f.T_map_camera is not None]) for n in names])
+    xy = bundle.T_map_place[:, :2, 3]
+    recalls = {}
+    for setting, place in raw_best_views(bundle, dataset, names, report=report).items():
+        right = (place >= 0) & (np.linalg.norm(xy[np.maximum(place, 0)] - truth, axis=1) <= RIGHT_PLACE_M)
+        recalls[setting] = float(right.mean())
+    best = max(recalls, key=lambda name: recalls[name])
+    figures["raw_recall_at_1_5m"] = recalls[best]
+    figures["raw"] = {"best_setting": best, "recall_at_1_5m": recalls}
+
+
+def _table(figures: dict[str, Any]) -> Table:
+    table = Table(title=f"{figures['dataset']} on map {figures['map']['name']} {figures['map']['version']}")
+    columns = [("all", figures), *figures["sets"].items()] if len(figures["sets"]) > 1 else [*figures["sets"].items()]
+    table.add_column("")
+    for name, values in columns:
+        table.add_column(f"{name}\n{values['split'].replace('_', ' ')}", justify="right")
+    merged = [values | {k: v for k, v in figures.items() if k.startswith("raw") and len(columns) == 1} for _, values in columns]
+    for key, label, form in SHOWN:
+        cells = [form.format(v[key]) if v.get(key) is not None else "-" for v in merged]
+        if any(cell != "-" for cell in cells):
+            table.add_row(label, *cells)
+    return table

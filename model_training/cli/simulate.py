@@ -1,0 +1,91 @@
+"""``streetfix simulate``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from model_training.cli.progress import bars
+from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
+from model_training.simulation.simulate import simulate
+from service.errors import DatasetError
+
+EXAMPLE = """Simulate a city, its LiDAR survey and RGB-D query drives into a dataset folder.
+
+Examples:
+
+  streetfix simulate --city paper --table1 --drives 5 --depth precise --depth stereo --out data/paper
+
+  streetfix simulate --seed 9001 --queries 334 --out data/unseen1
+
+An interrupted run goes on where it stopped. Same seed, same bytes, for any number of workers.
+"""
+
+
+def command(
+    out: Annotated[Path, typer.Option(help="folder to write the dataset to")],
+    city: Annotated[str, typer.Option(help="paper: the paper's nine streets; city: another city for each seed")] = "city",
+    seed: Annotated[int, typer.Option(help="decides everything that is random")] = 0,
+    name: Annotated[str, typer.Option(help="name of the dataset [default: that of the folder]")] = "",
+    size: Annotated[str, typer.Option(help="extent of a random city, metres")] = "300x400",
+    streets: Annotated[str, typer.Option(help="drive only these streets, e.g. 1,5,between")] = "",
+    lidar: Annotated[str, typer.Option(help="paper_32, vlp_16, hdl_64 or os1_128")] = "paper_32",
+    spacing: Annotated[float, typer.Option(help="metres between scans")] = 1.0,
+    queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none")] = 200,
+    drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light")] = 1,
+    table1: Annotated[bool, typer.Option("--table1", help="as many queries of each class as the paper's Table I (626)")] = False,
+    on_track: Annotated[int, typer.Option(help="queries at the survey's own poses too: the paper's split, which leaks")] = 0,
+    depth: Annotated[list[str] | None, typer.Option(help="ideal, precise or stereo; repeat for several [default: precise]")] = None,
+    condition: Annotated[str, typer.Option(help="of the query drives: clear, rain, snow, fog, night or low_sun")] = "clear",
+    survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
+    survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
+    parked_changed: Annotated[float, typer.Option(help="share of parking slots that differ from drive to drive")] = 0.5,
+    aside: Annotated[float, typer.Option(help="how far queries may be beside the survey's lane, metres")] = 2.0,
+    heading: Annotated[float, typer.Option(help="how far queries may look off the street's axis, degrees")] = 15.0,
+    turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees")] = 0.0,
+    pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees")] = 0.0,
+    blocked: Annotated[float, typer.Option(help="share of the columns that a lorry right ahead hides")] = 0.0,
+    max_depth: Annotated[float | None, typer.Option(help="cut depth at this, metres")] = None,
+    camera: Annotated[str, typer.Option(help="picture size in pixels")] = "640x480",
+    hfov: Annotated[float, typer.Option(help="horizontal field of view, degrees")] = 90.0,
+    workers: Annotated[int | None, typer.Option(help="processes [default: one a core]")] = None,
+) -> None:
+    """See ``EXAMPLE``, which the command line shows."""
+    depths = tuple(depth or ["precise"])
+    plans = []
+    if queries or table1:
+        plans = [
+            QueryPlan(
+                name=f"drive{k}", traversal=k, count=max(1, queries), per_class=table1, depths=depths, condition=condition,
+                parked_changed=parked_changed, aside_m=aside, heading_deg=heading, turn_deg=turn, pitch_deg=pitch,
+                blocked=blocked, max_depth_m=max_depth,
+            )
+            for k in range(1, drives + 1)
+        ]  # fmt: skip
+    if on_track:
+        plans.append(QueryPlan(name="survey_drive", traversal=0, count=on_track, on_track=True, depths=depths))
+    width, height = _pair(camera, "camera")
+    plan = SimulationPlan(
+        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size"),
+        streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
+        survey_error=survey_error, camera=CameraPlan(width=int(width), height=int(height), horizontal_deg=hfov),
+        queries=tuple(plans),
+    )  # fmt: skip
+    if city not in ("paper", "city"):
+        raise DatasetError(f"city: {city!r} is neither 'paper' nor 'city'", field="city")
+    with bars() as report:
+        simulate(plan, out, workers=workers, report=report)
+    Console().print(f"dataset {plan.name}: {out}")
+
+
+command.__doc__ = EXAMPLE
+
+
+def _pair(text: str, field: str) -> tuple[float, float]:
+    parts = text.lower().split("x")
+    try:
+        first, second = (float(part) for part in parts)
+    except ValueError as error:
+        raise DatasetError(f"{field}: {text!r} is not two numbers with an x between, such as 640x480", field=field) from error
+    return first, second

@@ -1,0 +1,53 @@
+"""``streetfix train``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from model_training.cli.progress import bars
+from model_training.training.loop import Progress, TrainingConfig, train
+from model_training.training.packs import make_packs
+from model_training.training.recipe import paper_plans, stock_plans
+from service.errors import DatasetError
+from service.imaging.view_grid import ViewGrid
+
+
+def command(
+    run: Annotated[Path, typer.Option(help="folder of the run: configuration, checkpoint, TensorBoard log")],
+    recipe: Annotated[str, typer.Option(help="stock: many cities; paper: the paper's city itself")] = "stock",
+    cities: Annotated[int, typer.Option(help="cities of the stock recipe")] = 24,
+    packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
+    steps: Annotated[int, typer.Option(help="optimiser steps")] = 4000,
+    pairs: Annotated[int, typer.Option(help="pairs of views a step")] = 128,
+    optimiser: Annotated[str, typer.Option(help="adamw, or sgdm (the paper's)")] = "adamw",
+    rate: Annotated[float, typer.Option(help="highest learning rate")] = 2e-3,
+    seed: Annotated[int, typer.Option(help="of everything that is drawn")] = 0,
+    start_from: Annotated[Path | None, typer.Option(help="run whose weights to start from")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+    workers: Annotated[int | None, typer.Option(help="processes that simulate [default: one a core]")] = None,
+) -> None:
+    """Simulate training cities and train an encoder on them; Ctrl-C saves, the same command goes on.
+
+    Example, the stock encoder:
+
+      streetfix train --run runs/stock && streetfix export runs/stock --out encoder.onnx
+    """
+    if recipe not in ("stock", "paper"):
+        raise DatasetError(f"recipe: {recipe!r} is neither 'stock' nor 'paper'", field="recipe")
+    config = TrainingConfig.model_validate(
+        {"steps": steps, "pairs": pairs, "optimiser": optimiser, "learning_rate": rate, "seed": seed}
+    )
+    plans = stock_plans(cities) if recipe == "stock" else paper_plans()
+    grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
+    with bars() as report:
+        folders = make_packs(plans, packs, grid, workers=workers, report=report)
+
+        def show(progress: Progress) -> None:
+            stage = f"loss {progress.loss:.2f} {progress.accuracy:4.0%} {progress.images_per_s:.0f}/s"
+            report("training", progress.step, progress.steps)
+            report.describe("training", stage)
+
+        train(folders, run, config, device=device, start_from=start_from, report=show)
+    Console().print(f"trained: {run}; next: streetfix export {run} --out encoder.onnx")

@@ -1,0 +1,262 @@
+"""The dataset folder: what ``simulate`` and ``import`` write, and ``build-map`` and ``evaluate`` read.
+
+Frames are read one at a time; nothing here loads a whole drive.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_from
+from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
+
+FORMAT = 1
+Transforms = NDArray[np.float64]  # (n, 4, 4)
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class LidarSensor(_Model):
+    """A LiDAR of the survey."""
+
+    name: str
+    channels: int | None = None
+    top_deg: float | None = None
+    bottom_deg: float | None = None
+    max_range_m: float | None = None
+    T_vehicle_sensor: list[list[float]] | None = None
+
+
+class DepthSpec(_Model):
+    """How a depth picture's numbers become metres: value * ``scale_m`` is z, range or disparity."""
+
+    scale_m: float = 0.001
+    kind: Literal["z", "range", "disparity"] = "z"
+    max_range_m: float | None = None
+    baseline_m: float | None = None
+
+
+class CameraSensor(_Model):
+    """A rectified camera and its depth."""
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    depth: DepthSpec = DepthSpec()
+    T_vehicle_sensor: list[list[float]] | None = None
+
+    def pinhole(self) -> PinholeCamera:
+        """Its intrinsics."""
+        return PinholeCamera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+
+class Sensors(_Model):
+    """All sensors of a dataset."""
+
+    lidars: list[LidarSensor] = []
+    cameras: list[CameraSensor] = []
+
+
+class DatasetDescription(_Model):
+    """``dataset.json``."""
+
+    format: int = FORMAT
+    name: str
+    source: dict[str, Any]
+    sensors: Sensors
+    georeference: dict[str, Any] | None = None
+    conditions: dict[str, Any] = {}
+    seed: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class QueryFrame:
+    """One query of a set: its number, picture pair and truth (None where unknown)."""
+
+    number: int
+    rgb_path: Path
+    depth_path: Path
+    camera: CameraSensor
+    T_map_camera: NDArray[np.float64] | None
+
+    def rgb(self) -> NDArray[np.uint8]:
+        """The colour picture (H, W, 3)."""
+        return decode_rgb(self.rgb_path.read_bytes(), limits=ImageLimits())
+
+    def depth_m(self) -> NDArray[np.float32]:
+        """z (H, W), metres, 0 where nothing was measured."""
+        spec = self.camera.depth
+        return decode_depth(
+            self.depth_path.read_bytes(), encoding=None, scale_m=spec.scale_m, kind=spec.kind, camera=self.camera.pinhole(),
+            baseline_m=spec.baseline_m, max_range_m=spec.max_range_m, limits=ImageLimits(),
+        )  # fmt: skip
+
+
+class Dataset:
+    """An opened dataset folder.
+
+    Args:
+        folder: with ``dataset.json``.
+
+    Raises:
+        DatasetError: the folder, its description or a pose file is missing or broken.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        path = folder / "dataset.json"
+        if not path.is_file():
+            raise DatasetError(
+                f"{folder} is no finished dataset: dataset.json is missing; run `streetfix simulate` or `streetfix import` (again)",
+                field="dataset.json",
+            )
+        try:
+            self.description = DatasetDescription.model_validate_json(path.read_bytes())
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise DatasetError(f"{path}: {where}: {first['msg']}", field=where) from error
+        if self.description.format != FORMAT:
+            raise DatasetError(f"{path}: format {self.description.format} is not {FORMAT}; make the dataset anew", field="format")
+
+    @property
+    def name(self) -> str:
+        """Name of the dataset."""
+        return self.description.name
+
+    def streets(self) -> dict[str, Any] | None:
+        """The GeoJSON of the streets, or None."""
+        path = self.folder / "streets.geojson"
+        if not path.exists():
+            return None
+        try:
+            loaded: dict[str, Any] = json.loads(path.read_text())
+        except json.JSONDecodeError as error:
+            raise DatasetError(f"{path}: not JSON: {error}", field="streets.geojson") from error
+        return loaded
+
+    def survey_poses(self) -> Transforms:
+        """T_map_lidar of every scan, (n, 4, 4)."""
+        return read_tum(self.folder / "survey" / "poses.txt")[1]
+
+    def scan(self, number: int) -> NDArray[np.float32]:
+        """Scan ``number``: (n, 4) x, y, z (m, LiDAR frame) and intensity."""
+        path = scan_path(self.folder, number)
+        if not path.is_file():
+            raise DatasetError(f"{path} is missing, but survey/poses.txt has a line for it", field=str(path.name))
+        size = path.stat().st_size
+        if size == 0 or size % 16:
+            raise DatasetError(f"{path}: {size} bytes are no rows of four float32; the file is truncated", field=str(path.name))
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        finite: NDArray[np.float32] = points[np.isfinite(points).all(axis=1)]
+        return finite
+
+    def query_sets(self, *, with_truth: bool = False) -> list[str]:
+        """Names of the query sets, sorted."""
+        root = self.folder / "queries"
+        names = sorted(p.name for p in root.iterdir() if (p / "rgb").is_dir()) if root.is_dir() else []
+        return [n for n in names if not with_truth or (root / n / "poses.txt").exists()]
+
+    def queries(self, name: str) -> Iterator[QueryFrame]:
+        """The frames of a query set, one at a time."""
+        folder = query_folder(self.folder, name)
+        if not (folder / "rgb").is_dir():
+            known = ", ".join(self.query_sets()) or "none"
+            raise DatasetError(f"{self.folder} has no query set {name!r}; it has: {known}", field="queries")
+        poses_path = folder / "poses.txt"
+        truth = read_tum(poses_path)[1] if poses_path.exists() else None
+        pictures = sorted((folder / "rgb").iterdir())
+        names = _camera_names(folder, len(pictures))
+        cameras = {camera.name: camera for camera in self.description.sensors.cameras}
+        if not cameras:
+            raise DatasetError(f"{self.folder}/dataset.json names no camera", field="sensors.cameras")
+        first = next(iter(cameras))
+        for rgb_path in pictures:
+            number = int(rgb_path.stem)
+            depth_path = next((p for p in (folder / "depth").glob(f"{rgb_path.stem}.*")), None)
+            if depth_path is None:
+                raise DatasetError(f"{folder}/depth has no picture {rgb_path.stem}", field="depth")
+            if truth is not None and number >= len(truth):
+                raise DatasetError(f"{poses_path} has {len(truth)} lines, none for {rgb_path.name}", field="poses.txt")
+            camera_name = names[number] if names else first
+            if camera_name not in cameras:
+                raise DatasetError(f"{folder}/cameras.txt names {camera_name!r}, which dataset.json does not", field="cameras.txt")
+            yield QueryFrame(number, rgb_path, depth_path, cameras[camera_name], None if truth is None else truth[number])
+
+
+def _camera_names(folder: Path, count: int) -> list[str] | None:
+    """Names in ``cameras.txt`` (a line a query), or None where all frames are of the first camera."""
+    path = folder / "cameras.txt"
+    if not path.exists():
+        return None
+    names = path.read_text().split()
+    if len(names) != count:
+        raise DatasetError(f"{path} has {len(names)} lines for {count} pictures", field="cameras.txt")
+    return names
+
+
+def scan_path(folder: Path, number: int) -> Path:
+    """Where scan ``number`` lies."""
+    return folder / "survey" / "scans" / f"{number:06d}.bin"
+
+
+def query_folder(folder: Path, name: str) -> Path:
+    """Where a query set lies."""
+    return folder / "queries" / name
+
+
+def write_description(folder: Path, description: DatasetDescription) -> None:
+    """Write ``dataset.json``; last of all, since its presence says that the dataset is whole."""
+    part = folder / "dataset.json.part"
+    part.write_text(description.model_dump_json(indent=2) + "\n")
+    part.rename(folder / "dataset.json")
+
+
+def write_tum(path: Path, timestamps: NDArray[np.float64], transforms: Transforms) -> None:
+    """Write poses in TUM format (timestamp x y z qx qy qz qw), renamed when whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    with part.open("w") as file:
+        for stamp, T in zip(timestamps, transforms, strict=True):
+            numbers = [*T[:3, 3], *quaternion_xyzw_from(T[:3, :3])]
+            file.write(f"{stamp:.6f} " + " ".join(f"{x:.9f}" for x in numbers) + "\n")
+    part.rename(path)
+
+
+def read_tum(path: Path) -> tuple[NDArray[np.float64], Transforms]:
+    """Timestamps (n) and transforms (n, 4, 4) of a TUM file.
+
+    Raises:
+        DatasetError: the file is missing, or a line is no pose.
+    """
+    if not path.is_file():
+        raise DatasetError(f"{path} is missing", field=path.name)
+    stamps, transforms = [], []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            values = np.array(line.split(), np.float64)
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {number}: not numbers: {line[:60]!r}", field=path.name) from error
+        if len(values) != 8 or not np.isfinite(values).all() or np.linalg.norm(values[4:]) < 1e-6:
+            raise DatasetError(
+                f"{path}, line {number}: not `timestamp x y z qx qy qz qw` with a unit quaternion: {line[:60]!r}", field=path.name
+            )
+        stamps.append(values[0])
+        transforms.append(transform_from(rotation_from_quaternion_xyzw(values[4:]), values[1:4]))
+    return np.array(stamps), np.array(transforms).reshape(-1, 4, 4)

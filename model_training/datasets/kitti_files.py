@@ -1,0 +1,67 @@
+"""The files of a frame in KITTI's object layout, read with every doubt."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8, UInt16
+from numpy.typing import NDArray
+
+from service.errors import DatasetError, StreetfixError
+from service.imaging.decode import ImageLimits, decode_rgb
+from service.imaging.depth_formats import read_depth_values
+
+_LIMITS = ImageLimits()
+
+
+def copy_scan(path: Path, to: Path) -> None:
+    """Copy a scan (float32 x y z intensity), checked.
+
+    Raises:
+        DatasetError: it is empty or cut off, or a number in it is not finite.
+    """
+    size = path.stat().st_size
+    if size == 0 or size % 16:
+        raise damaged(path, f"{size} bytes are no rows of four float32")
+    if not np.isfinite(np.fromfile(path, np.float32)).all():
+        raise damaged(path, "a coordinate is not finite")
+    to.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, to)
+
+
+def read_rgb(path: Path) -> UInt8[NDArray[np.uint8], "H W 3"]:
+    """Read a colour picture.
+
+    Raises:
+        DatasetError: it is damaged.
+    """
+    try:
+        return decode_rgb(path.read_bytes(), limits=_LIMITS)
+    except StreetfixError as error:
+        raise damaged(path, str(error)) from error
+
+
+def read_stored_depth(path: Path, size: tuple[int, ...]) -> UInt16[NDArray[np.uint16], "H W"]:
+    """Read the depth that lies beside a picture: metres x 256, 0 where nothing was measured.
+
+    Args:
+        path: 16-bit PNG.
+        size: (height, width) of its left picture.
+
+    Raises:
+        DatasetError: it is missing or damaged, or has another size.
+    """
+    if not path.is_file():
+        raise damaged(path, "the stored depth of this frame is missing (--depth sgbm does without)")
+    try:
+        values = read_depth_values(path.read_bytes(), encoding=None, limits=_LIMITS)
+    except StreetfixError as error:
+        raise damaged(path, str(error)) from error
+    if values.dtype != np.uint16 or values.shape != size:
+        raise damaged(path, f"it is {values.shape} of {values.dtype}, and its left picture is {size}")
+    return values.astype(np.uint16, copy=False)
+
+
+def damaged(path: Path, why: str) -> DatasetError:
+    """The error for a file of a recording that cannot be used."""
+    return DatasetError(f"{path}: {why}; take the file from the recording again, or remove the frame", field=path.name)

@@ -1,0 +1,81 @@
+"""One map against one dataset: predictions, measures, the split each set belongs to, trajectories."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model_training.datasets.dataset import Dataset, write_tum
+from model_training.evaluation.measures import measure
+from model_training.evaluation.predict import Predictions, joined, predict
+from service.errors import DatasetError
+from service.localization.localizer import Localizer
+from service.maps.reader import MapBundle
+
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures as JSON values, and the predictions of each set that they were made from."""
+
+    figures: dict[str, Any]
+    predictions: dict[str, Predictions] = field(default_factory=dict)
+
+
+def evaluate(
+    bundle: MapBundle, dataset: Dataset, names: list[str] | None = None, *, workers: int = 2, report: Report = lambda *_: None
+) -> Evaluation:
+    """Measure a map with query sets; all that have truth where none is named.
+
+    The figures at the top are over all queries of all sets; ``sets`` has them for each set with its split.
+
+    Raises:
+        DatasetError: there is no query set with truth.
+    """
+    names = names or dataset.query_sets(with_truth=True)
+    if not names:
+        raise DatasetError(f"{dataset.folder} has no query set with poses.txt, so nothing can be measured", field="queries")
+    localizer = Localizer.open(bundle)
+    classes = [] if bundle.streets is None else [street.name for street in bundle.streets.features]
+    predictions = {name: predict(localizer, dataset, name, workers=workers, report=report) for name in names}
+    figures = measure(joined(list(predictions.values())), classes)
+    seen = city_seen_in_training(dataset, localizer.encoder.trained_on)
+    sets = {
+        name: {"split": split_of(dataset, name, seen), "city_seen_in_training": seen} | measure(p, classes)
+        for name, p in predictions.items()
+    }
+    splits = sorted({str(s["split"]) for s in sets.values()})
+    head = {
+        "map": {"name": bundle.name, "version": bundle.manifest.version}, "dataset": dataset.name,
+        "split": splits[0] if len(splits) == 1 else "mixed", "encoder_sha256": bundle.manifest.encoder_sha256,
+    }  # fmt: skip
+    return Evaluation(head | figures | {"sets": sets}, predictions)
+
+
+def city_seen_in_training(dataset: Dataset, trained_on: tuple[str, ...]) -> bool | None:
+    """Whether the encoder saw this city; None where the encoder does not say what it was trained on."""
+    if not trained_on:
+        return None
+    source = dataset.description.source
+    plan = source.get("plan") or {}
+    if source.get("kind") != "simulation":
+        return False
+    return f"{plan.get('city')}-{plan.get('seed')}" in trained_on
+
+
+def split_of(dataset: Dataset, name: str, city_seen: bool | None) -> str:
+    """``same_drive`` (the paper's way; it leaks), ``other_drive`` (honest), or ``unseen_city`` (and new to the encoder)."""
+    plan = dataset.description.source.get("plan") or {}
+    for query in plan.get("queries", []):
+        if query.get("on_track") and name.startswith(f"{query.get('name')}_"):
+            return "same_drive"
+    return "unseen_city" if city_seen is False else "other_drive"
+
+
+def write_trajectory(path: Path, predictions: Predictions) -> None:
+    """Write the answered poses, T_map_camera, in TUM format; a query's number is its time, as in the truth's file."""
+    answered = np.isfinite(predictions.T_answer[:, 0, 3])
+    write_tum(path, np.flatnonzero(answered).astype(np.float64), predictions.T_answer[answered])

@@ -1,0 +1,87 @@
+"""Pass 2: figures from predictions.
+
+Shares are over all queries, an unanswered one being wrong. Distances are over answered ones; ``forced`` gives them once
+more for the best hypothesis of every query that has one.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.evaluation.error_measures import (
+    distance_errors,
+    error_rate,
+    heading_errors_deg,
+    mean_error_distance,
+    mean_squared_error,
+    root_mean_squared_error,
+    wilson_interval,
+)
+from model_training.evaluation.predict import Predictions, headings_of
+
+RIGHT_PLACE_M = 5.0
+
+
+def recall_at(ranked_xy: NDArray[np.float64], true_xy: NDArray[np.float64], k: int) -> NDArray[np.bool_]:
+    """Whether one of the first k distinct places lies within 5 m of the truth, (n)."""
+    distance = np.linalg.norm(ranked_xy[:, :k] - true_xy[:, None], axis=2)
+    return np.asarray((np.nan_to_num(distance, nan=np.inf) <= RIGHT_PLACE_M).any(axis=1))
+
+
+def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]:
+    """All figures of one query set, as plain JSON values; ``ci95`` holds Wilson intervals of the shares."""
+    p, count = predictions, len(predictions.T_true)
+    true_xy = p.T_true[:, :2, 3]
+    has_pose = np.isfinite(p.T_answer[:, 0, 3])
+    answered = p.localized & has_pose
+    distance = np.full(count, np.inf)
+    distance[has_pose] = distance_errors(p.T_answer[has_pose, :2, 3], true_xy[has_pose])
+    shown = np.where(answered, distance, np.inf)
+    shares: dict[str, NDArray[np.bool_]] = {
+        "within_0_5_m": shown <= 0.5,
+        "within_1_m": shown <= 1.0,
+        "within_5_m": shown <= 5.0,
+        "recall_at_1_5m": recall_at(p.ranked_xy, true_xy, 1),
+        "recall_at_5_5m": recall_at(p.ranked_xy, true_xy, 5),
+        "recall_at_10_5m": recall_at(p.ranked_xy, true_xy, 10),
+        "localized": answered,
+    }
+    in_street = p.street_true >= 0
+    if in_street.any():
+        shares["street_accuracy"] = (answered & (p.street_answer == p.street_true))[in_street]
+    result: dict[str, Any] = {"queries": count}
+    result |= {name: float(np.mean(flags)) for name, flags in shares.items()}
+    result.setdefault("street_accuracy", None)
+    result["error_rate"] = error_rate(shares["street_accuracy"]) if in_street.any() else None
+    result |= _distances(distance[answered])
+    result["forced"] = _distances(distance[has_pose]) | {"answered": float(np.mean(has_pose))}
+    headings = heading_errors_deg(headings_of(p.T_answer[answered]), headings_of(p.T_true[answered])) if answered.any() else None
+    result["median_heading_error_deg"] = None if headings is None else float(np.median(headings))
+    result["ms_per_query"] = float(np.median(p.ms))
+    result["ci95"] = {name: list(wilson_interval(int(flags.sum()), len(flags))) for name, flags in shares.items()}
+    result["confusion"] = _confusion(p, street_names) if in_street.any() else None
+    return result
+
+
+def _distances(distance: NDArray[np.float64]) -> dict[str, float | None]:
+    if not len(distance):
+        keys = ("mean_distance_error_m", "median_distance_error_m", "p95_distance_error_m", "rms_distance_error_m", "mse_m2")
+        return dict.fromkeys(keys)
+    return {
+        "mean_distance_error_m": mean_error_distance(distance),
+        "median_distance_error_m": float(np.median(distance)),
+        "p95_distance_error_m": float(np.percentile(distance, 95)),
+        "rms_distance_error_m": root_mean_squared_error(distance),
+        "mse_m2": mean_squared_error(distance),
+    }
+
+
+def _confusion(p: Predictions, names: list[str]) -> dict[str, Any]:
+    """Counts, a row a true class, a column an answered one; the last column is "no street or no answer"."""
+    matrix = np.zeros((len(names), len(names) + 1), int)
+    answer = np.where(p.localized, p.street_answer, -1)
+    for true, found in zip(p.street_true, answer, strict=True):
+        if true >= 0:
+            matrix[true, found] += 1
+    return {"classes": names, "matrix": matrix.tolist()}

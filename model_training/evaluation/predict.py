@@ -1,0 +1,113 @@
+"""Pass 1: what a map answers to every query of a set. New measures then cost no new run."""
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import Dataset, QueryFrame
+from service.errors import DatasetError, NoDepthError
+from service.geometry.rigid import heading_of_camera
+from service.localization.answer import Answer
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+
+RANKED = 10
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Truth and answers of one query set, a row a query.
+
+    ``T_true`` and ``T_answer`` (n, 4, 4) are T_map_camera, NaN where nothing was answered; ``street_true`` and
+    ``street_answer`` (n) are features of the map's streets, -1 for none; ``ranked_xy`` (n, RANKED, 2) are the most similar
+    distinct places, the best first, NaN where there are fewer; ``localized`` (n); ``ms`` (n) of decoding and localizing.
+    """
+
+    T_true: NDArray[np.float64]
+    T_answer: NDArray[np.float64]
+    street_true: NDArray[np.int64]
+    street_answer: NDArray[np.int64]
+    ranked_xy: NDArray[np.float64]
+    ranked_place: NDArray[np.int64]
+    localized: NDArray[np.bool_]
+    ms: NDArray[np.float64]
+
+    def save(self, path: Path) -> None:
+        """Keep them as NPZ, without pickle."""
+        np.savez_compressed(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
+
+
+def joined(parts: list[Predictions]) -> Predictions:
+    """Several sets as one."""
+    return Predictions(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in Predictions.__dataclass_fields__})
+
+
+def predict(
+    localizer: Localizer, dataset: Dataset, name: str, *, workers: int = 2, report: Report = lambda *_: None
+) -> Predictions:
+    """Ask every query of a set that has truth.
+
+    Raises:
+        DatasetError: the set has no truth or no frames.
+    """
+    frames = list(dataset.queries(name))
+    if not frames or frames[0].T_map_camera is None:
+        raise DatasetError(f"query set {name!r} of {dataset.folder} has no poses.txt, so nothing can be measured", field="queries")
+    answers: list[tuple[Answer | None, float]] = []
+    with ThreadPoolExecutor(workers) as pool:
+        for done, answer in enumerate(_in_order(pool, lambda frame: _ask(localizer, frame), frames, ahead=4 * workers), 1):
+            answers.append(answer)
+            report(f"queries {name}", done, len(frames))
+    return _table(localizer, frames, answers)
+
+
+def _in_order[T, R](pool: ThreadPoolExecutor, work: Callable[[T], R], items: list[T], *, ahead: int) -> Iterator[R]:
+    """Results in order, never more than ``ahead`` items in memory."""
+    rest = iter(items)
+    waiting = [pool.submit(work, item) for item in islice(rest, ahead)]
+    while waiting:
+        yield waiting.pop(0).result()
+        waiting += [pool.submit(work, item) for item in islice(rest, 1)]
+
+
+def _ask(localizer: Localizer, frame: QueryFrame) -> tuple[Answer | None, float]:
+    began = time.perf_counter()
+    query = Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole(), ranked=RANKED)
+    try:
+        answer: Answer | None = localizer.localize(query)
+    except NoDepthError:
+        answer = None
+    return answer, 1e3 * (time.perf_counter() - began)
+
+
+def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[Answer | None, float]]) -> Predictions:
+    count, streets = len(frames), localizer.bundle.streets
+    T_true = np.array([frame.T_map_camera for frame in frames])
+    T_answer, ranked = np.full((count, 4, 4), np.nan), np.full((count, RANKED, 2), np.nan)
+    ranked_place = np.full((count, RANKED), -1)
+    street_answer, localized = np.full(count, -1), np.zeros(count, bool)
+    for k, (answer, _) in enumerate(answers):
+        if answer is None:
+            continue
+        T_answer[k] = answer.T_map_camera
+        localized[k] = answer.status == "LOCALIZED"
+        for j, neighbour in enumerate(answer.neighbours[:RANKED]):
+            ranked[k, j], ranked_place[k, j] = neighbour.position_m[:2], neighbour.place
+        if answer.vote is not None:
+            street_answer[k] = answer.vote.street
+    street_true = np.full(count, -1)
+    if streets is not None:
+        street_true = np.array([streets.index_at(T[:2, 3]) for T in T_true])
+    return Predictions(T_true, T_answer, street_true, street_answer, ranked, ranked_place, localized, np.array([ms for _, ms in answers]))
+
+
+def headings_of(transforms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Headings (n), radians, of T_map_camera (n, 4, 4)."""
+    return np.array([heading_of_camera(T) for T in transforms])

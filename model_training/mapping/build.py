@@ -1,0 +1,201 @@
+"""Dataset + encoder -> map bundle: level by PCA, cut the view fan, encode, gather the cloud, write the bundle."""
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.preview import preview_webp
+from model_training.mapping.voxel_map import VoxelMap
+from service.errors import DatasetError
+from service.geometry.rigid import heading_of_body, transform_from, transform_points
+from service.imaging.pca import Level, level_scan, principal_heading
+from service.imaging.view_grid import (
+    ViewGrid,
+    panorama_from_points,
+    ranges_from_panorama,
+    survey_planes,
+)
+from service.imaging.weather import remove_weather_noise
+from service.localization.encoder import Encoder
+from service.maps.content import BundleContent
+from service.maps.manifest import Manifest
+from service.maps.streets import Streets
+from service.maps.writer import write_bundle
+
+Report = Callable[[str, int, int], None]
+
+SEEN_SHARE = 0.02  # a row of the grid is the survey's if at least this share of its cells is measured
+CLOUD_REACH_M = 40.0
+
+
+@dataclass(frozen=True, slots=True)
+class BuildSettings:
+    """How a map is built; all of it is in the manifest."""
+
+    name: str
+    spacing_m: float = 1.0
+    headings: int = 24
+    voxel_m: float = 0.3
+    expected_lidar_height_m: float = 1.8
+    remove_weather: bool = False
+    licence: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LevelledScan:
+    """One kept scan: its number, level points (n, 3), level, and the principal heading that its fan starts at (rad)."""
+
+    number: int
+    points: NDArray[np.float32]
+    level: Level
+    start_rad: float
+
+
+def build_map(
+    dataset: Dataset, encoder_file: Path, out: Path, settings: BuildSettings, *, overwrite: bool = False,
+    threads: int | None = None, report: Report = lambda *_: None,
+) -> Manifest:  # fmt: skip
+    """Build a map bundle.
+
+    Args:
+        dataset: with a survey.
+        encoder_file: ONNX; it goes into the bundle.
+        out: folder of the bundle; it appears whole or not at all.
+        settings: spacing, fan, voxel.
+        overwrite: replace a bundle that is there.
+        threads: of the encoder; by default one a core.
+        report: told after every place.
+
+    Raises:
+        DatasetError: the survey is empty or damaged.
+        EncoderError: the encoder cannot be used.
+        BundleError: ``out`` exists and ``overwrite`` is not given.
+    """
+    data = encoder_file.read_bytes()
+    encoder = Encoder.open(data, threads=threads or os.cpu_count() or 1)
+    grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
+    poses = dataset.survey_poses()
+    if not len(poses):
+        raise DatasetError(f"{dataset.folder}/survey/poses.txt is empty: there is nothing to build a map of", field="survey")
+    kept = thinned(poses, settings.spacing_m)
+    rows_seen = _rows_seen(dataset, kept, grid, settings)
+    cloud = VoxelMap(settings.voxel_m, np.round(poses[:, :3, 3].mean(axis=0)))
+    turns = fan(settings.headings)
+    T_map_level = np.zeros((len(kept), 4, 4))
+    heights, headings, descriptors = np.zeros(len(kept)), [], []
+    for k, scan in enumerate(levelled_scans(dataset, kept, settings)):
+        T = poses[scan.number] @ transform_from(scan.level.R_level_sensor.T, np.zeros(3))
+        planes = np.stack([
+            survey_planes(ranges, sensor_height_m=scan.level.height_m, rows_seen=rows_seen, grid=grid)
+            for ranges in _fan_ranges(scan, turns, grid)
+        ])  # fmt: skip
+        descriptors.append(encoder.encode(planes, "survey"))
+        headings.append((heading_of_body(T) + scan.start_rad + turns + np.pi) % (2 * np.pi) - np.pi)
+        near = scan.points[np.linalg.norm(scan.points, axis=1) < CLOUD_REACH_M].astype(np.float64)
+        cloud.add(transform_points(T, near))
+        T_map_level[k], heights[k] = T, scan.level.height_m
+        report("places", k + 1, len(kept))
+    lidar_height_m = float(np.median(heights))
+    T_map_level[:, 2, 3] += lidar_height_m - heights  # so that the ground under each place lies that far below it
+    streets = dataset.streets()
+    surfels = cloud.surfels()
+    content = BundleContent(
+        name=settings.name, grid=grid, headings=settings.headings, spacing_m=settings.spacing_m, rows_seen=rows_seen,
+        T_map_place=T_map_level, place_street=_streets_of(streets, T_map_level),
+        view_place=np.repeat(np.arange(len(kept), dtype=np.int32), settings.headings), view_heading_rad=np.concatenate(headings),
+        descriptors=np.concatenate(descriptors), encoder=data, streets=streets, cloud=cloud.tiles(surfels),
+        preview_webp=preview_webp(surfels.positions, surfels.normals, T_map_level[:, :3, 3]),
+        georeference=dataset.description.georeference,
+        calibration={"calibrated": False, "why": "this release does not calibrate confidence yet; answers carry confidence null"},
+        parameters={
+            "lidar_height_m": lidar_height_m, "voxel_m": settings.voxel_m, "weather_removed": float(settings.remove_weather),
+            "expected_lidar_height_m": settings.expected_lidar_height_m, "survey_scans": float(len(poses)),
+        },
+        licence=settings.licence,
+        tool_versions={name: version(name) for name in ("streetfix", "numpy", "faiss-cpu", "onnxruntime")},
+    )  # fmt: skip
+    return write_bundle(out, content, overwrite=overwrite)
+
+
+def _streets_of(streets: dict[str, Any] | None, T_map_level: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Number of the street's feature under each place, -1 for none."""
+    if streets is None:
+        return np.full(len(T_map_level), -1, np.int32)
+    polygons = Streets.from_geojson(streets)
+    return np.array([polygons.index_at(xy) for xy in T_map_level[:, :2, 3]], np.int32)
+
+
+def fan(headings: int) -> NDArray[np.float64]:
+    """Turns of a place's views against its principal heading, radians."""
+    return 2 * np.pi * np.arange(headings) / headings
+
+
+def view_ranges(
+    dataset: Dataset, settings: BuildSettings, grid: ViewGrid, rows_seen: NDArray[np.bool_]
+) -> Iterator[NDArray[np.float32]]:
+    """Range views (headings, rows, columns) of every place of the map that these settings build, in its order."""
+    kept = thinned(dataset.survey_poses(), settings.spacing_m)
+    turns = fan(settings.headings)
+    for scan in levelled_scans(dataset, kept, settings):
+        yield np.stack(list(_fan_ranges(scan, turns, grid))) * rows_seen[:, None]
+
+
+def _fan_ranges(scan: LevelledScan, turns: NDArray[np.float64], grid: ViewGrid) -> Iterator[NDArray[np.float32]]:
+    panorama = panorama_from_points(scan.points, grid)
+    for turn in turns:
+        yield ranges_from_panorama(panorama, scan.start_rad + float(turn), grid)
+
+
+def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:
+    """Numbers of the poses that stand at least ``spacing_m`` of travel after the last one kept."""
+    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))]
+    kept, last = [0], 0.0
+    for k in range(1, len(poses)):
+        if travelled[k] - last >= spacing_m * 0.999:
+            kept.append(k)
+            last = travelled[k]
+    return np.array(kept)
+
+
+def levelled_scans(dataset: Dataset, numbers: NDArray[np.int64], settings: BuildSettings) -> Iterator[LevelledScan]:
+    """Scans one at a time, levelled by PCA, each with its principal heading."""
+    for number in numbers:
+        points = dataset.scan(int(number))[:, :3]
+        if settings.remove_weather:
+            points = points[remove_weather_noise(points)]
+        level = level_scan(points, expected_height_m=settings.expected_lidar_height_m)
+        levelled = points @ level.R_level_sensor.T.astype(np.float32)
+        yield LevelledScan(int(number), levelled, level, principal_heading(levelled, height_m=level.height_m))
+
+
+def _rows_seen(
+    dataset: Dataset, kept: NDArray[np.int64], grid: ViewGrid, settings: BuildSettings, *, sample: int = 100
+) -> NDArray[np.bool_]:
+    """Rows that the survey's sensor covers, from a sample of its scans; what it never sees is cut from queries too."""
+    chosen = kept[:: max(1, len(kept) // sample)]
+    measured = np.zeros(grid.rows)
+    for scan in levelled_scans(dataset, chosen, settings):
+        measured += (panorama_from_points(scan.points, grid) > 0).mean(axis=1)
+    seen: NDArray[np.bool_] = measured / len(chosen) > SEEN_SHARE
+    if not seen.any():
+        raise DatasetError(
+            f"{dataset.folder}: the scans have no points between {grid.elevation_bottom_deg:g} and {grid.elevation_top_deg:g} degrees "
+            f"of elevation within {grid.max_range_m:g} m: check units and axes (metres, z up)", field="survey",
+        )  # fmt: skip
+    return seen
+
+
+def describe(manifest: Manifest) -> str:
+    """One line about a bundle, for people."""
+    counts = manifest.counts
+    return (
+        f"map {manifest.name}, version {manifest.version}: {counts.places} places, {counts.views} views, "
+        f"{counts.cloud_points} cloud points, {counts.streets} street classes"
+    )

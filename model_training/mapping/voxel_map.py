@@ -1,0 +1,129 @@
+"""The map cloud for registration: voxels with mean, normal and thickness, from sums that add up scan by scan.
+
+Each voxel keeps the moments of its points (count, sum, sum of products), so a drive of any length streams through. The
+normal of a voxel is the axis of least variance of the moments of it and its 26 neighbours.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SPAN = 1 << 20  # cells along an axis: a key is 3 x 20 bits
+_MOMENTS = 10  # count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's corner
+TILE_M = 40.0
+
+#: A surface element: position relative to the tile's origin, unit normal, thickness across the surface (m), points.
+SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
+
+
+@dataclass(frozen=True)
+class Surfels:
+    """Surface elements: ``positions`` and unit ``normals`` (n, 3), ``thickness_m`` and ``points`` in the voxel (n)."""
+
+    positions: NDArray[np.float64]
+    normals: NDArray[np.float32]
+    thickness_m: NDArray[np.float32]
+    points: NDArray[np.uint32]
+
+
+class VoxelMap:
+    """Accumulates scans; ``tiles`` gives the surfels.
+
+    Args:
+        voxel_m: edge of a voxel.
+        origin: a point near the map's middle, metres; coordinates stay small around it.
+    """
+
+    def __init__(self, voxel_m: float, origin: NDArray[np.float64]) -> None:
+        self.voxel_m, self.origin = voxel_m, origin
+        self._keys = np.zeros(0, np.int64)
+        self._moments = np.zeros((0, _MOMENTS))
+        self._waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+
+    def add(self, points_map: NDArray[np.float64]) -> None:
+        """Add points (n, 3), metres, map frame."""
+        cell = np.floor((points_map - self.origin) / self.voxel_m).astype(np.int64)
+        local = (points_map - self.origin) - (cell + 0.5) * self.voxel_m
+        key = ((cell[:, 0] + _SPAN // 2) * _SPAN + cell[:, 1] + _SPAN // 2) * _SPAN + cell[:, 2] + _SPAN // 2
+        self._waiting.append(_summed(key, _moments_of(local)))
+        if len(self._waiting) >= 64:
+            self._merge()
+
+    def _merge(self) -> None:
+        keys = np.concatenate([self._keys, *(k for k, _ in self._waiting)])
+        moments = np.concatenate([self._moments, *(m for _, m in self._waiting)])
+        self._keys, self._moments = _summed(keys, moments)
+        self._waiting = []
+
+    def surfels(self, *, fewest: int = 5) -> "Surfels":
+        """One for each voxel that has ``fewest`` points in it and around it, enough for a normal."""
+        self._merge()
+        keys, own = self._keys, self._moments
+        total = np.zeros_like(own)
+        for dx, dy, dz in product((-1, 0, 1), repeat=3):
+            wanted = keys + ((dx * _SPAN) + dy) * _SPAN + dz
+            at = np.searchsorted(keys, wanted)
+            at[at == len(keys)] = 0
+            found = keys[at] == wanted
+            total[found] += _shifted(own[at[found]], np.array([dx, dy, dz]) * self.voxel_m)
+        keep = total[:, 0] >= fewest
+        keys, own, total = keys[keep], own[keep], total[keep]
+        cell = np.stack([keys // (_SPAN * _SPAN), keys // _SPAN % _SPAN, keys % _SPAN], axis=1) - _SPAN // 2
+        centre = self.origin + (cell + 0.5) * self.voxel_m
+        variances, axes = np.linalg.eigh(_covariances(total))
+        normals = axes[:, :, 0].astype(np.float32)
+        thickness = np.sqrt(np.maximum(variances[:, 0], 0)).astype(np.float32)
+        return Surfels(centre + own[:, 1:4] / own[:, :1], normals, thickness, own[:, 0].astype(np.uint32))
+
+    def tiles(self, found: "Surfels") -> dict[str, NDArray[np.generic]]:
+        """Arrays of ``cloud/``: ``surfels``, sorted by tile, and ``tiles``: (n, 5) origin x, y, z (m), first surfel, count."""
+        positions = found.positions
+        tile = np.floor((positions[:, :2] - self.origin[:2]) / TILE_M).astype(np.int64)
+        order = np.lexsort((tile[:, 1], tile[:, 0]))
+        tile, positions = tile[order], positions[order]
+        corners, first, count = np.unique(tile, axis=0, return_index=True, return_counts=True)
+        origins = np.concatenate([self.origin[:2] + (corners + 0.5) * TILE_M, np.full((len(corners), 1), self.origin[2])], axis=1)
+        surfels = np.zeros(len(positions), SURFEL)
+        surfels["xyz"] = positions - np.repeat(origins, count, axis=0)
+        surfels["normal"], surfels["thickness_m"] = found.normals[order], found.thickness_m[order]
+        surfels["points"] = found.points[order]
+        return {"surfels": surfels, "tiles": np.concatenate([origins, np.stack([first, count], axis=1)], axis=1)}
+
+
+def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:
+    x, y, z = local.T
+    return np.stack([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
+
+
+def _summed(keys: NDArray[np.int64], moments: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Rows of equal key added up; keys sorted."""
+    order = np.argsort(keys, kind="stable")
+    keys, moments = keys[order], moments[order]
+    first = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]]) if len(keys) else np.zeros(0, np.int64)
+    return keys[first], np.add.reduceat(moments, first, axis=0) if len(first) else moments
+
+
+def _shifted(moments: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same moments about a corner that lies ``shift`` (3,) away: every point moves by it."""
+    n, s = moments[:, :1], moments[:, 1:4]
+    a, b, c = shift
+    moved = moments.copy()
+    moved[:, 1:4] += n * shift
+    x, y, z = s.T
+    n0 = moments[:, 0]
+    moved[:, 4:] += np.stack(
+        [2 * a * x + n0 * a * a, a * y + b * x + n0 * a * b, a * z + c * x + n0 * a * c,
+         2 * b * y + n0 * b * b, b * z + c * y + n0 * b * c, 2 * c * z + n0 * c * c], axis=1
+    )  # fmt: skip
+    return moved
+
+
+def _covariances(moments: NDArray[np.float64]) -> NDArray[np.float64]:
+    n = moments[:, :1]
+    mean = moments[:, 1:4] / n
+    second = moments[:, 4:] / n
+    index = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    covariances: NDArray[np.float64] = second[:, index] - mean[:, :, None] * mean[:, None, :]
+    return covariances

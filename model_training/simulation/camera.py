@@ -1,0 +1,106 @@
+"""RGB and true depth of one camera pose."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.simulation.blocker import Blocker
+from model_training.simulation.conditions import Condition
+from model_training.simulation.meshes import Material
+from model_training.simulation.scene import Hits, Scene
+from model_training.simulation.shading import Light, shade, shadows, to_srgb
+from model_training.simulation.terrain import GroundPicture
+from service.geometry.camera import PinholeCamera
+
+SHADOW_STEP = 2  # shadow rays at every second pixel each way: four times fewer, and edges stay soft
+
+
+@dataclass(frozen=True)
+class Picture:
+    """``rgb`` (H, W, 3), true z ``depth_m`` (H, W; 0 for nothing) and ``blank`` (H, W): nothing to match on."""
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    blank: NDArray[np.bool_]
+
+
+def unit_rays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Unit rays (H*W, 3) in the optical frame, and their z (H*W)."""
+    rays = camera.rays_of_pixels().reshape(-1, 3)
+    length = np.linalg.norm(rays, axis=1)
+    return (rays / length[:, None]).astype(np.float32), (1.0 / length).astype(np.float32)
+
+
+def take(
+    scene: Scene, ground: GroundPicture, camera: PinholeCamera, T_map_camera: NDArray[np.float64], light: Light,
+    condition: Condition, rng: np.random.Generator, *, rays_camera: NDArray[np.float32], z_of_ray: NDArray[np.float32],
+    blocker: Blocker | None = None,
+) -> Picture:  # fmt: skip
+    """Take a picture; ``rays_camera`` and ``z_of_ray`` are those of ``unit_rays``."""
+    R = T_map_camera[:3, :3].astype(np.float32)
+    origin = T_map_camera[:3, 3]
+    rays = rays_camera @ R.T
+    hits = scene.hits(origin, rays)
+    shape = (camera.height, camera.width)
+    lit = _lit(scene, origin, rays, hits, light, shape) if condition.sun_strength > 0 else None
+    linear = shade(scene, ground, origin, rays, hits, light, condition, forward=T_map_camera[:3, 2], lit=lit)
+    distance = hits.distance
+    if blocker is not None:
+        stopped, near, albedo = blocker.over(origin, rays, hits)
+        distance = np.where(stopped, near, distance)
+        linear = np.where(stopped[:, None], albedo * light.sky, linear)
+    rgb = _expose(linear.reshape(*shape, 3), condition, rng)
+    depth = (distance * z_of_ray).reshape(shape)
+    material = scene.mesh.material[np.maximum(hits.primitive, 0)]
+    blank = ((material == Material.GLASS) | (material == Material.METAL) | (material == Material.MATTE)).reshape(shape)
+    return Picture(rgb, depth, blank & (depth > 0))
+
+
+def _lit(
+    scene: Scene, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light, shape: tuple[int, int]
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Shadow rays on a coarser grid, spread over the pixels between."""
+
+    def coarse(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        picked = values.reshape(*shape, -1)[::SHADOW_STEP, ::SHADOW_STEP]
+        return picked.reshape(-1, picked.shape[-1])
+
+    directions, distance, normal = coarse(rays), coarse(hits.distance), coarse(hits.normal)
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal = normal * np.where((normal * directions).sum(axis=1, keepdims=True) > 0, np.float32(-1), np.float32(1))
+    points = origin.astype(np.float32) + directions * distance
+    lit = shadows(scene, points, normal, light)
+    small = lit.reshape(-(-shape[0] // SHADOW_STEP), -(-shape[1] // SHADOW_STEP)).astype(np.uint8)
+    spread = cv2.resize(small, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(spread, np.uint8).reshape(-1) > 0
+
+
+def _expose(linear: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Automatic exposure, noise, rain and snow in the air, the lens's glare."""
+    mean = float(np.mean(linear[::4, ::4].min(axis=2))) + 1e-4
+    gain = min(0.26 / mean, 60.0) * rng.uniform(0.8, 1.25)
+    picture = to_srgb(linear, gain)
+    sigma = 1.2 + 0.35 * min(gain, 40.0)
+    picture += rng.standard_normal(linear.shape[:2], dtype=np.float32)[..., None] * np.float32(sigma)
+    picture += cv2.resize(rng.standard_normal((linear.shape[0] // 2, linear.shape[1] // 2, 3), dtype=np.float32),
+                          (linear.shape[1], linear.shape[0])) * np.float32(0.5 * sigma)  # fmt: skip
+    if condition.streaks > 0:
+        _particles(picture, condition, rng)
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+
+def _particles(picture: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> None:
+    """Streaks of rain or flakes of snow, drawn into the picture in place."""
+    height, width = picture.shape[:2]
+    flakes = condition.snow_cover > 0
+    slant = rng.normal(0, 0.15)
+    for _ in range(int(condition.streaks * 500 * width / 640)):
+        x, y = int(rng.integers(width)), int(rng.integers(height))
+        tone = float(rng.uniform(170, 235))
+        if flakes:
+            cv2.circle(picture, (x, y), int(rng.integers(1, 4)), (tone, tone, tone), -1, cv2.LINE_AA)
+        else:
+            length = int(rng.integers(6, 26))
+            cv2.line(picture, (x, y), (x + int(slant * length), y + length), (tone, tone, tone), 1, cv2.LINE_AA)

@@ -1,0 +1,116 @@
+"""Errors of a depth camera that triangulates: they grow with the square of the distance.
+
+Presets after feasibility.md (November 2026): ``precise`` and ``stereo``, both at focal length x baseline = 80 px m.
+Gross errors of stereo matching (bleeding edges, invented depth in sky, glass and blank walls, holes): Scharstein and
+Szeliski, IJCV 47, 2002; Menze and Geiger, CVPR 2015.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.simulation.conditions import Condition
+
+Depth = NDArray[np.float32]
+
+BEYOND_M = 200.0  # stands for "nothing there" while disparities are formed
+
+
+@dataclass(frozen=True, slots=True)
+class DepthModel:
+    """Parameters of a depth camera; pixels are those of a 640 wide picture."""
+
+    name: str
+    focal_baseline_px_m: float = 80.0
+    noise_px: float = 0.1
+    correlated: float = 0.5  # share of the noise's deviation common to patches of 16 and 60 px
+    step_px: float = 1 / 16
+    offset_px: float = 0.0  # one sigma, a frame
+    scale_error: float = 0.003  # one sigma, a frame
+    bleeding: float = 0.4  # share of edges that take the foreground's depth
+    hole_level: float = 2.3  # patches of a unit normal field above this are missing
+    invented_frames: float = 0.0  # share of frames with depth made up in sky, glass and blank walls
+    min_range_m: float = 0.4
+    max_range_m: float = 40.0
+
+
+DEPTHS = {
+    m.name: m
+    for m in (
+        DepthModel("ideal", noise_px=0.0, step_px=0.0, scale_error=0.0, bleeding=0.0, hole_level=99.0),
+        DepthModel("precise"),
+        DepthModel("stereo", noise_px=0.5, offset_px=0.05, scale_error=0.01, hole_level=1.9, invented_frames=0.3),
+    )
+}
+
+
+def _field(rng: np.random.Generator, shape: tuple[int, int], patch: int, smooth: bool = True) -> Depth:
+    """A unit normal field whose values hang together over ``patch`` pixels."""
+    rows, columns = max(2, shape[0] // patch), max(2, shape[1] // patch)
+    coarse = rng.standard_normal((rows, columns), dtype=np.float32)
+    field = cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR)
+    return np.asarray(field, np.float32)
+
+
+def measured_depth(
+    clean_m: Depth, blank: NDArray[np.bool_], model: DepthModel, condition: Condition, rng: np.random.Generator
+) -> Depth:
+    """What the camera says where the truth is ``clean_m``.
+
+    Args:
+        clean_m: z (H, W), metres, 0 for nothing there.
+        blank: pixels (H, W) without texture (glass, plain walls), where stereo may make depth up.
+        model: the camera.
+        condition: the weather and light.
+        rng: of this frame.
+
+    Returns:
+        z (H, W), metres, 0 for no measurement.
+    """
+    shape = clean_m.shape
+    zoom = shape[1] / 640.0
+
+    def patch(pixels: float) -> int:
+        return max(1, round(pixels * zoom))
+
+    there = clean_m > 0
+    z = np.where(there, clean_m, np.float32(BEYOND_M))
+    if condition.extinction_per_m > 0:  # contrast under 5 % is not matched (Koschmieder)
+        there &= np.exp(-condition.extinction_per_m * z) > 0.05
+    size = 2 * patch(2) + 1
+    near = cv2.erode(z, np.ones((size, size), np.uint8))
+    edge = (z - near) > np.maximum(0.5, 0.08 * near)
+    mixing = np.float32(0.3 * rng.random())
+    bleed = edge & (_field(rng, shape, patch(12), smooth=False) > 0.2) & (model.bleeding > 0)
+    z = np.where(bleed, near * (1 - mixing) + np.minimum(z, np.float32(60)) * mixing, z)
+    measured = (there | bleed) & (z < 150)
+    noise = np.zeros(shape, np.float32)
+    sigma = model.noise_px * condition.disparity_noise
+    if sigma > 0:
+        common = 0.65 * _unit(_field(rng, shape, patch(16))) + 0.35 * _unit(_field(rng, shape, patch(60)))
+        own = rng.standard_normal(shape, dtype=np.float32)
+        weight = model.correlated
+        noise = _unit(common) * np.float32(weight**0.5) + own * np.float32((1 - weight) ** 0.5)
+    offset = np.float32(model.offset_px * rng.standard_normal())
+    disparity = np.float32(model.focal_baseline_px_m) / np.maximum(z, np.float32(0.2)) + noise * np.float32(sigma) + offset
+    if model.step_px > 0:
+        disparity = np.rint(disparity / np.float32(model.step_px)) * np.float32(model.step_px)
+    seen = np.float32(model.focal_baseline_px_m) / np.maximum(disparity, np.float32(0.1))
+    measured &= disparity > 0.2
+    measured &= _field(rng, shape, patch(20)) < model.hole_level - 1.6 * condition.holes
+    if model.bleeding > 0:
+        measured &= ~(edge & ~bleed & (rng.random(shape, dtype=np.float32) < 0.5))
+    if rng.random() < model.invented_frames:
+        made_up = np.exp(0.3 * _field(rng, shape, max(2, shape[0] // 5))) * np.float32(20)
+        region = _field(rng, shape, max(2, shape[0] // 7)) > 0.3
+        invented = region & (~there | (blank & (_field(rng, shape, patch(40)) > 0.8)))
+        seen, measured = np.where(invented, made_up, seen), measured | invented
+    seen = seen * np.float32(1 + model.scale_error * rng.standard_normal())
+    measured &= (seen > model.min_range_m) & (seen < model.max_range_m)
+    return np.where(measured, seen, np.float32(0)).astype(np.float32)
+
+
+def _unit(field: Depth) -> Depth:
+    return field / np.float32(max(1e-6, float(field.std())))

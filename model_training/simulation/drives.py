@@ -1,0 +1,106 @@
+"""Poses of a plan: the survey's, and every query traversal's. All chance is by seed and drive, not by frame order."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from model_training.simulation.city import City
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.streets import TABLE_I
+from model_training.simulation.traversal import (
+    QueryDrive,
+    Station,
+    lidar_pose,
+    query_pose,
+    stations,
+    survey_error,
+)
+from service.errors import DatasetError
+from service.geometry.rigid import R_BODY_OPTICAL, transform_from
+
+Transforms = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """True poses of the scans, and those that the survey writes down, which are off by its smooth error."""
+
+    stations: list[Station]
+    T_map_lidar: Transforms
+    T_map_lidar_written: Transforms
+
+
+def driven(city: City, plan: SimulationPlan, step_m: float) -> list[Station]:
+    """The stations of the streets that the plan drives.
+
+    Raises:
+        DatasetError: the plan names a street that the city does not have.
+    """
+    known = [street.street for street in city.streets]
+    for wanted in plan.streets:
+        if wanted not in known:
+            raise DatasetError(f"streets: there is no street {wanted!r} here; there are: {', '.join(known)}", field="streets")
+    if not plan.streets:
+        return stations(city, step_m)
+    part = City.__new__(City)
+    part.streets = [street for street in city.streets if street.street in plan.streets]
+    return stations(part, step_m)
+
+
+def survey_of(city: City, plan: SimulationPlan) -> Survey:
+    """The survey drive."""
+    rng = np.random.default_rng([plan.seed, 21])
+    track = driven(city, plan, plan.spacing_m)
+    true = np.array([lidar_pose(city, station, rng, height_m=plan.lidar_height_m) for station in track])
+    written = true.copy()
+    if plan.survey_error:
+        errors = survey_error(np.array([station.travelled for station in track]), rng)
+        written = np.array([T @ error for T, error in zip(true, errors, strict=True)])
+    return Survey(track, true, written)
+
+
+def query_candidates(city: City, plan: SimulationPlan, query: QueryPlan, survey: Survey) -> Transforms:
+    """T_map_camera of more poses than wanted, in the order in which they are tried: some may be blocked.
+
+    For ``per_class`` the order is class by class; ``wanted_of`` says how many of each are kept.
+    """
+    rng = np.random.default_rng([plan.seed, 22, query.traversal, 1 if query.on_track else 0])
+    drive = QueryDrive(
+        aside_m=query.aside_m, heading_deg=query.heading_deg, height_m=plan.camera_height_m, turn_deg=query.turn_deg,
+        pitch_deg=query.pitch_deg,
+    )  # fmt: skip
+    if query.on_track:
+        order = rng.permutation(len(survey.T_map_lidar))
+        return np.array([_camera_on(survey.T_map_lidar[k], plan) for k in order])
+    track = [survey.stations[k] for k in rng.permutation(len(survey.stations))]
+    rounds = 1 + 3 * query.count // max(1, len(track))
+    return np.array([query_pose(city, station, drive, rng) for _ in range(rounds) for station in track])
+
+
+def _camera_on(T_map_lidar: NDArray[np.float64], plan: SimulationPlan) -> NDArray[np.float64]:
+    """A camera that rides below the LiDAR and looks ahead."""
+    T_lidar_camera = transform_from(R_BODY_OPTICAL, np.array([0.0, 0.0, plan.camera_height_m - plan.lidar_height_m]))
+    T: NDArray[np.float64] = T_map_lidar @ T_lidar_camera
+    return T
+
+
+@dataclass(frozen=True)
+class Quota:
+    """How many queries are wanted of each class; one class for all where classes do not count."""
+
+    wanted: list[int]
+    class_of: NDArray[np.int64]  # of every candidate; -1 is wanted nowhere
+
+
+def quota_of(city: City, query: QueryPlan, candidates: Transforms) -> Quota:
+    """Table I's counts, or all alike."""
+    if not query.per_class:
+        return Quota([query.count], np.zeros(len(candidates), np.int64))
+    shapes = [shapely.geometry.shape(feature["geometry"]) for feature in city.streets_geojson()["features"]]
+    points = shapely.points(candidates[:, :2, 3])
+    class_of = np.full(len(candidates), -1, np.int64)
+    for index, shape in enumerate(shapes):
+        class_of[shapely.contains(shape, points)] = index
+    return Quota([count for _, _, count in TABLE_I], class_of)

@@ -1,0 +1,86 @@
+"""What to simulate: the settings of a dataset, frozen and checked."""
+
+import math
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.depth_noise import DEPTHS
+from model_training.simulation.lidar import LIDARS
+from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CameraPlan(_Model):
+    """The RGB-D camera; by default 640 x 480 with 90 degrees of horizontal field."""
+
+    width: int = Field(640, ge=64, le=4096)
+    height: int = Field(480, ge=48, le=4096)
+    horizontal_deg: float = Field(90.0, gt=20, lt=150)
+
+    def pinhole(self) -> PinholeCamera:
+        """Its intrinsics, the optical axis in the middle of the picture."""
+        focal = self.width / 2 / math.tan(math.radians(self.horizontal_deg) / 2)
+        return PinholeCamera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+
+
+class QueryPlan(_Model):
+    """One query traversal; a query set is written for each depth preset, over the same pictures."""
+
+    name: str = Field(pattern=r"^[a-z0-9_]+$")
+    traversal: int = Field(ge=0, description="0 is the survey's own drive, with its own vehicles")
+    count: int = Field(200, ge=1)
+    per_class: bool = False  # Table I's counts of the paper, instead of ``count``
+    on_track: bool = False  # at the survey's own poses: the paper's leaking split
+    depths: tuple[str, ...] = ("precise",)
+    condition: str = "clear"
+    parked_changed: float = Field(0.5, ge=0, le=1)
+    aside_m: float = Field(2.0, ge=0, le=10)
+    heading_deg: float = Field(15.0, ge=0, le=180)
+    turn_deg: float = 0.0
+    pitch_deg: float = 0.0
+    blocked: float = Field(0.0, ge=0, le=0.9)
+    max_depth_m: float | None = Field(None, gt=1)
+
+
+class SimulationPlan(_Model):
+    """A city, its survey and its query traversals."""
+
+    name: str
+    city: Literal["paper", "city"] = "city"
+    seed: int = Field(0, ge=0)
+    size_m: tuple[float, float] = (300.0, 400.0)
+    streets: tuple[str, ...] = ()  # only these are driven; empty: all
+    lidar: str = "paper_32"
+    lidar_height_m: float = 1.8
+    spacing_m: float = Field(1.0, gt=0.01)
+    survey_condition: str = "clear"
+    survey_error: bool = True
+    camera: CameraPlan = CameraPlan()
+    camera_height_m: float = 1.5
+    queries: tuple[QueryPlan, ...] = ()
+
+    def checked(self) -> "SimulationPlan":
+        """Itself, if every preset it names exists.
+
+        Raises:
+            DatasetError: naming the field, the value and what there is.
+        """
+        named = [("lidar", self.lidar, LIDARS), ("survey_condition", self.survey_condition, CONDITIONS)]
+        for query in self.queries:
+            named.append(("condition", query.condition, CONDITIONS))
+            named += [("depth", depth, DEPTHS) for depth in query.depths]
+        for field, value, known in named:
+            if value not in known:
+                raise DatasetError(f"{field}: {value!r} is no preset; there are: {', '.join(known)}", field=field)
+        names = [query.name for query in self.queries]
+        if len(set(names)) != len(names):
+            raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")
+        if self.city != "paper" and any(query.per_class for query in self.queries):
+            raise DatasetError("table1: only the paper's city has the classes of Table I; add --city paper", field="per_class")
+        return self

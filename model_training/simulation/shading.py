@@ -1,0 +1,186 @@
+"""Colour of what rays meet: sun with shadows, sky light, textures, sky and clouds, haze, headlights."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.simulation.conditions import Condition
+from model_training.simulation.meshes import Material
+from model_training.simulation.scene import Hits, Scene
+from model_training.simulation.terrain import Cover, GroundPicture
+
+Colour = NDArray[np.float32]
+
+_COVER_ALBEDO = np.zeros((len(Cover), 3), np.float32)
+_COVER_ALBEDO[Cover.GRASS] = (0.14, 0.21, 0.07)
+_COVER_ALBEDO[Cover.ASPHALT] = (0.12, 0.12, 0.125)
+_COVER_ALBEDO[Cover.PAVING] = (0.34, 0.33, 0.31)
+_COVER_ALBEDO[Cover.MARKING] = (0.62, 0.62, 0.60)
+_COVER_ALBEDO[Cover.SOIL] = (0.22, 0.16, 0.11)
+
+_ROUGHNESS = np.array([0.25, 0.12, 0.30, 0.05, 0.45, 0.04], np.float32)  # contrast of the texture, by material
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Sun and sky of one drive (linear light)."""
+
+    toward_sun: NDArray[np.float64]
+    sun: Colour
+    sky: Colour  # ambient
+    zenith: Colour  # colour of the sky itself
+    horizon: Colour
+    clouds: float
+    haze_per_m: float
+
+    @staticmethod
+    def of(condition: Condition, rng: np.random.Generator) -> "Light":
+        """The sun stands where the hour has it; its azimuth and the clouds differ from drive to drive."""
+        spread = 12.0 if condition.sun_elevation_deg > 20 else 2.0
+        elevation = np.deg2rad(condition.sun_elevation_deg + rng.uniform(-spread, spread))
+        azimuth = rng.uniform(0, 2 * np.pi)
+        warm = np.clip(1.2 - np.sin(elevation), 0.0, 1.0)
+        sun = np.array([1.0, 0.95 - 0.15 * warm, 0.85 - 0.4 * warm]) * 2.4 * condition.sun_strength
+        grey = 1.0 if condition.sun_strength == 0 else rng.uniform(0.0, 0.5)
+        blue, white = np.array([0.30, 0.45, 0.80]), np.array([0.70, 0.72, 0.75])
+        zenith = (blue * (1 - grey) + white * grey) * condition.ambient
+        horizon = (np.array([0.72, 0.80, 0.92]) * (1 - grey) + white * 1.05 * grey) * condition.ambient
+        f = np.float32
+        return Light(
+            np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]),
+            sun.astype(f), (0.75 * (0.5 * zenith + 0.5 * horizon)).astype(f), zenith.astype(f), horizon.astype(f),
+            float(rng.uniform(0.1, 0.8)), condition.extinction_per_m + 1.0 / 2500.0,
+        )  # fmt: skip
+
+
+def _noise(cells: NDArray[np.int32]) -> NDArray[np.float32]:
+    """A number in -1..1 for each whole-numbered cell (n, 3): an integer hash."""
+    h = cells[:, 0].astype(np.uint32) * np.uint32(73856093)
+    h ^= cells[:, 1].astype(np.uint32) * np.uint32(19349663)
+    h ^= cells[:, 2].astype(np.uint32) * np.uint32(83492791)
+    h ^= h >> np.uint32(13)
+    h *= np.uint32(1274126177)
+    h ^= h >> np.uint32(16)
+    return (h & np.uint32(0xFFFF)).astype(np.float32) / np.float32(32767.5) - np.float32(1)
+
+
+def _sky(rays: NDArray[np.float32], light: Light, condition: Condition) -> Colour:
+    up = np.clip(rays[:, 2:3], 0, 1)
+    colour = light.horizon + (light.zenith - light.horizon) * np.sqrt(up)
+    spread = rays[:, :2] / (up + 0.15)
+    wave = np.sin(spread[:, 0] * 3.1 + 1.7 * np.sin(spread[:, 1] * 2.3)) * np.sin(spread[:, 1] * 3.7 + 1.3 * np.sin(spread[:, 0] * 1.9))
+    cover = np.clip(wave + light.clouds, 0, 1)[:, None].astype(np.float32)
+    colour = colour + (np.float32(0.95 * condition.ambient) - colour) * cover * 0.8
+    if condition.sun_strength > 0:
+        toward = np.clip(rays @ light.toward_sun.astype(np.float32), 0, 1)[:, None]
+        colour = colour + light.sun * (toward**400 * 8 + condition.glare * (toward**12 * 0.8 + toward**60 * 3))
+    shaded: Colour = colour.astype(np.float32)
+    return shaded
+
+
+def albedo_of(
+    scene: Scene, ground: GroundPicture, points: NDArray[np.float32], hits: Hits, condition: Condition
+) -> Colour:
+    """Textured albedo (n, 3) at what rays met; every ray has met something."""
+    primitive = hits.primitive
+    material = scene.mesh.material[primitive]
+    albedo = scene.mesh.albedo[primitive]
+    on_ground = material == Material.GROUND
+    albedo[on_ground] = _COVER_ALBEDO[ground.at(points[on_ground, :2])]
+    fine = _noise(np.floor(points * np.array([9, 9, 14], np.float32)).astype(np.int32))
+    coarse = _noise(np.floor(points * np.float32(1.1)).astype(np.int32))
+    albedo = albedo * (1 + _ROUGHNESS[material] * (0.65 * fine + 0.5 * coarse))[:, None]
+    brick = material == Material.BRICK
+    course = np.modf(np.abs(points[brick, 2]) * np.float32(1 / 0.24))[0] < 0.18
+    albedo[brick] *= np.where(course, np.float32(1.25), np.float32(0.95))[:, None]
+    if condition.wet > 0:
+        albedo *= np.float32(1 - 0.45 * condition.wet)
+    if condition.snow_cover > 0:
+        flat = np.abs(hits.normal[:, 2]) > 0.6 * np.linalg.norm(hits.normal, axis=1)
+        lying = flat & (coarse > 1 - 2 * condition.snow_cover)
+        albedo[lying] = 0.85
+    clipped: Colour = np.clip(albedo, 0.0, 1.0)
+    return clipped
+
+
+def shade(
+    scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light,
+    condition: Condition, *, forward: NDArray[np.float64], lit: NDArray[np.bool_] | None = None,
+) -> Colour:  # fmt: skip
+    """Linear light (n, 3) that comes along rays (n, 3) from what they hit.
+
+    Args:
+        scene: what stands there.
+        ground: cover of the ground.
+        origin: of the rays, metres.
+        rays: unit, map frame.
+        hits: of the rays.
+        light: of the drive.
+        condition: of the drive.
+        forward: optical axis, for the headlights.
+        lit: which hits see the sun; None casts shadow rays here.
+    """
+    met = hits.primitive >= 0
+    colour = np.empty((len(rays), 3), np.float32)
+    colour[~met] = _sky(rays[~met], light, condition)
+    solid = Hits(hits.distance[met], hits.primitive[met], hits.normal[met])
+    colour[met] = _surfaces(
+        scene, ground, origin, rays[met], solid, light, condition, forward, None if lit is None else lit[met]
+    )
+    return colour
+
+
+def _surfaces(
+    scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light,
+    condition: Condition, forward: NDArray[np.float64], lit: NDArray[np.bool_] | None,
+) -> Colour:  # fmt: skip
+    """Light from surfaces; every ray has met one."""
+    points = origin.astype(np.float32) + rays * hits.distance[:, None]
+    colour = albedo_of(scene, ground, points, hits, condition)
+    normal = hits.normal / np.maximum(np.sqrt(np.einsum("ij,ij->i", hits.normal, hits.normal)), 1e-12)[:, None]
+    head_on = np.einsum("ij,ij->i", normal, rays)
+    normal *= np.where(head_on > 0, np.float32(-1), np.float32(1))[:, None]
+    received = (0.62 + 0.38 * normal[:, 2:3]) * light.sky
+    if condition.sun_strength > 0:
+        if lit is None:
+            lit = shadows(scene, points, normal, light)
+        facing = np.maximum(normal @ light.toward_sun.astype(np.float32), 0) * lit
+        received += facing[:, None] * light.sun
+    if condition.headlights:
+        axis = np.clip(rays @ forward.astype(np.float32), 0, 1)
+        beam = np.clip((axis - 0.85) / 0.12, 0, 1) ** 2
+        received += (beam * np.abs(head_on) * 14.0 / np.maximum(hits.distance, 2.0) ** 1.6)[:, None]
+    colour *= received
+    glass = scene.mesh.material[hits.primitive] == Material.GLASS
+    if glass.any():
+        mirrored = rays[glass] - 2 * (rays[glass] * normal[glass]).sum(axis=1, keepdims=True) * normal[glass]
+        colour[glass] = 0.6 * colour[glass] + 0.25 * _sky(mirrored, light, condition)
+    through = np.exp(np.float32(-light.haze_per_m) * hits.distance)[:, None]
+    colour *= through
+    colour += light.horizon * (1 - through)
+    return colour
+
+
+def shadows(scene: Scene, points: NDArray[np.float32], normal: NDArray[np.float32], light: Light) -> NDArray[np.bool_]:
+    """Whether points see the sun, started a little off their surfaces."""
+    return scene.lit(points + normal * np.float32(0.03), light.toward_sun)
+
+
+def to_srgb(linear: Colour, exposure: float) -> NDArray[np.float32]:
+    """Display values 0..255 of linear light: exposure, a soft shoulder, gamma 2.2 by table."""
+    step = np.minimum(linear * np.float32(exposure * _CURVE_STEPS / _CURVE_END), np.float32(_CURVE_STEPS - 1))
+    encoded: NDArray[np.float32] = _CURVE[step.astype(np.int32)]
+    return encoded
+
+
+_CURVE_END, _CURVE_STEPS = 12.0, 16384
+
+
+def _curve() -> NDArray[np.float32]:
+    exposed = (np.arange(_CURVE_STEPS) + 0.5) / _CURVE_STEPS * _CURVE_END
+    shoulder = exposed * (1 + exposed / 9.0) / (1 + exposed)
+    return (255.0 * np.minimum(shoulder * 1.25, 1.0) ** (1 / 2.2)).astype(np.float32)
+
+
+_CURVE = _curve()

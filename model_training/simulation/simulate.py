@@ -1,0 +1,276 @@
+"""Write a dataset: scans and picture pairs by a pool of workers, resumable, the same bytes for any number of them.
+
+Every frame draws its errors from its own seed, so neither order nor worker matters. Files are renamed when whole, and
+``dataset.json`` comes last: a folder without it goes on where it stopped.
+"""
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from multiprocessing.pool import Pool
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import (
+    CameraSensor,
+    DatasetDescription,
+    DepthSpec,
+    LidarSensor,
+    Sensors,
+    query_folder,
+    scan_path,
+    write_description,
+    write_tum,
+)
+from model_training.simulation.blocker import Blocker
+from model_training.simulation.camera import take, unit_rays
+from model_training.simulation.city import City
+from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.depth_noise import DEPTHS, measured_depth
+from model_training.simulation.drives import Quota, Survey, query_candidates, quota_of, survey_of
+from model_training.simulation.lidar import LIDARS, scan
+from model_training.simulation.meshes import joined
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.scene import Scene
+from model_training.simulation.shading import Light
+from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
+
+DEPTH_SCALE_M = 0.001
+TOO_NEAR_M = 1.5  # a picture that is mostly nearer shows a vehicle's side: the robot would not stand there
+Report = Callable[[str, int, int], None]  # stage, done, of
+
+
+def simulate(plan: SimulationPlan, out: Path, *, workers: int | None = None, report: Report = lambda *_: None) -> None:
+    """Simulate a plan into the folder ``out``.
+
+    Args:
+        plan: what to simulate.
+        out: a new folder, or one that an interrupted run of the same plan left.
+        workers: processes; by default as many as there are cores.
+        report: told after every frame.
+
+    Raises:
+        DatasetError: the plan names what does not exist, or ``out`` holds something else.
+    """
+    plan = plan.checked()
+    if not _claim(out, plan):
+        return
+    city = City(seed=plan.seed, name=plan.city, size_m=plan.size_m)
+    survey = survey_of(city, plan)
+    workers = workers or os.cpu_count() or 1
+    _survey(city, plan, survey, out, workers, report)
+    for query in plan.queries:
+        _queries(city, plan, query, survey, out, workers, report)
+    _streets(city, out)
+    write_description(out, _description(plan))
+    (out / "simulation.json").rename(out / "simulation.done.json")
+
+
+def _claim(out: Path, plan: SimulationPlan) -> bool:
+    """Whether there is work to do in ``out``; it is then ours."""
+    text = plan.model_dump_json(indent=2) + "\n"
+    for name in ("simulation.done.json", "simulation.json"):
+        path = out / name
+        if path.exists():
+            if path.read_text() != text:
+                raise DatasetError(f"{out} holds the simulation of another plan; choose another --out or remove it", field="out")
+            return name == "simulation.json"
+    if out.exists() and any(out.iterdir()):
+        raise DatasetError(f"{out} is not empty and holds no simulation; choose another --out", field="out")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "simulation.json").write_text(text)
+    return True
+
+
+@dataclass
+class _Job:
+    """What a worker has inherited: the scene and all that is the same for every frame of a traversal."""
+
+    plan: SimulationPlan
+    city: City
+    scene: Scene
+    out: Path
+    survey: Survey | None = None
+    query: QueryPlan | None = None
+    light: Light | None = None
+    camera: PinholeCamera | None = None
+    rays: NDArray[np.float32] | None = None
+    z_of_ray: NDArray[np.float32] | None = None
+    candidates: NDArray[np.float64] | None = None
+
+
+_job: _Job | None = None  # set before the workers are forked: they share the scene instead of copying it
+
+
+def _run(job: _Job, work: Callable[[int], Any], items: Iterable[int], workers: int) -> Iterable[Any]:
+    """Results of ``work`` in the order of ``items``."""
+    global _job
+    _job = job
+    cv2.setNumThreads(1)
+    if workers == 1:
+        yield from map(work, items)
+        return
+    pool: Pool
+    with multiprocessing.get_context("fork").Pool(workers) as pool:
+        yield from pool.imap(work, items, chunksize=4)
+
+
+def _survey(city: City, plan: SimulationPlan, survey: Survey, out: Path, workers: int, report: Report) -> None:
+    scan_path(out, 0).parent.mkdir(parents=True, exist_ok=True)
+    count = len(survey.stations)
+    todo = [k for k in range(count) if not scan_path(out, k).exists()]
+    if todo:
+        scene = Scene(joined([city.static, city.occupants(0)]))
+        job = _Job(plan, city, scene, out, survey=survey, rays=LIDARS[plan.lidar].rays())
+        for done, _ in enumerate(_run(job, _one_scan, todo, workers), count - len(todo) + 1):
+            report("survey", done, count)
+    write_tum(out / "survey" / "poses.txt", np.arange(count) * 0.1, survey.T_map_lidar_written)
+
+
+def _one_scan(number: int) -> int:
+    job = _job
+    if job is None or job.survey is None or job.rays is None:
+        raise RuntimeError("a worker was started without its job")
+    rng = np.random.default_rng([job.plan.seed, 31, number])
+    points = scan(
+        job.scene, LIDARS[job.plan.lidar], job.rays, job.survey.T_map_lidar[number], CONDITIONS[job.plan.survey_condition], rng
+    )
+    _write(scan_path(job.out, number), points.tobytes())
+    return number
+
+
+def _queries(
+    city: City, plan: SimulationPlan, query: QueryPlan, survey: Survey, out: Path, workers: int, report: Report
+) -> None:
+    sets = {depth: query_folder(out, f"{query.name}_{depth}") for depth in query.depths}
+    if all((folder / "poses.txt").exists() for folder in sets.values()):
+        return
+    candidates = query_candidates(city, plan, query, survey)
+    quota = quota_of(city, query, candidates)
+    camera = plan.camera.pinhole()
+    rays, z_of_ray = unit_rays(camera)
+    light = Light.of(CONDITIONS[query.condition], np.random.default_rng([plan.seed, 32, query.traversal]))
+    scene = Scene(joined([city.static, city.occupants(query.traversal, parked_changed=query.parked_changed)]))
+    job = _Job(plan, city, scene, out, query=query, light=light, camera=camera, rays=rays, z_of_ray=z_of_ray, candidates=candidates)
+    chosen = _free_candidates(job, quota, workers)
+    for folder in sets.values():
+        for part in ("rgb", "depth"):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+    job.candidates = candidates[chosen]
+    todo = [k for k in range(len(chosen)) if not all(_pair(folder, k)[1].exists() for folder in sets.values())]
+    for done, _ in enumerate(_run(job, _one_pair, todo, workers), len(chosen) - len(todo) + 1):
+        report(f"queries {query.name}", done, len(chosen))
+    for folder in sets.values():
+        write_tum(folder / "poses.txt", np.arange(len(chosen)) * 1.0, job.candidates)
+
+
+def _free_candidates(job: _Job, quota: Quota, workers: int) -> NDArray[np.int64]:
+    """The first candidates, class by class, that do not stare at something right before them."""
+    left = list(quota.wanted)
+    chosen: dict[int, list[int]] = {k: [] for k in range(len(left))}
+    order = [k for k in range(len(quota.class_of)) if quota.class_of[k] >= 0]
+    step = 256
+    for start in range(0, len(order), step):
+        part = [k for k in order[start : start + step] if left[quota.class_of[k]] > 0]
+        for k, free in zip(part, _run(job, _is_free, part, min(workers, 1)), strict=True):
+            index = int(quota.class_of[k])
+            if free and left[index] > 0:
+                left[index] -= 1
+                chosen[index].append(k)
+        if not any(left):
+            break
+    if any(left):
+        raise DatasetError(
+            f"only {sum(map(len, chosen.values()))} of {sum(quota.wanted)} queries found room; drive more streets or ask for fewer",
+            field="queries",
+        )
+    return np.array([k for index in sorted(chosen) for k in chosen[index]])
+
+
+_COARSE = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
+
+
+def _is_free(k: int) -> bool:
+    job = _job
+    if job is None or job.candidates is None:
+        raise RuntimeError("a worker was started without its job")
+    rays, _ = unit_rays(_COARSE)
+    T = job.candidates[k]
+    distance = job.scene.distances(T[:3, 3], rays @ T[:3, :3].T.astype(np.float32))
+    met = distance[distance > 0]
+    return len(met) > 0 and float(np.percentile(met, 40)) > TOO_NEAR_M
+
+
+def _pair(folder: Path, number: int) -> tuple[Path, Path]:
+    return folder / "rgb" / f"{number:06d}.jpg", folder / "depth" / f"{number:06d}.png"
+
+
+def _one_pair(number: int) -> int:
+    job = _job
+    if job is None or job.query is None or job.light is None or job.camera is None or job.candidates is None:
+        raise RuntimeError("a worker was started without its job")
+    if job.rays is None or job.z_of_ray is None:
+        raise RuntimeError("a worker was started without its rays")
+    plan, query, T = job.plan, job.query, job.candidates[number]
+    condition = CONDITIONS[query.condition]
+    key = [plan.seed, 33, query.traversal, number]
+    rng = np.random.default_rng(key)
+    blocker = None
+    if query.blocked > 0:
+        blocker = Blocker.before(T, job.city.height(T[0, 3], T[1, 3]), query.blocked, rng)
+    picture = take(job.scene, job.city.ground, job.camera, T, job.light, condition, rng,
+                   rays_camera=job.rays, z_of_ray=job.z_of_ray, blocker=blocker)  # fmt: skip
+    encoded = cv2.imencode(".jpg", picture.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+    for index, name in enumerate(query.depths):
+        folder = query_folder(job.out, f"{query.name}_{name}")
+        rgb_path, depth_path = _pair(folder, number)
+        depth = measured_depth(picture.depth_m, picture.blank, DEPTHS[name], condition, np.random.default_rng([*key, index]))
+        if query.max_depth_m is not None:
+            depth[depth > query.max_depth_m] = 0
+        steps = np.rint(depth / DEPTH_SCALE_M).clip(0, 65535).astype(np.uint16)
+        _write(rgb_path, encoded)
+        _write(depth_path, cv2.imencode(".png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+    return number
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Write a file under another name first, so that one that exists is whole."""
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(data)
+    part.rename(path)
+
+
+def _streets(city: City, out: Path) -> None:
+    _write(out / "streets.geojson", (json.dumps(city.streets_geojson()) + "\n").encode())
+
+
+def _description(plan: SimulationPlan) -> DatasetDescription:
+    lidar, camera = LIDARS[plan.lidar], plan.camera.pinhole()
+    return DatasetDescription(
+        name=plan.name,
+        source={"kind": "simulation", "plan": plan.model_dump(mode="json")},
+        sensors=Sensors(
+            lidars=[
+                LidarSensor(
+                    name=lidar.name, channels=lidar.channels, top_deg=lidar.top_deg, bottom_deg=lidar.bottom_deg,
+                    max_range_m=lidar.max_range_m,
+                )
+            ],
+            cameras=[
+                CameraSensor(
+                    name="front", width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
+                    depth=DepthSpec(scale_m=DEPTH_SCALE_M, kind="z", max_range_m=None),
+                )
+            ],
+        ),
+        conditions={"survey": plan.survey_condition, "queries": {query.name: query.condition for query in plan.queries}},
+        seed=plan.seed,
+    )  # fmt: skip
+

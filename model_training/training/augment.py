@@ -1,0 +1,163 @@
+"""What sensors do to a clean view, drawn anew for every pair: noise, gaps, blocked parts, cut rows and columns.
+
+All works on batches on the view grid. The presets that bars are measured with (``simulation.depth_noise``) act on whole
+pictures with other code and other seeds; here only the kinds of error are the same, over wider ranges.
+"""
+
+import torch
+from pydantic import BaseModel, ConfigDict
+from torch import Tensor
+from torch.nn import functional
+
+from service.imaging.view_grid import ViewGrid
+
+FOCAL_BASELINE_PX_M = 80.0
+
+
+class Augmentation(BaseModel):
+    """Shares are probabilities a view; metres, pixels of disparity at 80 px m."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    disparity_noise_px: tuple[float, float] = (0.02, 0.7)
+    scale_error: float = 0.03
+    invented_depth: float = 0.15
+    short_range: float = 0.4
+    shortest_range_m: float = 12.0
+    no_colour: float = 0.4
+    narrow_rows: float = 0.2
+    narrow_columns: float = 0.3
+    blocked: float = 0.35
+    widest_block: float = 0.45
+    small_blocks: float = 0.3
+    unseen_top_rows: float = 0.15
+    survey_noise_m: float = 0.02
+    survey_dropout: float = 0.05
+    height_error_m: float = 0.08
+
+
+class Augmenter:
+    """Draws errors for batches of views; all its chance comes from one generator."""
+
+    def __init__(self, settings: Augmentation, grid: ViewGrid, generator: torch.Generator, device: torch.device) -> None:
+        self.settings, self.grid, self._generator, self._device = settings, grid, generator, device
+        self.elevation = torch.tensor(grid.elevations_rad, dtype=torch.float32, device=device)[:, None]
+        self.azimuth = torch.tensor(grid.azimuths_rad.copy(), dtype=torch.float32, device=device)[None, :]
+        # z of the optical axis for each metre of range, of a level camera
+        self.z_of_range = torch.cos(self.elevation) * torch.cos(self.azimuth)
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self._generator, device=self._device)
+
+    def _normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self._generator, device=self._device)
+
+    def _chance(self, count: int, share: float) -> Tensor:
+        return self._uniform(count, 1, 1) < share
+
+    def _field(self, count: int, rows: int, columns: int) -> Tensor:
+        coarse = self._normal(count, 1, rows, columns)
+        size = (self.grid.rows, self.grid.columns)
+        return functional.interpolate(coarse, size=size, mode="bilinear", align_corners=False)[:, 0]
+
+    def cut_rows(self, rows_seen: Tensor, count: int) -> Tensor:
+        """Rows (B, rows, 1) that the survey covers: the sensor's, and sometimes fewer at the top."""
+        row = torch.arange(self.grid.rows, device=self._device)[None, :, None]
+        top = (self._uniform(count, 1, 1) * 9 + 8).floor() * self._chance(count, self.settings.unseen_top_rows)
+        return rows_seen.reshape(1, -1, 1) & (row >= top)
+
+    def survey(self, ranges: Tensor, height_m: Tensor, rows_seen: Tensor) -> Tensor:
+        """Planes (B, 5, rows, columns) of LiDAR views (B, rows, columns), metres."""
+        s, count = self.settings, len(ranges)
+        noisy = ranges + self._normal(*ranges.shape) * s.survey_noise_m
+        lost = self._uniform(*ranges.shape) < s.survey_dropout * self._uniform(count, 1, 1)
+        keep = (ranges > 0) & ~lost & rows_seen & (noisy < self.grid.max_range_m)
+        return self._planes(noisy * keep, height_m, rows_seen.expand_as(ranges), None)
+
+    def query(self, ranges: Tensor, rgb: Tensor, height_m: Tensor, rows_seen: Tensor) -> Tensor:
+        """Planes (B, 5, rows, columns) of clean query views (B, rows, columns) with colour (B, 3, rows, columns) 0..255."""
+        s, count = self.settings, len(ranges)
+        blocked = ranges
+        blocked = self._block(blocked, height_m, self._chance(count, s.blocked), 0.12, s.widest_block)
+        blocked = self._block(blocked, height_m, self._chance(count, s.small_blocks), 0.03, 0.2)
+        z, measured = self._stereo(blocked * self.z_of_range, blocked > 0)
+        observed = rows_seen.expand_as(ranges) & self._field_of_view(count)
+        reach = torch.where(
+            self._chance(count, s.short_range),
+            s.shortest_range_m + (self.grid.max_range_m - s.shortest_range_m) * self._uniform(count, 1, 1),
+            torch.full((count, 1, 1), self.grid.max_range_m, device=self._device),
+        )
+        distance = z / self.z_of_range
+        keep = measured & observed & (z < reach) & (distance < self.grid.max_range_m) & (distance > self.grid.min_range_m)
+        height = height_m + self._normal(count) * s.height_error_m
+        return self._planes(distance * keep, height, observed, self._colour(rgb))
+
+    def _stereo(self, z: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+        """Disparity noise, partly correlated; bleeding edges; made-up depth where there is none; holes; a wrong scale."""
+        s, count = self.settings, len(z)
+        z = z * (1 + (self._uniform(count, 1, 1) * 2 - 1) * s.scale_error)
+        low, high = (torch.log(torch.tensor(v)) for v in s.disparity_noise_px)
+        sigma = torch.exp(low + (high - low) * self._uniform(count, 1, 1))
+        rows, columns = self.grid.rows, self.grid.columns
+        noise = 1.0 * self._field(count, 12, 40) + 0.5 * self._field(count, 4, 12) + 0.5 * self._normal(count, rows, columns)
+        disparity = FOCAL_BASELINE_PX_M / z.clamp(min=0.3) + sigma * noise
+        far = 150.0
+        seen = torch.where(measured, FOCAL_BASELINE_PX_M / disparity.clamp(min=0.5), torch.full_like(z, far))
+        near = -functional.max_pool2d(-seen[:, None], 3, 1, 1)[:, 0]
+        bleeding = self._field(count, 8, 32) > 1.2 - 1.2 * self._uniform(count, 1, 1)
+        seen = torch.where(bleeding, near, seen)
+        measured = (measured | bleeding) & (seen < 0.9 * far)
+        region = self._chance(count, s.invented_depth) & (self._field(count, 4, 8) > 0.3)
+        made_up = 18.0 * torch.exp(0.4 * self._field(count, 2, 4))
+        seen = torch.where(region & ~measured, made_up, seen)
+        measured = measured | region
+        measured = measured & (self._field(count, 8, 24) < 2.2 - 1.6 * self._uniform(count, 1, 1))
+        return seen, measured
+
+    def _block(self, ranges: Tensor, height_m: Tensor, happens: Tensor, narrowest: float, widest: float) -> Tensor:
+        """A vehicle's side: an upright plane 2.5 to 8.5 m away over a share of the columns, its top 1.3 to 4 m high."""
+        count = len(ranges)
+        width = (narrowest + (widest - narrowest) * self._uniform(count, 1, 1)) * self.grid.columns
+        left = self._uniform(count, 1, 1) * (self.grid.columns + 0.6 * width) - 0.6 * width
+        column = torch.arange(self.grid.columns, device=self._device)[None, None, :]
+        distance = 2.5 + 6.0 * self._uniform(count, 1, 1)
+        facing = (self._uniform(count, 1, 1) - 0.5) * 1.6
+        slant = torch.cos(self.azimuth - facing).clamp(min=0.25)
+        plane = distance / (slant * torch.cos(self.elevation))
+        top = 1.3 + 2.7 * self._uniform(count, 1, 1)
+        height = height_m.reshape(-1, 1, 1) + plane * torch.sin(self.elevation)
+        hides = happens & (column >= left) & (column < left + width) & (height < top) & (height > 0.25)
+        hides = hides & ((ranges <= 0) | (ranges > plane))
+        return torch.where(hides, plane, ranges)
+
+    def _field_of_view(self, count: int) -> Tensor:
+        """Cells (B, rows, columns) that the camera looks at: narrower cameras, cut borders."""
+        s = self.settings
+        row = torch.arange(self.grid.rows, device=self._device)[None, :, None]
+        column = torch.arange(self.grid.columns, device=self._device)[None, None, :]
+        top = self._chance(count, s.narrow_rows) * self._uniform(count, 1, 1) * 10
+        bottom = self._chance(count, s.narrow_rows) * self._uniform(count, 1, 1) * 10
+        narrow = self._chance(count, s.narrow_columns)
+        both = narrow * self._uniform(count, 1, 1) * 14
+        left = both + narrow * self._uniform(count, 1, 1) * 12
+        right = both + narrow * self._uniform(count, 1, 1) * 12
+        return (row >= top) & (row < self.grid.rows - bottom) & (column >= left) & (column < self.grid.columns - right)
+
+    def _colour(self, rgb: Tensor) -> Tensor:
+        """V1, V2 (B, 2, rows, columns) in grey levels (eq. 9): other white balance and saturation, noise, often none."""
+        count = len(rgb)
+        balance = 1 + 0.12 * self._normal(count, 3, 1, 1)
+        r, g, b = ((rgb * balance)[:, k] for k in range(3))
+        planes = torch.stack([(2 * b - r - g) / 6**0.5, (g - r) / 2**0.5], dim=1)
+        saturation = torch.exp(0.4 * self._normal(count, 1, 1, 1)) * (self._uniform(count, 1, 1, 1) > self.settings.no_colour)
+        return (planes + 3.0 * self._normal(*planes.shape)) * saturation
+
+    def _planes(self, ranges: Tensor, height_m: Tensor, observed: Tensor, colour: Tensor | None) -> Tensor:
+        heights = (ranges * torch.sin(self.elevation) + height_m.reshape(-1, 1, 1)) * (ranges > 0)
+        if colour is None:
+            colour = torch.zeros(len(ranges), 2, self.grid.rows, self.grid.columns, device=self._device)
+        seen = observed.to(ranges.dtype)
+        colour = colour * seen[:, None]
+        return torch.cat([ranges[:, None], colour, heights[:, None], seen[:, None]], dim=1)
+
+

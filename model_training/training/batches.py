@@ -1,0 +1,71 @@
+"""Batches of pairs: all of one city, half of them from one neighbourhood, so that negatives are hard."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from model_training.training.packs import Pack
+from service.imaging.view_grid import ViewGrid
+
+PAIR_REACH_M = 2.5
+NEIGHBOURHOOD_M = 70.0
+TURN_DEG = 9.0  # a fan of 24 headings is off by at most 7.5
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Clean views of pairs: tensors (B, rows, columns), colour (B, 3, rows, columns), heights and positions (m)."""
+
+    survey_ranges: Tensor
+    survey_height_m: Tensor
+    query_ranges: Tensor
+    query_rgb: Tensor
+    query_height_m: Tensor
+    rows_seen: Tensor
+    survey_xy: Tensor
+    query_xy: Tensor
+
+    @property
+    def images(self) -> int:
+        """Branches of pairs in the batch."""
+        return 2 * len(self.query_xy)
+
+
+class City:
+    """One pack with what sampling needs: which places lie near each query, and which queries near each other."""
+
+    def __init__(self, pack: Pack, grid: ViewGrid) -> None:
+        self.pack, self._grid = pack, grid
+        places = cKDTree(pack.places[:, :2])
+        self._places_near = places.query_ball_point(pack.queries[:, :2], PAIR_REACH_M)
+        self._queries = cKDTree(pack.queries[:, :2])
+        self.usable = np.array([k for k, near in enumerate(self._places_near) if near])
+
+    def draw(self, pairs: int, rng: np.random.Generator) -> Batch:
+        """Draw a batch of up to ``pairs`` pairs."""
+        pack, grid = self.pack, self._grid
+        middle = pack.queries[rng.integers(len(pack.queries)), :2]
+        near = np.array(self._queries.query_ball_point(middle, NEIGHBOURHOOD_M))
+        near = near[np.isin(near, self.usable)]
+        half = rng.choice(near, min(len(near), pairs // 2), replace=False) if len(near) else np.zeros(0, int)
+        chosen = np.unique(np.concatenate([half, rng.choice(self.usable, pairs - len(half), replace=False)]).astype(int))
+        place = np.array([rng.choice(self._places_near[k]) for k in chosen])
+        queries, places = pack.queries[chosen], pack.places[place]
+        turn = np.deg2rad(rng.uniform(-TURN_DEG, TURN_DEG, len(chosen)))
+        heading = queries[:, 2] + turn - places[:, 2]
+        columns = np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int) % grid.around
+        views: NDArray[np.float32] = np.stack(
+            [pack.panoramas[p][:, c] for p, c in zip(place, columns, strict=True)]
+        ).astype(np.float32)
+
+        def tensor(array: NDArray[np.generic]) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(array)).float()
+
+        return Batch(
+            tensor(views), tensor(places[:, 3]), tensor(pack.ranges[chosen]), tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)),
+            tensor(queries[:, 3]), torch.from_numpy(np.array(pack.rows_seen)), tensor(places[:, :2]), tensor(queries[:, :2]),
+        )  # fmt: skip

@@ -1,0 +1,87 @@
+"""The CNN: twelve layers with learned weights, one encoder for both sides.
+
+conv1 reads the planes of a view (``service.imaging.view_grid.PLANES``) after a fixed normalisation; its input channels
+are doubled, so each side has filters of its own there, and all that follows is shared. conv11 narrows the channels and
+the last layer, fully connected, keeps *where* things are: it reads the flattened map, not an average.
+
+   1 conv 3x3 /2   2-3 conv 3x3   4 conv 3x3 /2   5-6 conv 3x3 (+)   7 conv 3x3 /2   8-9 conv 3x3 (+)
+  10 conv 3x3 /(2,1)   11 conv 1x1   12 fully connected -> unit vector            (+) with a shortcut around the pair
+"""
+
+import torch
+from pydantic import BaseModel, ConfigDict
+from torch import Tensor, nn
+from torch.nn import functional
+
+from service.imaging.view_grid import PLANES
+
+LAYERS = 12
+CHANNELS = 6  # log range, measured, height, observed, V1, V2
+
+
+class EncoderShape(BaseModel):
+    """Widths of the encoder; the defaults are the stock encoder's."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rows: int = 32
+    columns: int = 128
+    widths: tuple[int, int, int, int] = (24, 48, 72, 96)
+    narrow: int = 48
+    descriptor: int = 256
+
+
+class EncoderNet(nn.Module):
+    """Planes of either side into unit descriptors."""
+
+    def __init__(self, shape: EncoderShape) -> None:
+        super().__init__()
+        self.shape = shape
+        a, b, c, d = shape.widths
+        self.conv1 = _conv(2 * CHANNELS, a, (2, 2))
+        self.conv2, self.conv3 = _conv(a, a), _conv(a, a)
+        self.conv4 = _conv(a, b, (2, 2))
+        self.conv5, self.conv6 = _conv(b, b), _conv(b, b)
+        self.conv7 = _conv(b, c, (2, 2))
+        self.conv8, self.conv9 = _conv(c, c), _conv(c, c)
+        self.conv10 = _conv(c, d, (2, 1))
+        self.conv11 = nn.Conv2d(d, shape.narrow, 1)
+        cells = -(-shape.rows // 16) * -(-shape.columns // 8)
+        self.full12 = nn.Linear(shape.narrow * cells, shape.descriptor)
+
+    def forward(self, planes: Tensor, side: Tensor) -> Tensor:
+        """Descriptors (B, D) of planes (B, 5, rows, columns); ``side`` (B) is 0 for survey views, 1 for queries."""
+        x = normalised(planes)
+        query = side.reshape(-1, 1, 1, 1)
+        x = self.conv1(torch.cat([x * (1 - query), x * query], dim=1))
+        x = self.conv3(self.conv2(x))
+        x = self.conv4(x)
+        x = x + self.conv6(self.conv5(x))
+        x = self.conv7(x)
+        x = x + self.conv9(self.conv8(x))
+        x = functional.relu(self.conv11(self.conv10(x)))
+        # Rows first whatever the memory format, so that torch and ONNX flatten alike.
+        return functional.normalize(self.full12(x.flatten(1)), dim=1)
+
+
+def normalised(planes: Tensor) -> Tensor:
+    """Metres and grey levels into numbers near one, in the graph itself, so that no caller can forget it."""
+    distance, v1, v2, height, observed = (planes[:, k : k + 1] for k in range(len(PLANES)))
+    measured = (distance > 0).to(planes.dtype)
+    return torch.cat(
+        [
+            torch.log(distance.clamp(0.5, 40.0) / 10.0) * measured,
+            measured,
+            (height.clamp(-4.0, 14.0) / 4.0 - 0.4) * measured,
+            observed,
+            (v1 / 40.0).clamp(-2, 2),
+            (v2 / 40.0).clamp(-2, 2),
+        ],
+        dim=1,
+    )
+
+
+def _conv(inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+    )

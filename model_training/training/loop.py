@@ -1,0 +1,214 @@
+"""The training loop: draws pairs, steps, logs, saves, resumes."""
+
+import json
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict
+from torch.utils.tensorboard import SummaryWriter
+
+from model_training.training.augment import Augmentation, Augmenter
+from model_training.training.batches import City
+from model_training.training.encoder_net import EncoderNet, EncoderShape
+from model_training.training.losses import paired_info_nce
+from model_training.training.packs import Pack
+from service.errors import DatasetError
+from service.imaging.view_grid import ViewGrid
+
+
+class TrainingConfig(BaseModel):
+    """Everything that decides what a run learns; kept beside its checkpoint, and a differing one is refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    steps: int = 4000
+    pairs: int = 128
+    optimiser: Literal["adamw", "sgdm"] = "adamw"
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-3
+    momentum: float = 0.9  # of sgdm
+    warm_up_steps: int = 100
+    gradient_norm: float = 2.0
+    largest_scale: float = 60.0
+    seed: int = 0
+    encoder: EncoderShape = EncoderShape()
+    augmentation: Augmentation = Augmentation()
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """State after a step, for bars and logs; ``accuracy`` is the share of pairs whose own survey view came first."""
+
+    step: int
+    steps: int
+    loss: float
+    accuracy: float
+    images_per_s: float
+
+
+def device_of(name: str) -> torch.device:
+    """``auto`` takes CUDA where there is one."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(name)
+
+
+def train(
+    packs: list[Path], run: Path, config: TrainingConfig, *, device: str = "auto", resume: bool = True, save_every: int = 200,
+    start_from: Path | None = None,
+    report: Callable[[Progress], None] = lambda _: None,
+) -> EncoderNet:  # fmt: skip
+    """Train an encoder on packs; the run's folder holds ``config.json``, ``checkpoint.pt`` and TensorBoard's log.
+
+    The first Ctrl-C saves a checkpoint and ends; the same call goes on from there.
+
+    Raises:
+        DatasetError: the run's folder belongs to another configuration.
+        KeyboardInterrupt: after the checkpoint was saved.
+    """
+    grid, place = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns), device_of(device)
+    run.mkdir(parents=True, exist_ok=True)
+    _keep_config(run, config)
+    before = [] if start_from is None else json.loads((start_from / "packs.json").read_text())
+    (run / "packs.json").write_text(json.dumps(before + [folder.name for folder in packs], indent=1) + "\n")
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng(config.seed)
+    generator = torch.Generator(device=place).manual_seed(config.seed)
+    net = EncoderNet(config.encoder).to(place, memory_format=torch.channels_last)
+    log_scale = torch.nn.Parameter(torch.tensor(float(np.log(1 / 0.07)), device=place))
+    optimiser = _optimiser([*net.parameters(), log_scale], config)
+    checkpoint = run / "checkpoint.pt"
+    first = 0
+    if start_from is not None:
+        net.load_state_dict(load_run(start_from, device=str(place)).state_dict())
+    if resume and checkpoint.exists():
+        state = torch.load(checkpoint, map_location=place, weights_only=True)
+        net.load_state_dict(state["net"])
+        optimiser.load_state_dict(state["optimiser"])
+        log_scale.data.copy_(state["log_scale"])
+        generator.set_state(state["generator"].cpu())
+        rng.bit_generator.state = json.loads(state["rng"])
+        first = int(state["step"])
+    cities = [City(Pack.open(folder), grid) for folder in packs]
+    augment = Augmenter(config.augmentation, grid, generator, place)
+
+    def save(step: int) -> None:
+        part = checkpoint.with_suffix(".part")
+        torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "log_scale": log_scale.detach(), "step": step,
+                    "generator": generator.get_state(), "rng": json.dumps(rng.bit_generator.state)}, part)  # fmt: skip
+        part.rename(checkpoint)
+
+    net.train()
+    with SummaryWriter(str(run / "tensorboard")) as log, _Interrupt() as interrupt:
+        began, images = time.perf_counter(), 0
+        for step in range(first, config.steps):
+            _set_rate(optimiser, config, step)
+            batch = cities[int(rng.integers(len(cities)))].draw(config.pairs, rng)
+            count = len(batch.query_xy)
+            rows_seen = augment.cut_rows(batch.rows_seen.to(place), count)
+            surveys = augment.survey(batch.survey_ranges.to(place), batch.survey_height_m.to(place), rows_seen)
+            queries = augment.query(
+                batch.query_ranges.to(place), batch.query_rgb.to(place), batch.query_height_m.to(place), rows_seen
+            )
+            planes = torch.cat([queries, surveys]).contiguous(memory_format=torch.channels_last)
+            side = torch.cat([torch.ones(count, device=place), torch.zeros(count, device=place)])
+            descriptors = net(planes, side)
+            scale = log_scale.exp().clamp(max=config.largest_scale)
+            losses, first_ones = paired_info_nce(
+                descriptors[:count], descriptors[count:], batch.query_xy.to(place), batch.survey_xy.to(place), scale=scale
+            )
+            loss = losses.mean()
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped
+            torch.nn.utils.clip_grad_norm_(net.parameters(), config.gradient_norm)
+            optimiser.step()
+            images += batch.images
+            state_now = Progress(
+                step + 1, config.steps, float(loss.detach()), float(first_ones.float().mean()), images / (time.perf_counter() - began)
+            )
+            report(state_now)
+            if (step + 1) % 10 == 0:
+                log.add_scalar("loss", state_now.loss, step + 1)
+                log.add_scalar("own_view_first", state_now.accuracy, step + 1)
+                log.add_scalar("scale", float(scale.detach()), step + 1)
+            if (step + 1) % save_every == 0 or step + 1 == config.steps:
+                save(step + 1)
+            if interrupt.asked:
+                save(step + 1)
+                raise KeyboardInterrupt
+    return net.eval()
+
+
+def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:
+    """The network of a run's last checkpoint, ready for use.
+
+    Raises:
+        DatasetError: the folder holds no run.
+    """
+    if not (run / "checkpoint.pt").exists():
+        raise DatasetError(f"{run} holds no checkpoint.pt; train first: streetfix train --run {run}", field="run")
+    config = TrainingConfig.model_validate_json((run / "config.json").read_bytes())
+    net = EncoderNet(config.encoder)
+    net.load_state_dict(torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)["net"])
+    return net.eval()
+
+
+def trained_on(run: Path) -> tuple[str, ...]:
+    """Cities that a run was trained on, ``KIND-SEED``, those of the run that it started from included."""
+    names: list[str] = json.loads((run / "packs.json").read_text())
+    return tuple("-".join(name.split("-")[1:3]) for name in names)
+
+
+def _keep_config(run: Path, config: TrainingConfig) -> None:
+    path = run / "config.json"
+    if path.exists():
+        if TrainingConfig.model_validate_json(path.read_bytes()) != config:
+            raise DatasetError(f"{path} is of another configuration; take another --run folder, or remove this one", field="run")
+        return
+    path.write_text(config.model_dump_json(indent=2) + "\n")
+
+
+def _optimiser(parameters: list[torch.nn.Parameter], config: TrainingConfig) -> torch.optim.Optimizer:
+    if config.optimiser == "sgdm":
+        return torch.optim.SGD(
+            parameters, lr=config.learning_rate, momentum=config.momentum, weight_decay=config.weight_decay, nesterov=True
+        )
+    return torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
+
+
+def _set_rate(optimiser: torch.optim.Optimizer, config: TrainingConfig, step: int) -> None:
+    """Linear warm-up, then half a cosine down to a hundredth."""
+    warm = min(1.0, (step + 1) / max(1, config.warm_up_steps))
+    rate = config.learning_rate * warm * (0.5 * (1 + np.cos(np.pi * step / config.steps)) + 0.01)
+    for group in optimiser.param_groups:
+        group["lr"] = rate
+
+
+class _Interrupt:
+    """Turns the first Ctrl-C into a wish to end after the step; the second ends at once."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> "_Interrupt":
+        try:
+            self._before = signal.signal(signal.SIGINT, self._note)
+        except ValueError:  # not in the main thread: Ctrl-C is not ours to take
+            self._before = None
+        return self
+
+    def _note(self, _signal: int, _frame: FrameType | None) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)

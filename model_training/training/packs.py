@@ -1,0 +1,177 @@
+"""Training data: a simulated city as levelled panoramas and clean query views on the view grid.
+
+A pack is what one city gives: small enough to keep many, and free of the errors that training draws anew each time it
+shows a pair (``augment``). Panoramas go through the same levelling and resampling as those of a real survey.
+"""
+
+import multiprocessing
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.simulation.city import City
+from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.lidar import LIDARS, scan
+from model_training.simulation.meshes import joined
+from model_training.simulation.scene import Scene
+from model_training.simulation.shading import Light, shade, to_srgb
+from model_training.simulation.traversal import lidar_pose, stations, upright_on
+from service.geometry.rigid import heading_of_body, rotation_x, rotation_y, rotation_z
+from service.imaging.pca import level_scan
+from service.imaging.view_grid import ViewGrid, panorama_from_points
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PackPlan:
+    """What one city of the training set holds; the numbers that change a pack are in its file name."""
+
+    seed: int
+    name: str = "city"
+    places: int = 1200
+    queries_a_place: int = 3
+    lidar: str = "paper_32"
+    size_m: tuple[float, float] = (300.0, 400.0)
+
+    @property
+    def stem(self) -> str:
+        """File name of the pack, without its ending."""
+        return f"pack{FORMAT}-{self.name}-{self.seed}-{self.places}x{self.queries_a_place}-{self.lidar}"
+
+
+@dataclass(frozen=True)
+class Pack:
+    """One city, memory-mapped.
+
+    ``panoramas`` (P, rows, around) metres; ``places`` (P, 4): x, y, heading of the panorama's x axis, LiDAR height (m, rad);
+    ``rows_seen`` (rows); ``ranges`` (Q, rows, columns) metres; ``rgb`` (Q, rows, columns, 3); ``queries`` (Q, 4): x, y,
+    heading, camera height.
+    """
+
+    panoramas: NDArray[np.float16]
+    places: NDArray[np.float64]
+    rows_seen: NDArray[np.bool_]
+    ranges: NDArray[np.float16]
+    rgb: NDArray[np.uint8]
+    queries: NDArray[np.float64]
+
+    @staticmethod
+    def open(folder: Path) -> "Pack":
+        """Map a pack's arrays; they are read as they are needed."""
+        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in Pack.__annotations__}
+        return Pack(**arrays)
+
+
+def rows_seen_by(panoramas: NDArray[np.float16], *, least: float = 0.02) -> NDArray[np.bool_]:
+    """Rows that a survey's sensor covers: those with a share of measured cells that is not negligible."""
+    measured = (np.asarray(panoramas[:: max(1, len(panoramas) // 200)]) > 0).mean(axis=(0, 2))
+    seen: NDArray[np.bool_] = measured > least
+    return seen
+
+
+def make_packs(
+    plans: list[PackPlan], root: Path, grid: ViewGrid, *, workers: int | None = None,
+    report: Callable[[str, int, int], None] = lambda *_: None,
+) -> list[Path]:  # fmt: skip
+    """Make the packs that are not there yet, a city a process, and say where all of them lie."""
+    root.mkdir(parents=True, exist_ok=True)
+    folders = [root / plan.stem for plan in plans]
+    missing = [plan for plan, folder in zip(plans, folders, strict=True) if not folder.exists()]
+    if missing:
+        report("training cities", 0, len(missing))
+        with multiprocessing.get_context("spawn").Pool(workers or os.cpu_count(), maxtasksperchild=1) as pool:
+            for done, _ in enumerate(pool.imap_unordered(partial(_make_in, root=root, grid=grid), missing), 1):
+                report("training cities", done, len(missing))
+    return folders
+
+
+def _make_in(plan: PackPlan, root: Path, grid: ViewGrid) -> None:
+    make_pack(plan, root / plan.stem, grid)
+
+
+def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
+    """Simulate a city and write its pack; the folder appears whole or not at all."""
+    city = City(seed=plan.seed, name=plan.name, size_m=plan.size_m)
+    rng = np.random.default_rng([104729, plan.seed, plan.places])
+    model, clear = LIDARS[plan.lidar], CONDITIONS["clear"]
+    lidar_rays = model.rays()
+    along = stations(city, 1.2, lane_m=0.0)
+    chosen = [along[k] for k in rng.permutation(len(along))[: plan.places]]
+    survey = Scene(joined([city.static, city.occupants(0)]))
+    panoramas = np.zeros((len(chosen), grid.rows, grid.around), np.float16)
+    places = np.zeros((len(chosen), 4))
+    for k, station in enumerate(chosen):
+        aside = rng.uniform(-2.2, 2.2)
+        x, y = station.x + aside * np.sin(station.heading), station.y - aside * np.cos(station.heading)
+        moved = type(station)(x, y, station.heading + (np.pi if rng.random() < 0.5 else 0.0), station.travelled)
+        T = lidar_pose(city, moved, rng, height_m=1.8 + rng.normal(0, 0.08))
+        points = scan(survey, model, lidar_rays, T, clear, rng)[:, :3]
+        level = level_scan(points)
+        panoramas[k] = panorama_from_points(points @ level.R_level_sensor.T.astype(np.float32), grid)
+        R_map_level = T[:3, :3] @ level.R_level_sensor.T
+        places[k] = (x, y, heading_of_body(np.vstack([np.c_[R_map_level, [0, 0, 0]], [0, 0, 0, 1]])), level.height_m)
+    del survey
+    ranges, rgb, queries = _queries(city, plan, places, grid, rng)
+    arrays = {
+        "panoramas": panoramas, "places": places, "rows_seen": rows_seen_by(panoramas),
+        "ranges": ranges, "rgb": rgb, "queries": queries,
+    }  # fmt: skip
+    part = folder.with_name(folder.name + ".part")
+    part.mkdir(parents=True, exist_ok=True)
+    for name, array in arrays.items():
+        np.save(part / f"{name}.npy", array)
+    part.rename(folder)
+
+
+def _queries(
+    city: City, plan: PackPlan, places: NDArray[np.float64], grid: ViewGrid, rng: np.random.Generator
+) -> tuple[NDArray[np.float16], NDArray[np.uint8], NDArray[np.float64]]:
+    """Clean range and colour of query views, each ray of a cell its centre's, shaken a little."""
+    drives = max(1, plan.queries_a_place)
+    total = len(places) * plan.queries_a_place
+    ranges = np.zeros((total, grid.rows, grid.columns), np.float16)
+    rgb = np.zeros((total, grid.rows, grid.columns, 3), np.uint8)
+    queries = np.zeros((total, 4))
+    cells = grid.rays_level().reshape(-1, 3)
+    row = 0
+    for drive in range(1, drives + 1):  # each with its own vehicles and people, sun and clouds
+        scene = Scene(joined([city.static, city.occupants(drive)]))
+        light, clear = Light.of(CONDITIONS["clear"], rng), CONDITIONS["clear"]
+        for place in places:
+            for _ in range(6):
+                x, y, heading = _near(place, rng)
+                height = rng.uniform(1.2, 1.9)
+                roll, pitch, yaw = np.deg2rad(rng.normal(0, [0.6, 0.6, 0.0]))
+                R = upright_on(city, x, y, heading) @ rotation_z(yaw) @ rotation_y(pitch) @ rotation_x(roll)
+                origin = np.array([x, y, city.height(x, y) + height])
+                shaken = cells + rng.normal(0, 0.002, cells.shape)
+                rays = (shaken @ R.T).astype(np.float32)
+                hits = scene.hits(origin, rays)
+                met = hits.distance[hits.distance > 0]
+                if len(met) and np.percentile(met, 40) > 1.5:
+                    break
+            linear = shade(scene, city.ground, origin, rays, hits, light, clear, forward=R[:, 0])
+            gain = rng.uniform(0.25, 0.6) / (float(linear.min(axis=1).mean()) + 1e-4)
+            shape = (grid.rows, grid.columns)
+            ranges[row] = np.where(hits.distance < 150, hits.distance, 0).reshape(shape)
+            rgb[row] = np.clip(to_srgb(linear, gain), 0, 255).reshape(*shape, 3)
+            queries[row] = (x, y, heading, height)
+            row += 1
+    return ranges, rgb, queries
+
+
+def _near(place: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, float]:
+    """A query pose within 2 m of a place; mostly along the street, either way."""
+    angle, distance = rng.uniform(0, 2 * np.pi), 2.0 * np.sqrt(rng.random())
+    x, y = place[0] + distance * np.cos(angle), place[1] + distance * np.sin(angle)
+    if rng.random() < 0.7:
+        heading = place[2] + rng.choice([0.0, np.pi]) + np.deg2rad(rng.uniform(-20, 20))
+    else:
+        heading = rng.uniform(-np.pi, np.pi)
+    return float(x), float(y), float(heading)

@@ -1,0 +1,56 @@
+"""An answer of the service as a person would want to read it."""
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+
+def print_answer(answer: dict[str, Any], console: Console | None = None) -> None:
+    """Print status, street, pose, neighbours and timings.
+
+    Args:
+        answer: as in the REST contract.
+        console: where to; standard output by default.
+    """
+    out = console or Console(highlight=False)
+    facts = Table.grid(padding=(0, 2))
+    for name, value in _facts(answer):
+        facts.add_row(name, value)
+    out.print(facts)
+    out.print()
+    out.print(_neighbours(answer["neighbours"]))
+    times = "  ".join(f"{stage} {value:.1f}" for stage, value in answer["timings_ms"].items())
+    out.print(f"milliseconds: {times}", style="dim")
+
+
+def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
+    pose, street, place = answer["pose"], answer["street"], answer["map"]
+    confidence = answer["confidence"]
+    facts = [
+        ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f})")),
+        ("street", "none" if street is None else f"{street['name']} ({street['vote']:.0%} of the votes)"),
+        ("position", f"{_metres(pose['position'])}, map frame"),
+        ("heading", f"{pose['heading_deg']:.1f} degrees, counter-clockwise from map x"),
+    ]
+    if answer.get("vehicle_pose"):
+        vehicle = answer["vehicle_pose"]
+        facts.append(("vehicle", f"{_metres(vehicle['position'])}, heading {vehicle['heading_deg']:.1f} degrees"))
+    return [*facts, ("map", f"{place['name']}, version {place['version']}")]
+
+
+def _neighbours(neighbours: list[dict[str, Any]]) -> Table:
+    table = Table("place", "similarity", "street", "position", "heading", title="nearest places", title_justify="left")
+    for each in neighbours:
+        table.add_row(
+            str(each["place"]),
+            f"{each['similarity']:.3f}",
+            each["street"] or "none",
+            _metres(each["position"]),
+            f"{each['heading_deg']:.0f}",
+        )
+    return table
+
+
+def _metres(position: dict[str, float]) -> str:
+    return f"x {position['x']:.2f}  y {position['y']:.2f}  z {position['z']:.2f} m"

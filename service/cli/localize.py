@@ -1,0 +1,98 @@
+"""``streetfix localize``: ask a running service, print its answer for people or programs."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.errors import RefusedError, RequestError, UnreachableError
+
+_TIMEOUT_S = 60.0
+
+
+def command(
+    rgb: Annotated[Path, typer.Option(help="Colour picture: JPEG, PNG or WebP.", show_default=False)],
+    depth: Annotated[Path, typer.Option(help="Depth picture: 16-bit PNG, TIFF, NPY or SFD1.", show_default=False)],
+    camera: Annotated[
+        Path, typer.Option(help='JSON: {"camera": {...}, "depth": {...}, "gravity": {...}}.', show_default=False)
+    ],
+    url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
+    map_name: Annotated[str | None, typer.Option("--map", help="Needed where several are mounted.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as it came.")] = False,
+) -> None:
+    """Ask where two pictures were taken.
+
+    Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json
+    """
+    answer = localize(url, rgb=rgb, depth=depth, camera=camera, map_name=map_name)
+    if as_json:
+        typer.echo(json.dumps(answer))
+    else:
+        from service.cli.answer_text import print_answer
+
+        print_answer(answer)
+
+
+def localize(url: str, *, rgb: Path, depth: Path, camera: Path, map_name: str | None = None) -> dict[str, Any]:
+    """Post a pair of pictures.
+
+    Args:
+        url: of the service, without a path.
+        rgb: file of the colour picture.
+        depth: file of the depth picture.
+        camera: JSON file with the request's parts: camera, depth, gravity and so on.
+        map_name: which map; goes above the file's.
+
+    Raises:
+        RequestError: a file cannot be read, or the camera file is no JSON object.
+        UnreachableError: nothing answers at the address, or something that is no Streetfix.
+        RefusedError: the service answered with a problem.
+    """
+    import httpx
+
+    request = _camera_parts(camera) | ({} if map_name is None else {"map": map_name})
+    files = {
+        "rgb": (rgb.name, _bytes_of(rgb, "rgb"), "application/octet-stream"),
+        "depth": (depth.name, _bytes_of(depth, "depth"), "application/octet-stream"),
+        "request": ("request.json", json.dumps(request).encode(), "application/json"),
+    }
+    try:
+        response = httpx.post(f"{url.rstrip('/')}/v1/localize", files=files, timeout=_TIMEOUT_S)
+        answer = response.json()
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
+        raise UnreachableError(
+            f"{url}: no service answers ({error}); start one with: streetfix serve BUNDLE", field="url"
+        ) from error
+    except ValueError as error:
+        raise UnreachableError(
+            f"{url}: what answers there (status {response.status_code}) is no Streetfix; check --url", field="url"
+        ) from error
+    if not isinstance(answer, dict) or (response.is_success and "pose" not in answer):
+        raise UnreachableError(f"{url}: what answers there is no Streetfix; check --url", field="url")
+    if not response.is_success:
+        raise RefusedError(_problem_text(answer, response.status_code), field=str(answer.get("field") or ""))
+    return answer
+
+
+def _camera_parts(path: Path) -> dict[str, Any]:
+    try:
+        parts = json.loads(_bytes_of(path, "camera"))
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"{path}: this is no JSON ({error})", field="camera") from error
+    if not isinstance(parts, dict) or "camera" not in parts:
+        raise RequestError(f'{path}: it must be an object like {{"camera": {{"width": 640, ...}}}}', field="camera")
+    return parts
+
+
+def _bytes_of(path: Path, field: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RequestError(f"{path}: it cannot be read ({error.strerror}); check --{field}", field=field) from error
+
+
+def _problem_text(problem: dict[str, Any], status: int) -> str:
+    title, detail = problem.get("title", f"status {status}"), problem.get("detail", "")
+    field = f" [field {problem['field']}]" if problem.get("field") else ""
+    return f"the service refused: {title}\n  {detail}{field}\n  request id {problem.get('request_id', 'unknown')}"

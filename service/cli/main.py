@@ -1,0 +1,102 @@
+"""The command ``streetfix``: two commands of the service, and those that other packages bring by entry point."""
+
+import functools
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import version as installed_version
+from typing import Annotated, Any
+
+import typer
+
+from service.cli import localize, serve
+from service.errors import ExtraMissingError, StreetfixError
+
+GROUP = "streetfix.commands"
+#: One line for ``--help``, which must not import what it lists, and the extra that brings a command's packages.
+_KNOWN = {
+    "simulate": ("Make a city by seed and drive through it: survey and queries.", "mapping"),
+    "import": ("Bring recorded data into the dataset folder.", "mapping"),
+    "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
+    "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
+    "train": ("Train an encoder on simulated cities.", "training"),
+    "export": ("Make an ONNX encoder from a training's checkpoint.", "training"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        app_for(given)(given, prog_name="streetfix")
+    except StreetfixError as error:
+        typer.echo(f"streetfix: {error.message}", err=True)
+        sys.exit(1)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(1)
+
+
+def app_for(arguments: Sequence[str]) -> typer.Typer:
+    """The application; of the commands that other packages bring only the one that is called is imported."""
+    called = next((argument for argument in arguments if not argument.startswith("-")), None)
+    app = typer.Typer(
+        add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=_HELP
+    )
+    app.callback()(_global_options)
+    app.command("serve")(serve.command)
+    app.command("localize")(localize.command)
+    for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
+        summary, extra = _KNOWN.get(point.name, (f"From the package {point.dist.name if point.dist else '?'}.", None))
+        function = _load(point, extra) if point.name == called else _not_called
+        app.command(point.name, help=None if point.name == called else summary)(function)
+    return app
+
+
+_HELP = "Street and pose of a robot from one RGB and one depth picture against a LiDAR map."
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"streetfix {installed_version('streetfix')}")
+        raise typer.Exit
+
+
+def _global_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    del version  # its callback has done the work
+
+
+def _not_called() -> None:
+    """Stand in the list of commands for one that is not imported."""
+
+
+def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any]:
+    """The command's function, with a missing package told as a missing extra, whether now or when it runs."""
+    try:
+        function: Callable[..., Any] = point.load()
+    except ModuleNotFoundError as error:
+        missing = _extra_missing(point, extra, error)
+
+        def refuse(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+            del arguments
+            raise missing
+
+        return refuse
+
+    @functools.wraps(function)
+    def run(*args: object, **kwargs: object) -> object:
+        try:
+            return function(*args, **kwargs)
+        except ModuleNotFoundError as error:
+            raise _extra_missing(point, extra, error) from error
+
+    return run
+
+
+def _extra_missing(point: EntryPoint, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
+    remedy = f'pip install "streetfix[{extra}]"' if extra else "install the packages it needs"
+    return ExtraMissingError(f"the command {point.name!r} needs the package {error.name!r}: {remedy}", field=point.name)

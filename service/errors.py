@@ -1,0 +1,156 @@
+"""The exceptions of Streetfix. The lowest layer: it imports nothing of ours.
+
+StreetfixError                     code            kind
+├── RequestError                   request         invalid      a field of the request is missing or makes no sense
+│   ├── DecodeError                undecodable     invalid      a part is not the picture it says it is
+│   ├── ImageSizeError             image-size      invalid      a picture's size does not fit the camera
+│   ├── NoDepthError               no-depth        invalid      the depth picture holds no usable measurement
+│   └── NotYetSupportedError       not-yet         invalid      a field of the contract that this release cannot use
+├── UnsupportedFormatError         format          unsupported  a format that we do not read
+├── TooLargeError                  too-large       too_large    a part is beyond a limit
+├── UnknownMapError                unknown-map     not_found    no map of that name is mounted
+├── BusyError                      busy            busy         the queue is full
+├── DeadlineError                  deadline        deadline     a request took longer than the service allows
+├── BundleError                    bundle          not_ready    a map bundle is missing, damaged or of another version
+├── DatasetError                   dataset         invalid      a dataset folder is incomplete or contradicts itself
+├── EncoderError                   encoder         not_ready    an encoder file is missing or is not an encoder of ours
+├── UnreachableError               unreachable     not_ready    a service does not answer
+├── RefusedError                   refused         invalid      a service refused a request (seen by its client)
+├── AddressError                   address         not_ready    the service cannot listen where it was told to
+└── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
+
+No number of HTTP or gRPC stands here: each face has one table over ``kind``.
+"""
+
+from typing import ClassVar, Literal
+
+Kind = Literal["invalid", "unsupported", "too_large", "not_found", "busy", "deadline", "not_ready"]
+
+
+class StreetfixError(Exception):
+    """The root: what happened, the offending value, what to do.
+
+    Args:
+        message: for people, in three parts: what, the value, the remedy.
+        field: dotted path of the request's or file's field at fault, e.g. ``camera.fx``; empty if none is.
+    """
+
+    code: ClassVar[str] = "error"
+    kind: ClassVar[Kind] = "invalid"
+
+    def __init__(self, message: str, *, field: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.field = field
+
+
+class RequestError(StreetfixError):
+    """A field of the request is missing or makes no sense."""
+
+    code = "request"
+
+
+class DecodeError(RequestError):
+    """A part is not the picture it says it is."""
+
+    code = "undecodable"
+
+
+class ImageSizeError(RequestError):
+    """A picture's size or aspect does not fit the camera's intrinsics."""
+
+    code = "image-size"
+
+
+class NoDepthError(RequestError):
+    """The depth picture holds no usable measurement."""
+
+    code = "no-depth"
+
+
+class NotYetSupportedError(RequestError):
+    """A field of the contract that this release cannot use; ignoring it would be a silent lie."""
+
+    code = "not-yet"
+
+
+class UnsupportedFormatError(StreetfixError):
+    """A format that we do not read."""
+
+    code = "format"
+    kind = "unsupported"
+
+
+class TooLargeError(StreetfixError):
+    """A part is beyond a limit of bytes, pixels or parts."""
+
+    code = "too-large"
+    kind = "too_large"
+
+
+class UnknownMapError(StreetfixError):
+    """No map of that name is mounted."""
+
+    code = "unknown-map"
+    kind = "not_found"
+
+
+class BusyError(StreetfixError):
+    """The queue is full; try again shortly."""
+
+    code = "busy"
+    kind = "busy"
+
+
+class DeadlineError(StreetfixError):
+    """A request took longer than the service allows."""
+
+    code = "deadline"
+    kind = "deadline"
+
+
+class BundleError(StreetfixError):
+    """A map bundle is missing, damaged, or of a version that this program does not read."""
+
+    code = "bundle"
+    kind = "not_ready"
+
+
+class DatasetError(StreetfixError):
+    """A dataset folder is incomplete or contradicts itself."""
+
+    code = "dataset"
+
+
+class EncoderError(StreetfixError):
+    """An encoder file is missing, or is not an encoder of ours."""
+
+    code = "encoder"
+    kind = "not_ready"
+
+
+class UnreachableError(StreetfixError):
+    """A service does not answer."""
+
+    code = "unreachable"
+    kind = "not_ready"
+
+
+class RefusedError(StreetfixError):
+    """A service refused a request; the message carries the problem it answered with."""
+
+    code = "refused"
+
+
+class AddressError(StreetfixError):
+    """The service cannot listen on the address it was given."""
+
+    code = "address"
+    kind = "not_ready"
+
+
+class ExtraMissingError(StreetfixError):
+    """A command needs packages of an extra that is not installed."""
+
+    code = "extra-missing"
+    kind = "unsupported"

@@ -1,0 +1,44 @@
+"""The REST face: an engine in, an ASGI application out."""
+
+from importlib.metadata import version as installed_version
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service.http import problems, schema
+from service.http.request_id import RequestIdMiddleware
+from service.http.routes import health, localize, maps
+from service.runtime.engine import Engine
+
+_DESCRIPTION = """Street, position and heading of one RGB and one depth picture against a LiDAR map.
+
+Lengths are metres, angles degrees, quaternions x, y, z, w. The map frame is right-handed with z up; the camera frame is
+x right, y down, z forward. Headings are counter-clockwise from map x, in (-180, 180]. Every error is
+`application/problem+json`, every response has an `X-Request-Id`."""
+
+
+def create_app(engine: Engine) -> FastAPI:
+    """The application; it neither opens nor closes the engine."""
+    version = installed_version("streetfix")
+    app = FastAPI(title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False)
+    app.include_router(localize.router_for(engine))
+    app.include_router(maps.router_for(engine))
+    app.include_router(health.router_for(engine, version))
+    app.add_middleware(RequestIdMiddleware)
+    problems.install(app)
+    app.openapi = lambda: _openapi_of(app)  # type: ignore[method-assign]  # FastAPI's documented way
+    return app
+
+
+def _openapi_of(app: FastAPI) -> dict[str, Any]:
+    """FastAPI's document with the schemas that no route declares: we split the body, and write problems, ourselves."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        schemas = document["components"]["schemas"]
+        for model in (schema.LocalizeRequest, problems.Problem):
+            written = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(written.pop("$defs", {}))
+            schemas[model.__name__] = written
+        app.openapi_schema = document
+    return app.openapi_schema

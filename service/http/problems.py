@@ -1,0 +1,145 @@
+"""Errors as problem+json (RFC 9457): one table over the kinds of the exception tree."""
+
+import json
+import logging
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.errors import Kind, RequestError, StreetfixError
+
+MEDIA_TYPE = "application/problem+json"
+RETRY_AFTER_S = 1
+
+STATUS_OF_KIND: dict[Kind, int] = {
+    "invalid": 422,
+    "unsupported": 415,
+    "too_large": 413,
+    "not_found": 404,
+    "busy": 503,
+    "not_ready": 503,
+    "deadline": 504,
+}
+
+#: Problems that no exception of ours stands for: what HTTP itself refuses, and what nobody foresaw.
+CODE_OF_STATUS = {400: "bad-request", 404: "not-found", 405: "method-not-allowed", 500: "internal"}
+
+_log = logging.getLogger("streetfix.http")
+
+
+class Problem(BaseModel):
+    """What went wrong and what to do, RFC 9457."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "type": "/problems/image-size",
+                    "title": "A picture's size or aspect does not fit the camera's intrinsics.",
+                    "status": 422,
+                    "detail": "The picture `depth` has 640x360 pixels, which is not the camera's 640x480 at any scale; "
+                    "send the whole picture, or the intrinsics of the picture sent.",
+                    "code": "image-size",
+                    "field": "depth",
+                    "request_id": "4f0c8f4c0d5e4c0f9b4a3a1d4b7f9e21",
+                }
+            ]
+        }
+    )
+
+    type: str = Field(description="a relative URI; docs/problems.md has a section for each")
+    title: str
+    status: int
+    detail: str = Field(description="what happened, the offending value, what to do")
+    code: str = Field(description="the last part of the type; stable")
+    field: str | None = Field(description="dotted path of the field at fault")
+    request_id: str
+
+
+def install(app: FastAPI) -> None:
+    """Answer every foreseen error as a problem; the unforeseen ones are the middleware's."""
+    app.add_exception_handler(StreetfixError, _on_ours)
+    app.add_exception_handler(RequestValidationError, _on_invalid)
+    app.add_exception_handler(HTTPException, _on_http)
+
+
+def problem_response(
+    *, status: int, code: str, title: str, detail: str, request_id: str, field: str = "", headers: Any = None
+) -> Response:
+    """A problem as a response."""
+    problem = Problem(
+        type=f"/problems/{code}",
+        title=title,
+        status=status,
+        detail=detail,
+        code=code,
+        field=field or None,
+        request_id=request_id,
+    )
+    all_headers = dict(headers or {})
+    if status == 503:
+        all_headers["Retry-After"] = str(RETRY_AFTER_S)
+    return Response(problem.model_dump_json(), status_code=status, media_type=MEDIA_TYPE, headers=all_headers)
+
+
+def internal_error(error: Exception, request_id: str) -> Response:
+    """What nobody foresaw: the log gets the story, the caller the request id only."""
+    _log.error("request_failed request_id=%s", request_id, exc_info=error)
+    return problem_response(
+        status=500,
+        code="internal",
+        title="Internal error.",
+        detail="The service failed on this request; tell its operator the request id.",
+        request_id=request_id,
+    )
+
+
+async def _on_ours(request: Request, error: Exception) -> Response:
+    if not isinstance(error, StreetfixError):
+        raise error
+    return problem_response(
+        status=STATUS_OF_KIND[error.kind],
+        code=error.code,
+        title=title_of(type(error)),
+        detail=error.message,
+        field=error.field,
+        request_id=request.state.request_id,
+    )
+
+
+async def _on_invalid(request: Request, error: Exception) -> Response:
+    if not isinstance(error, RequestValidationError):
+        raise error
+    return await _on_ours(request, request_error_from(error.errors()))
+
+
+async def _on_http(request: Request, error: Exception) -> Response:
+    if not isinstance(error, HTTPException):
+        raise error
+    path = json.dumps(request.url.path[:200])
+    return problem_response(
+        status=error.status_code,
+        code=CODE_OF_STATUS.get(error.status_code, "bad-request"),
+        title=HTTPStatus(error.status_code).phrase + ".",
+        detail=f"{request.method} {path}: {error.detail}; the API is described at /openapi.json",
+        request_id=request.state.request_id,
+        headers=error.headers,
+    )
+
+
+def request_error_from(errors: Any) -> RequestError:
+    """One error of ours from pydantic's list: the first field is named, the next ones are in the message."""
+    told = [f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg']}" for each in errors[:5]]
+    field = ".".join(str(part) for part in errors[0]["loc"])
+    return RequestError("; ".join(told) + "; see the schema at /openapi.json", field=field)
+
+
+def title_of(kind_of_error: type[StreetfixError]) -> str:
+    """The first line of an error's docstring."""
+    return (kind_of_error.__doc__ or "").strip().splitlines()[0]

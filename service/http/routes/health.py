@@ -1,0 +1,36 @@
+"""What an orchestrator asks."""
+
+from fastapi import APIRouter
+
+from service.errors import BundleError
+from service.http import schema
+from service.http.routes.localize import problems
+from service.runtime.engine import Engine
+
+
+def router_for(engine: Engine, version: str) -> APIRouter:
+    """The routes, bound to an engine."""
+    router = APIRouter(tags=["operation"])
+
+    @router.get("/livez", operation_id="getLiveness", summary="Whether the process lives")
+    async def livez() -> schema.Health:
+        return schema.Health()
+
+    @router.get(
+        "/readyz", operation_id="getReadiness", summary="Whether a map is open to answer from", responses=problems(503)
+    )
+    async def readyz() -> schema.Health:
+        if not engine.is_ready:
+            raise BundleError("no map is mounted; start the service with a map bundle")
+        return schema.Health()
+
+    @router.get("/v1/version", operation_id="getVersion", summary="What runs here")
+    async def get_version() -> schema.Version:
+        maps = [localizer.bundle.manifest for localizer in engine.registry]
+        return schema.Version(
+            version=version,
+            threads=engine.threads,
+            maps=[schema.MapVersion(name=manifest.name, version=manifest.version) for manifest in maps],
+        )
+
+    return router

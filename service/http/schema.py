@@ -1,0 +1,220 @@
+"""The REST contract: the request's JSON part and the answer. Degrees here, radians inside."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.localization.query import MOST_NEIGHBOURS
+
+
+class _Strict(BaseModel):
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Vector(_Strict):
+    """Three numbers."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Quaternion(_Strict):
+    """A rotation; of any length but zero when sent, of length 1 when answered."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class RigidTransform(_Strict):
+    """Takes coordinates of the second frame of its name to the first."""
+
+    position: Vector = Field(description="metres")
+    orientation: Quaternion
+
+
+class Camera(_Strict):
+    """Intrinsics of the rectified colour picture, pixels; the centre of the first pixel is (0, 0)."""
+
+    model: Literal["PINHOLE"] = "PINHOLE"
+    width: int = Field(ge=2, le=32768)
+    height: int = Field(ge=2, le=32768)
+    fx: float = Field(gt=0, le=1e6)
+    fy: float = Field(gt=0, le=1e6)
+    cx: float = Field(ge=-1e6, le=1e6)
+    cy: float = Field(ge=-1e6, le=1e6)
+    distortion: list[float] = Field(
+        default_factory=list, max_length=14, description="must be empty or zero: send rectified pictures"
+    )
+
+
+class Depth(_Strict):
+    """How the depth picture is to be read."""
+
+    scale_m: float | None = Field(
+        None,
+        gt=0,
+        le=1e4,
+        description="metres for each stored unit (disparity: pixels); default 0.001 for integers, 1 for floats",
+    )
+    kind: Literal["z", "range", "disparity"] = Field(
+        "z", description="along the optical axis, along the ray, or disparity"
+    )
+    encoding: Literal["auto", "carla"] = Field("auto", description="carla: depth in the 24 bits of a colour PNG")
+    max_range_m: float | None = Field(None, gt=0, le=1e5, description="what lies beyond is no measurement")
+    baseline_m: float | None = Field(None, gt=0, le=100, description="of the stereo rig; needed for disparity")
+
+
+class Options(_Strict):
+    """What to answer."""
+
+    neighbours: int = Field(5, ge=1, le=MOST_NEIGHBOURS, description="k: distinct places that vote and are answered")
+    refine: bool = Field(False, description="register on the map's cloud; true is refused in this release")
+
+
+class LocalizeRequest(_Strict):
+    """The JSON part of a request."""
+
+    model_config = ConfigDict(
+        title="LocalizeRequest",
+        json_schema_extra={
+            "examples": [
+                {
+                    "map": "paper-city",
+                    "camera": {
+                        "model": "PINHOLE",
+                        "width": 640,
+                        "height": 480,
+                        "fx": 320,
+                        "fy": 320,
+                        "cx": 319.5,
+                        "cy": 239.5,
+                    },
+                    "depth": {"scale_m": 0.001, "kind": "z", "max_range_m": 80},
+                    "gravity": {"x": 0.01, "y": 0.999, "z": 0.02},
+                    "options": {"neighbours": 5},
+                }
+            ]
+        },
+    )
+
+    map: str | None = Field(None, max_length=64, description="optional where one map is mounted")
+    camera: Camera
+    depth: Depth = Depth()
+    gravity: Vector | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
+    T_vehicle_camera: RigidTransform | None = Field(
+        None, description="where the camera sits: the vehicle's pose is answered too"
+    )
+    prior: Any = Field(None, description="reserved for a prior position; refused in this release")
+    options: Options = Options()
+
+
+class Street(BaseModel):
+    """The street that the nearest places voted for."""
+
+    id: str
+    name: str = Field(examples=["End of street 4"])
+    street: str = Field(examples=["4"])
+    section: Literal["beginning", "end"] | None
+    class_index: int = Field(description="0 to 15 in the paper's city")
+    vote: float = Field(description="share of the similarity-weighted votes, 0 to 1")
+
+
+HeadingDeg = Annotated[
+    float,
+    Field(gt=-180, le=180, description="of the optical axis (or of the vehicle's x), counter-clockwise from map x"),
+]
+
+
+class Pose(BaseModel):
+    """In the map frame: metres; the camera frame is x right, y down, z forward."""
+
+    position: Vector
+    orientation: Quaternion
+    heading_deg: HeadingDeg
+    covariance: list[float] | None = Field(
+        description="6x6, row by row, translation first, map frame; null: not known without registration"
+    )
+
+
+class Neighbour(BaseModel):
+    """One of the most similar places of the map."""
+
+    place: int
+    distance: float = Field(description="Euclidean distance of the descriptors, 0 to 2")
+    similarity: float = Field(description="cosine of the descriptors")
+    street: str | None = Field(description="id of the street it lies in")
+    position: Vector
+    heading_deg: HeadingDeg
+
+
+class MapVersion(BaseModel):
+    """Which map answered."""
+
+    name: str
+    version: str = Field(description="hash of the map's content")
+
+
+class TimingsMs(BaseModel):
+    """Milliseconds of each stage; register is 0 as long as nothing is registered."""
+
+    decode: float
+    fuse: float
+    encode: float
+    search: float
+    register_: float = Field(alias="register")
+    total: float
+
+
+class LocalizeAnswer(BaseModel):
+    """An answer that is not LOCALIZED is still an answer."""
+
+    status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"] = Field(
+        description="LOCALIZED wherever the map has neighbours, as long as confidence is null"
+    )
+    confidence: float | None = Field(description="probability of being right; null: the map is not calibrated")
+    street: Street | None = Field(description="null where the map has no streets, or the neighbours lie in none")
+    pose: Pose = Field(description="T_map_camera")
+    vehicle_pose: Pose | None = Field(description="T_map_vehicle, where T_vehicle_camera was sent")
+    geopose: dict[str, Any] | None = Field(description="null: the map is not georeferenced")
+    neighbours: list[Neighbour]
+    map: MapVersion
+    timings_ms: TimingsMs
+
+
+class MapEntry(BaseModel):
+    """A mounted map."""
+
+    name: str
+    version: str
+    made_at: str
+    places: int
+    views: int
+    streets: int
+    spacing_m: float
+    encoder_sha256: str
+    georeferenced: bool
+    licence: str
+
+
+class MapList(BaseModel):
+    """All mounted maps."""
+
+    maps: list[MapEntry]
+
+
+class Version(BaseModel):
+    """What runs here."""
+
+    version: str
+    api: Literal["v1"] = "v1"
+    threads: int = Field(description="requests worked on at once")
+    maps: list[MapVersion]
+
+
+class Health(BaseModel):
+    """Whether the service lives, or is ready."""
+
+    status: Literal["ok"] = "ok"

@@ -1,0 +1,196 @@
+"""Size and sample type of a picture from its first bytes, so that limits are met before anything is allocated.
+
+A picture of a few hundred bytes may claim, and on decoding take, gigabytes. These readers only look at headers: they
+allocate nothing, follow no more than a bounded number of segments, and leave decoding to OpenCV.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Literal
+
+from service.errors import DecodeError, TooLargeError, UnsupportedFormatError
+from service.imaging.tiff_header import read_tiff_tags
+
+Format = Literal["JPEG", "PNG", "WebP", "TIFF", "NPY", "SFD1"]
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_MAGIC: tuple[tuple[bytes, Format], ...] = (
+    (b"\xff\xd8\xff", "JPEG"),
+    (_PNG_SIGNATURE, "PNG"),
+    (b"II*\x00", "TIFF"),
+    (b"MM\x00*", "TIFF"),
+    (b"\x93NUMPY", "NPY"),
+    (b"SFD1", "SFD1"),
+)
+_MAX_JPEG_SEGMENTS = 1000
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+#: Length, kind and checksum round the data of a chunk, bytes.
+_PNG_CHUNK_FRAME = 12
+_MAX_PNG_CHUNKS = 50_000
+
+
+@dataclass(frozen=True, slots=True)
+class ImageLimits:
+    """What a picture may cost. Ours, 2026-11: a 4K camera's picture as PNG fits, a decompression bomb does not.
+
+    Attributes:
+        max_bytes: of the encoded part.
+        max_pixels: width x height of the decoded picture.
+    """
+
+    max_bytes: int = 32 * 2**20
+    max_pixels: int = 25_000_000
+
+
+DEFAULT_LIMITS = ImageLimits()
+
+
+@dataclass(frozen=True, slots=True)
+class PictureHeader:
+    """What a picture says of itself; ``is_float`` means IEEE samples."""
+
+    height: int
+    width: int
+    channels: int
+    bits: int
+    is_float: bool = False
+
+
+def format_of(data: bytes, *, field: str) -> Format:
+    """Tell a format by its first bytes.
+
+    Raises:
+        DecodeError: there are no bytes.
+        UnsupportedFormatError: none of ours.
+    """
+    if not data:
+        raise DecodeError(f"The part `{field}` is empty (0 bytes); send the picture's bytes in it.", field=field)
+    for magic, name in _MAGIC:
+        if data.startswith(magic):
+            return name
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return "WebP"
+    raise UnsupportedFormatError(
+        f"The format of `{field}` is unknown (it begins with {data[:8].hex(' ')}); send colour as JPEG, PNG or WebP, "
+        "and depth as 16-bit PNG, float TIFF or NPY.",
+        field=field,
+    )
+
+
+def header_of(data: bytes, format_: Format, *, field: str) -> PictureHeader:
+    """Read the header of a JPEG, PNG, WebP or TIFF.
+
+    Raises:
+        DecodeError: the header is damaged, or the end of the file is missing.
+        UnsupportedFormatError: a TIFF with a layout that we do not read.
+    """
+    readers = {"JPEG": _jpeg, "PNG": _png, "WebP": _webp, "TIFF": _tiff}
+    try:
+        header = readers[format_](data, field)
+    except (struct.error, IndexError) as error:
+        raise damaged(field, f"its {format_} header ends early") from error
+    if header.width < 1 or header.height < 1:
+        raise damaged(field, f"its {format_} header says {header.width}x{header.height} pixels")
+    return header
+
+
+def require_bytes(data: bytes, limits: ImageLimits, *, field: str) -> None:
+    """Refuse a part with too many bytes.
+
+    Raises:
+        TooLargeError: more than ``limits.max_bytes``.
+    """
+    if len(data) > limits.max_bytes:
+        raise TooLargeError(
+            f"The part `{field}` has {len(data)} bytes, more than the limit of {limits.max_bytes}; "
+            "send a smaller or more compressed picture.",
+            field=field,
+        )
+
+
+def require_pixels(height: int, width: int, limits: ImageLimits, *, field: str) -> None:
+    """Refuse a picture with too many pixels, as its header says.
+
+    Raises:
+        TooLargeError: more than ``limits.max_pixels``.
+    """
+    if height * width > limits.max_pixels:
+        raise TooLargeError(
+            f"The picture `{field}` has {width}x{height} pixels, more than the limit of {limits.max_pixels}; "
+            "scale it down.",
+            field=field,
+        )
+
+
+def damaged(field: str, why: str) -> DecodeError:
+    """The error for bytes that are not the picture they begin as."""
+    return DecodeError(f"The picture `{field}` cannot be decoded: {why}; send the whole file unchanged.", field=field)
+
+
+def _png(data: bytes, field: str) -> PictureHeader:
+    length, kind, width, height, bits, colour = struct.unpack_from(">I4sIIBB", data, 8)
+    if kind != b"IHDR" or length != 13 or colour not in _PNG_CHANNELS:
+        raise damaged(field, "its PNG header is no IHDR chunk")
+    _require_png_chunks(data, field)
+    return PictureHeader(height, width, _PNG_CHANNELS[colour], bits)
+
+
+def _require_png_chunks(data: bytes, field: str) -> None:
+    """Refuse chunks that reach beyond the data: decoders allocate what a chunk says before they read it."""
+    at = len(_PNG_SIGNATURE)
+    for _ in range(_MAX_PNG_CHUNKS):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        at += _PNG_CHUNK_FRAME + length
+        if at > len(data):
+            raise damaged(field, f"the PNG is cut off (its chunk {kind.hex(' ')} ends at byte {at} of {len(data)})")
+        if kind == b"IEND":
+            return
+    raise damaged(field, f"the PNG has more than {_MAX_PNG_CHUNKS} chunks")
+
+
+def _jpeg(data: bytes, field: str) -> PictureHeader:
+    at = 2
+    for _ in range(_MAX_JPEG_SEGMENTS):
+        marker, code = struct.unpack_from(">BB", data, at)
+        if marker != 0xFF:
+            break
+        if code == 0xFF or code in _JPEG_BARE:
+            at += 1 if code == 0xFF else 2
+            continue
+        if code in _JPEG_FRAMES:
+            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+            if data.rfind(b"\xff\xd9") < at:
+                raise damaged(field, "the JPEG is cut off (no end marker)")
+            return PictureHeader(height, width, channels, bits)
+        if code in (0xD9, 0xDA):
+            break
+        at += 2 + max(2, struct.unpack_from(">H", data, at + 2)[0])
+    raise damaged(field, "the JPEG has no frame header")
+
+
+def _webp(data: bytes, field: str) -> PictureHeader:
+    (size,) = struct.unpack_from("<I", data, 4)
+    if len(data) < size + 8:
+        raise damaged(field, f"the WebP is cut off ({len(data)} of {size + 8} bytes)")
+    kind = data[12:16]
+    if kind == b"VP8X":
+        w, h = int.from_bytes(data[24:27], "little"), int.from_bytes(data[27:30], "little")
+        return PictureHeader(h + 1, w + 1, 4 if data[20] & 0x10 else 3, 8)
+    if kind == b"VP8 " and data[23:26] == b"\x9d\x01\x2a":
+        w, h = struct.unpack_from("<HH", data, 26)
+        return PictureHeader(h & 0x3FFF, w & 0x3FFF, 3, 8)
+    if kind == b"VP8L" and data[20] == 0x2F:
+        (packed,) = struct.unpack_from("<I", data, 21)
+        return PictureHeader((packed >> 14 & 0x3FFF) + 1, (packed & 0x3FFF) + 1, 4, 8)
+    raise damaged(field, "its WebP header is none of VP8, VP8L and VP8X")
+
+
+def _tiff(data: bytes, field: str) -> PictureHeader:
+    tags = read_tiff_tags(data)
+    if tags is None:
+        raise damaged(field, "its first TIFF directory is incomplete or contradicts itself")
+    if tags.tile_pixels > tags.width * tags.height + 2**20:
+        raise damaged(field, f"its TIFF tiles have {tags.tile_pixels} pixels, more than the picture")
+    return PictureHeader(tags.height, tags.width, tags.channels, tags.bits, tags.sample_format == 3)

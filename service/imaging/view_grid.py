@@ -1,0 +1,143 @@
+"""The view grid: azimuth x elevation cells of metric range, the one image space of map views and queries.
+
+A row looks at one elevation (top first), a column at one azimuth (left first), both in a *level frame*: x along the
+heading of the view, z up (normal to the local ground). A cell is a ray, not an area: its value is the range along the
+ray through its centre, metres; 0 is "no measurement". Both sides forget what lies beyond ``max_range_m``.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+from numpy.typing import NDArray
+
+#: What the encoder is given of a view, in this order: range (m) in the place of intensity, V1 and V2 (grey levels,
+#: eq. 9; 0 where there is no colour), height above the local ground (m), and 1 where the sensor could have measured.
+PLANES = ("range_m", "v1", "v2", "height_m", "observed")
+
+Ranges = Float32[NDArray[np.float32], "rows columns"]
+Panorama = Float32[NDArray[np.float32], "rows around"]
+Planes = Float32[NDArray[np.float32], "5 rows columns"]
+
+
+@dataclass(frozen=True, slots=True)
+class ViewGrid:
+    """Shape and limits of the view grid; the defaults are the prototype's best (feasibility, November 2026)."""
+
+    rows: int = 32
+    columns: int = 128
+    azimuth_span_deg: float = 90.0
+    elevation_top_deg: float = 15.0
+    elevation_bottom_deg: float = -15.0
+    min_range_m: float = 0.5
+    max_range_m: float = 40.0
+
+    @property
+    def elevations_rad(self) -> Float64[NDArray[np.float64], " rows"]:
+        """Elevation of every row, the top row first; the first and last lie on the limits."""
+        return np.deg2rad(np.linspace(self.elevation_top_deg, self.elevation_bottom_deg, self.rows))
+
+    @property
+    def azimuths_rad(self) -> Float64[NDArray[np.float64], " columns"]:
+        """Azimuth of every column's centre against the heading, counter-clockwise, so the left column is positive."""
+        span = np.deg2rad(self.azimuth_span_deg)
+        return span / 2 - span * (np.arange(self.columns) + 0.5) / self.columns
+
+    @property
+    def around(self) -> int:
+        """Columns of a panorama: 360 degrees at twice the view's density, so any heading lies within a half column."""
+        return round(2 * self.columns * 360.0 / self.azimuth_span_deg)
+
+    def rays_level(self) -> Float64[NDArray[np.float64], "rows columns 3"]:
+        """Unit rays of the cells in the level frame (x along the heading, y left, z up)."""
+        elevation, azimuth = np.meshgrid(self.elevations_rad, self.azimuths_rad, indexing="ij")
+        flat = np.cos(elevation)
+        return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 3"], grid: ViewGrid) -> Panorama:
+    """Range image all round of a levelled scan: each cell takes the point whose ray is nearest to the cell's.
+
+    Rows that fall between two beams are filled where the cells above and below agree on one surface.
+
+    Args:
+        points_level: metres, z up, origin at the sensor; azimuth 0 is x.
+        grid: rows and limits; the panorama has ``grid.around`` columns, column 0 at azimuth -pi.
+
+    Returns:
+        Range, metres; 0 where nothing was measured within the limits.
+    """
+    x, y, z = points_level[:, 0], points_level[:, 1], points_level[:, 2]
+    flat = np.hypot(x, y)
+    distance = np.hypot(flat, z)
+    elevation = np.arctan2(z, flat)
+    top, bottom = np.deg2rad(grid.elevation_top_deg), np.deg2rad(grid.elevation_bottom_deg)
+    row_exact = (top - elevation) / (top - bottom) * (grid.rows - 1)
+    around = grid.around
+    column_exact = (np.arctan2(y, x) + np.pi) / (2 * np.pi) * around
+    row = np.rint(row_exact).astype(np.int64)
+    column = np.rint(column_exact).astype(np.int64) % around
+    good = (row >= 0) & (row < grid.rows) & (distance >= grid.min_range_m) & (distance <= grid.max_range_m)
+    cell = (row * around + column)[good]
+    # Written far ones first, so that the nearest to the cell's own ray is written last and stays.
+    off = np.abs(row_exact - row)[good] + np.abs(column_exact - np.rint(column_exact))[good]
+    order = np.argsort(-off, kind="stable")
+    panorama = np.zeros(grid.rows * around, np.float32)
+    panorama[cell[order]] = distance[good][order]
+    return _fill_between_beams(panorama.reshape(grid.rows, around))
+
+
+def _fill_between_beams(panorama: Panorama) -> Panorama:
+    """Fill gaps of one to three rows, and single columns, whose two sides lie on one surface (within 10 % of range)."""
+    filled = panorama.copy()
+    rows = panorama.shape[0]
+    for gap in (1, 2, 3):
+        for offset in range(1, gap + 1):
+            above, below = filled[: rows - gap - 1], filled[gap + 1 :]
+            hole = filled[offset : rows - gap - 1 + offset]
+            agree = (hole == 0) & (above > 0) & (below > 0)
+            agree &= np.abs(above - below) < (0.10 + 0.05 * gap) * np.minimum(above, below)
+            share = np.float32(offset / (gap + 1))
+            hole[agree] = ((1 - share) * above + share * below)[agree]
+    left, right = np.roll(filled, 1, axis=1), np.roll(filled, -1, axis=1)
+    agree = (filled == 0) & (left > 0) & (right > 0) & (np.abs(left - right) < 0.10 * np.minimum(left, right))
+    filled[agree] = 0.5 * (left + right)[agree]
+    return filled
+
+
+def ranges_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -> Ranges:
+    """Cut the view that looks along a heading (radians, against the panorama's x) out of a panorama."""
+    azimuth = heading_rad + grid.azimuths_rad
+    column = np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(np.int64) % grid.around
+    return panorama[:, column]
+
+
+def survey_planes(
+    ranges: Float32[NDArray[np.float32], "rows columns"],
+    *,
+    sensor_height_m: float,
+    rows_seen: Bool[NDArray[np.bool_], " rows"],
+    grid: ViewGrid,
+) -> Planes:
+    """The encoder's planes of a LiDAR view: no colour, and observed wherever the survey's beams reach.
+
+    Args:
+        ranges: the view, metres.
+        sensor_height_m: of the LiDAR above the local ground.
+        rows_seen: rows that the survey's sensor covers; the others are blank on both sides.
+        grid: the view grid.
+    """
+    planes = np.zeros((len(PLANES), grid.rows, grid.columns), np.float32)
+    inside = (ranges >= grid.min_range_m) & (ranges <= grid.max_range_m) & rows_seen[:, None]
+    planes[0] = ranges * inside
+    planes[3] = heights_of(planes[0], sensor_height_m, grid)
+    planes[4] = rows_seen[:, None]
+    return planes
+
+
+def heights_of(
+    ranges: Float32[NDArray[np.float32], "*lead rows columns"], sensor_height_m: float, grid: ViewGrid
+) -> Float32[NDArray[np.float32], "*lead rows columns"]:
+    """Height above the local ground, metres, of every measured cell; 0 elsewhere."""
+    sine = np.sin(grid.elevations_rad).astype(np.float32)[:, None]
+    return np.where(ranges > 0, ranges * sine + np.float32(sensor_height_m), np.float32(0))

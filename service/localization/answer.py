@@ -1,0 +1,57 @@
+"""What is known about where a query was taken."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.geometry.rigid import Transform
+from service.localization.hypotheses import Hypothesis
+from service.localization.search import Neighbour
+from service.localization.street_vote import StreetVote
+
+Status = Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timings:
+    """Milliseconds of each stage; ``decode_ms`` and ``total_ms`` with it are filled in by whoever decoded."""
+
+    decode_ms: float = 0.0
+    fuse_ms: float
+    encode_ms: float
+    search_ms: float
+    register_ms: float = 0.0
+    total_ms: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Answer:
+    """The answer to one query.
+
+    Attributes:
+        status: how far the answer can be trusted; without confidence calibration always LOCALIZED.
+        confidence: calibrated probability of being right; None until the map is calibrated.
+        vote: the k-nearest vote over streets; None where the map has none.
+        T_map_camera: pose of the camera, from the heaviest hypothesis.
+        covariance: of ``T_map_camera``, translation first; None without registration.
+        T_map_vehicle: pose of the vehicle, where the query said how the camera sits on it.
+        neighbours: the k most similar distinct places, the best first.
+        hypotheses: all clusters of the most similar views, the heaviest first.
+        measured_share: share of the view grid's cells with a measurement.
+        height_m: of the camera above the ground.
+    """
+
+    status: Status
+    confidence: float | None
+    vote: StreetVote | None
+    T_map_camera: Transform
+    covariance: Float64[NDArray[np.float64], "6 6"] | None
+    T_map_vehicle: Transform | None
+    neighbours: tuple[Neighbour, ...]
+    hypotheses: tuple[Hypothesis, ...]
+    measured_share: float
+    height_m: float
+    timings: Timings

@@ -1,0 +1,94 @@
+"""One query against one map, as the paper runs it: fuse, encode, search, cluster, vote."""
+
+from time import perf_counter
+
+import numpy as np
+
+from service.errors import BundleError
+from service.geometry.rigid import Transform, inverse, transform_from
+from service.imaging.query_view import QueryView, query_view
+from service.localization.answer import Answer, Timings
+from service.localization.encoder import Encoder
+from service.localization.hypotheses import ClusterSettings, Hypothesis, cluster
+from service.localization.query import Query
+from service.localization.search import distinct_places, search_views
+from service.localization.street_vote import vote
+from service.maps.reader import MapBundle
+
+
+class Localizer:
+    """A map and the encoder that made it; ``localize`` is safe to call from several threads.
+
+    Raises:
+        BundleError: the encoder is not the one that made the map's descriptors, or reads another view grid.
+    """
+
+    def __init__(self, bundle: MapBundle, encoder: Encoder, *, clusters: ClusterSettings | None = None) -> None:
+        expected, size = bundle.manifest.encoder_sha256, bundle.manifest.counts.descriptor_size
+        if encoder.sha256 != expected or encoder.dimension != size:
+            raise BundleError(
+                f"{bundle.path}: the descriptors ({size} numbers) are of encoder {expected[:12]}, not of "
+                f"{encoder.sha256[:12]} ({encoder.dimension} numbers): use the bundle's own, or build the map again",
+                field="encoder.onnx",
+            )
+        grid = (bundle.grid.rows, bundle.grid.columns)
+        if (encoder.rows, encoder.columns) != grid:
+            raise BundleError(
+                f"{bundle.path}: the encoder reads views of {encoder.rows} x {encoder.columns} cells, the map's have "
+                f"{grid[0]} x {grid[1]}: build the map again with a view grid that its encoder reads",
+                field="encoder.onnx",
+            )
+        self.bundle = bundle
+        self.encoder = encoder
+        self.clusters = clusters or ClusterSettings()
+
+    @classmethod
+    def open(cls, bundle: MapBundle) -> "Localizer":
+        """With the encoder that lies in the bundle."""
+        return cls(bundle, Encoder.open(bundle.encoder_bytes()))
+
+    def localize(self, query: Query) -> Answer:
+        """Answer a query.
+
+        Raises:
+            NoDepthError: the depth picture holds no measurement within the view grid.
+        """
+        started = perf_counter()
+        view = query_view(
+            query.rgb, query.depth_m, query.camera,
+            grid=self.bundle.grid, rows_seen=self.bundle.rows_seen, down_camera=query.down_camera,
+        )  # fmt: skip
+        fused = perf_counter()
+        descriptor = self.encoder.encode(view.planes[None], side="query")[0]
+        encoded = perf_counter()
+        wanted = max(query.neighbours, query.ranked)
+        matches = search_views(self.bundle, descriptor, places=wanted, fewest=self.clusters.views)
+        neighbours = distinct_places(matches, wanted)
+        hypotheses = cluster(matches, self.clusters)
+        streets = None if self.bundle.streets is None else vote(neighbours[: query.neighbours], self.clusters.temperature)
+        done = perf_counter()
+        T_map_camera = self._pose_of(hypotheses[0], view)
+        return Answer(
+            status="LOCALIZED",
+            confidence=None,
+            vote=streets,
+            T_map_camera=T_map_camera,
+            covariance=None,
+            T_map_vehicle=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
+            neighbours=neighbours,
+            hypotheses=hypotheses,
+            measured_share=view.measured_share,
+            height_m=view.height_m,
+            timings=Timings(
+                fuse_ms=1e3 * (fused - started),
+                encode_ms=1e3 * (encoded - fused),
+                search_ms=1e3 * (done - encoded),
+                total_ms=1e3 * (done - started),
+            ),
+        )
+
+    def _pose_of(self, hypothesis: Hypothesis, view: QueryView) -> Transform:
+        """The camera stands at the hypothesis, at its own height above the ground under the places' LiDAR."""
+        above_lidar_m = view.height_m - self.bundle.manifest.lidar_height_m
+        position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])
+        return transform_from(hypothesis.R_map_level @ view.R_level_camera, position_m)

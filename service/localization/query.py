@@ -1,0 +1,35 @@
+"""One question: where was this pair of pictures taken?"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from numpy.typing import NDArray
+
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import Transform
+
+MOST_NEIGHBOURS = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Query:
+    """Pictures that have been checked, and what is known beside them.
+
+    Attributes:
+        rgb: sRGB.
+        depth_m: z, metres; 0 where nothing was measured.
+        camera: rectified.
+        down_camera: direction of gravity in the camera frame, if an IMU measured it.
+        T_vehicle_camera: where the camera sits, if the vehicle's pose is wanted too.
+        neighbours: k, the number of distinct places that vote and are answered.
+        ranked: answer at least this many places, beyond the k that vote; evaluation wants R@10.
+    """
+
+    rgb: UInt8[NDArray[np.uint8], "H W 3"]
+    depth_m: Float32[NDArray[np.float32], "h w"]
+    camera: PinholeCamera
+    down_camera: Float64[NDArray[np.float64], "3"] | None = None
+    T_vehicle_camera: Transform | None = None
+    neighbours: int = 5
+    ranked: int = 0

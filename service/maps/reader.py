@@ -1,0 +1,182 @@
+"""Open a map bundle: check everything, then map it into memory."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int32
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+from service.imaging.view_grid import ViewGrid
+from service.maps import content as parts
+from service.maps import index, streets
+from service.maps.index import ViewIndex
+from service.maps.manifest import Manifest, read_manifest
+from service.maps.streets import Streets
+from service.maps.writer import sha256_of
+
+_NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
+_REMEDY = "copy or build the bundle again"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapBundle:
+    """An open map; all arrays are read-only and memory-mapped, safe to share between threads."""
+
+    path: Path
+    manifest: Manifest
+    grid: ViewGrid
+    rows_seen: Bool[NDArray[np.bool_], " rows"]
+    places: NDArray[Any]
+    views: NDArray[Any]
+    view_index: ViewIndex
+    streets: Streets | None
+    calibration: Mapping[str, Any]
+    cloud: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def open(cls, path: Path, *, verify: bool = True) -> "MapBundle":
+        """Open a bundle that ``write_bundle`` wrote.
+
+        Args:
+            path: the bundle's folder.
+            verify: compare every file's hash with the manifest; sizes and shapes are compared always.
+
+        Raises:
+            BundleError: missing, damaged, of another format, or contradicting itself; names the file and the remedy.
+        """
+        manifest = read_manifest(path)
+        _require_files(path, manifest, verify=verify)
+        bundle = cls(
+            path=path,
+            manifest=manifest,
+            grid=manifest.view_grid,
+            rows_seen=np.array(manifest.rows_seen, np.bool_),
+            places=_load(path / parts.PLACES_FILE, expected=parts.PLACE),
+            views=_load(path / parts.VIEWS_FILE, expected=parts.VIEW),
+            view_index=ViewIndex.open(path / index.FILE),
+            streets=_streets(path, manifest),
+            calibration=_json_object(path / parts.CALIBRATION_FILE),
+            cloud=_cloud(path, manifest),
+        )
+        _require_consistent(bundle)
+        return bundle
+
+    @property
+    def name(self) -> str:
+        """How requests address the map."""
+        return self.manifest.name
+
+    @property
+    def T_map_place(self) -> Float64[NDArray[np.float64], "P 4 4"]:
+        """Levelled pose of each place."""
+        poses: Float64[NDArray[np.float64], "P 4 4"] = self.places["T_map_place"]
+        return poses
+
+    @property
+    def place_street(self) -> Int32[NDArray[np.int32], " P"]:
+        """Number of each place's street; -1 for none."""
+        numbers: Int32[NDArray[np.int32], " P"] = self.places["street"]
+        return numbers
+
+    @property
+    def view_place(self) -> Int32[NDArray[np.int32], " V"]:
+        """Place of each view."""
+        numbers: Int32[NDArray[np.int32], " V"] = self.views["place"]
+        return numbers
+
+    @property
+    def view_heading_rad(self) -> Float64[NDArray[np.float64], " V"]:
+        """Heading of each view in the map frame."""
+        headings: Float64[NDArray[np.float64], " V"] = self.views["heading_rad"]
+        return headings
+
+    def encoder_bytes(self) -> bytes:
+        """The encoder that made the descriptors."""
+        return (self.path / parts.ENCODER_FILE).read_bytes()
+
+    def streets_geojson(self) -> bytes:
+        """The streets as they were given; an empty collection where the map has none."""
+        if self.streets is None:
+            return b'{"type": "FeatureCollection", "features": []}\n'
+        return (self.path / streets.FILE).read_bytes()
+
+
+def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
+    for name in _NEEDED:
+        if name not in manifest.files:
+            raise _defect(path / name, "the manifest does not list it")
+    for name, entry in manifest.files.items():
+        file = path / name
+        if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
+            raise _defect(file, "it is missing, or lies outside the bundle")
+        size = file.stat().st_size
+        if size != entry.size:
+            raise _defect(file, f"it has {size} bytes instead of {entry.size}")
+        if verify and sha256_of(file) != entry.sha256:
+            raise _defect(file, "its content is not what the manifest says")
+    if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
+        raise _defect(path / parts.ENCODER_FILE, "it is not the encoder that made the descriptors")
+
+
+def _load(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
+    try:
+        array = np.load(path, allow_pickle=False, mmap_mode="r")
+    except (OSError, ValueError, EOFError) as error:
+        raise _defect(path, f"it is no array of ours ({error})") from error
+    if expected is not None and (array.dtype != expected or array.ndim != 1):
+        raise _defect(path, f"it holds {array.dtype} in {array.ndim} dimensions")
+    return array  # type: ignore[no-any-return]  # np.load is not typed for one array
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise _defect(path, "it is no JSON") from error
+    if not isinstance(document, dict):
+        raise _defect(path, "it is no JSON object")
+    return document
+
+
+def _streets(path: Path, manifest: Manifest) -> Streets | None:
+    if streets.FILE not in manifest.files:
+        return None
+    return Streets.from_geojson(_json_object(path / streets.FILE))
+
+
+def _cloud(path: Path, manifest: Manifest) -> dict[str, NDArray[Any]]:
+    prefix, suffix = f"{parts.CLOUD_FOLDER}/", ".npy"
+    names = [name for name in manifest.files if name.startswith(prefix) and name.endswith(suffix)]
+    return {name.removeprefix(prefix).removesuffix(suffix): _load(path / name, expected=None) for name in names}
+
+
+def _require_consistent(bundle: MapBundle) -> None:
+    counts, path = bundle.manifest.counts, bundle.path
+    streets_found = 0 if bundle.streets is None else len(bundle.streets)
+    found = {
+        parts.PLACES_FILE: (len(bundle.places), counts.places, "places"),
+        parts.VIEWS_FILE: (len(bundle.views), counts.views, "views"),
+        index.FILE: (len(bundle.view_index), counts.views, "descriptors"),
+        streets.FILE: (streets_found, counts.streets, "streets"),
+        parts.CLOUD_FOLDER: (sum(len(tile) for tile in bundle.cloud.values()), counts.cloud_points, "points"),
+    }
+    for name, (has, expected, what) in found.items():
+        if has != expected:
+            raise _defect(path / name, f"it holds {has} {what} instead of {expected}")
+    if bundle.view_index.dimension != counts.descriptor_size:
+        raise _defect(path / index.FILE, f"descriptors of {bundle.view_index.dimension}, not {counts.descriptor_size}")
+    if bundle.view_place.min() < 0 or bundle.view_place.max() >= counts.places:
+        raise _defect(path / parts.VIEWS_FILE, "a view belongs to a place that is not there")
+    if bundle.place_street.min() < -1 or bundle.place_street.max() >= streets_found:
+        raise _defect(path / parts.PLACES_FILE, "a place lies in a street that is not there")
+    if not np.isfinite(bundle.T_map_place).all() or not np.isfinite(bundle.view_heading_rad).all():
+        raise _defect(path / parts.PLACES_FILE, "a pose or a heading is not finite")
+
+
+def _defect(path: Path, what: str) -> BundleError:
+    return BundleError(f"{path}: {what}; {_REMEDY}", field=path.name)

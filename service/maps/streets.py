@@ -1,0 +1,99 @@
+"""Street polygons of a map: which street, which section, which class of the paper's Table I."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+
+FILE = "streets.geojson"
+Ring = Float64[NDArray[np.float64], "n 2"]
+
+
+@dataclass(frozen=True, slots=True)
+class Street:
+    """One feature of ``streets.geojson``: a street or a section of one."""
+
+    id: str
+    street: str
+    section: Literal["beginning", "end"] | None
+    name: str
+    class_index: int
+    polygons: tuple[tuple[Ring, ...], ...]
+
+    def contains(self, position: Float64[NDArray[np.float64], "2"]) -> bool:
+        """Whether a point (in the polygons' own coordinates) lies inside; holes are outside."""
+        return any(sum(_inside(ring, position) for ring in rings) % 2 == 1 for rings in self.polygons)
+
+
+class Streets:
+    """The streets of a map, in the order of the file; other files refer to them by that index."""
+
+    def __init__(self, features: tuple[Street, ...]) -> None:
+        self.features = features
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def __getitem__(self, index: int) -> Street:
+        return self.features[index]
+
+    @classmethod
+    def from_geojson(cls, document: object) -> "Streets":
+        """Read a FeatureCollection of Polygon and MultiPolygon features.
+
+        Raises:
+            BundleError: a feature lacks a property or has another geometry; its number is named.
+        """
+        if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
+            raise _defect("it is not a GeoJSON FeatureCollection")
+        features = document.get("features")
+        if not isinstance(features, list):
+            raise _defect("it has no list of features")
+        return cls(tuple(_street_from(feature, number) for number, feature in enumerate(features)))
+
+    def index_at(self, position: Float64[NDArray[np.float64], "2"]) -> int:
+        """Index of the first street that contains a point; -1 where there is none."""
+        return next((index for index, street in enumerate(self.features) if street.contains(position)), -1)
+
+
+def _inside(ring: Ring, position: Float64[NDArray[np.float64], "2"]) -> bool:
+    """Even-odd rule: a ray towards growing x crosses the ring an odd number of times."""
+    start, end = ring, np.roll(ring, -1, axis=0)
+    spans = (start[:, 1] > position[1]) != (end[:, 1] > position[1])
+    rise = np.where(spans, end[:, 1] - start[:, 1], 1.0)
+    crossing = start[:, 0] + (position[1] - start[:, 1]) * (end[:, 0] - start[:, 0]) / rise
+    return bool(np.count_nonzero(spans & (position[0] < crossing)) % 2)
+
+
+def _street_from(feature: Any, number: int) -> Street:
+    try:
+        properties, geometry = feature["properties"], feature["geometry"]
+        kind, coordinates = geometry["type"], geometry["coordinates"]
+        identity, street, section = properties["id"], properties["street"], properties["section"]
+        name, class_index = properties["name"], properties["class_index"]
+    except (KeyError, TypeError) as missing:
+        raise _defect(f"feature {number} lacks {missing}") from missing
+    if section not in ("beginning", "end", None):
+        raise _defect(f"feature {number} has the section {section!r}, not beginning, end or null")
+    if not all(isinstance(text, str) for text in (identity, street, name)) or type(class_index) is not int:
+        raise _defect(
+            f"feature {number} has an id, street or name that is no text, or a class_index that is no integer"
+        )
+    if kind not in ("Polygon", "MultiPolygon"):
+        raise _defect(f"feature {number} is a {kind}, not a Polygon or MultiPolygon")
+    polygons = [coordinates] if kind == "Polygon" else coordinates
+    try:
+        rings = tuple(tuple(np.array(ring, np.float64)[:, :2].copy() for ring in rings) for rings in polygons)
+    except (TypeError, ValueError, IndexError) as error:
+        raise _defect(f"the coordinates of feature {number} are no rings of points") from error
+    if any(len(ring) < 4 or not np.isfinite(ring).all() for polygon in rings for ring in polygon):
+        raise _defect(f"a ring of feature {number} has fewer than four points, or one that is not finite")
+    return Street(identity, street, section, name, class_index, rings)
+
+
+def _defect(what: str) -> BundleError:
+    return BundleError(f"{FILE}: {what}; build the map again from a valid streets.geojson", field=FILE)

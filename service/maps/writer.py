@@ -1,0 +1,186 @@
+"""Write a map bundle whole or not at all."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from service.errors import BundleError
+from service.maps import content as parts
+from service.maps import index, manifest, streets
+from service.maps.content import BundleContent
+from service.maps.manifest import FORMAT, Counts, FileEntry, GridParameters, Manifest
+
+
+def write_bundle(out: Path, content: BundleContent, *, overwrite: bool = False) -> Manifest:
+    """Write a bundle beside its final name, bring it to the disk, and rename it when it is whole.
+
+    A killed or failed writer leaves nothing under the final name (a kill leaves a folder ``.NAME.*.partial``, safe to
+    delete). With ``overwrite`` the old bundle is moved aside first and comes back if the last step fails.
+
+    Args:
+        out: the bundle's folder.
+        content: the map.
+        overwrite: replace a bundle of that name.
+
+    Raises:
+        BundleError: the path is taken, the content contradicts itself, or the disk refuses.
+    """
+    if out.exists() and not overwrite:
+        raise BundleError(f"{out}: there is something of that name already; choose another, or overwrite it")
+    _require_valid(content)
+    partial: Path | None = None
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
+        made = _write_files(partial, content)
+        partial.chmod(0o755)
+        _sync(partial)
+        _put_in_place(partial, out)
+    except OSError as error:
+        raise BundleError(
+            f"{out}: the bundle cannot be written ({error.strerror}); make room or choose another folder"
+        ) from error
+    finally:
+        if partial is not None and partial.exists():
+            shutil.rmtree(partial, ignore_errors=True)
+    return made
+
+
+def _write_files(folder: Path, content: BundleContent) -> Manifest:
+    (folder / parts.CLOUD_FOLDER).mkdir()
+    places = np.empty(len(content.T_map_place), parts.PLACE)
+    places["T_map_place"], places["street"] = content.T_map_place, content.place_street
+    views = np.empty(len(content.view_place), parts.VIEW)
+    views["place"], views["heading_rad"] = content.view_place, content.view_heading_rad
+    writers: dict[str, Callable[[Path], object]] = {
+        parts.ENCODER_FILE: lambda path: path.write_bytes(content.encoder),
+        index.FILE: lambda path: index.write_index(path, content.descriptors),
+        parts.PLACES_FILE: lambda path: np.save(path, places, allow_pickle=False),
+        parts.VIEWS_FILE: lambda path: np.save(path, views, allow_pickle=False),
+        parts.CALIBRATION_FILE: lambda path: path.write_bytes(_json(content.calibration)),
+    }
+    if content.preview_webp:
+        writers[parts.PREVIEW_FILE] = lambda path: path.write_bytes(content.preview_webp)
+    if content.streets is not None:
+        writers[streets.FILE] = lambda path: path.write_bytes(_json(content.streets))
+    for name, tile in content.cloud.items():
+        writers[f"{parts.CLOUD_FOLDER}/{name}.npy"] = _tile_writer(tile)
+    for name, write in writers.items():
+        write(folder / name)
+        _sync(folder / name)
+    _sync(folder / parts.CLOUD_FOLDER)
+    made = _manifest_of(folder, content, sorted(writers))
+    (folder / manifest.FILE).write_bytes(made.to_bytes())
+    _sync(folder / manifest.FILE)
+    return made
+
+
+def _tile_writer(tile: NDArray[Any]) -> Callable[[Path], None]:
+    return lambda path: np.save(path, tile, allow_pickle=False)
+
+
+def _json(document: object) -> bytes:
+    return (json.dumps(document, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def _manifest_of(folder: Path, content: BundleContent, names: list[str]) -> Manifest:
+    files = {name: FileEntry(sha256=sha256_of(folder / name), size=(folder / name).stat().st_size) for name in names}
+    try:
+        return Manifest(
+            format=FORMAT,
+            name=content.name,
+            version="0" * 16,
+            made_at=datetime.now(UTC),
+            grid=GridParameters(**asdict(content.grid)),
+            headings=content.headings,
+            spacing_m=content.spacing_m,
+            rows_seen=tuple(bool(seen) for seen in content.rows_seen),
+            parameters=dict(content.parameters),
+            encoder_sha256=files[parts.ENCODER_FILE].sha256,
+            counts=_counts_of(content),
+            georeference=None if content.georeference is None else dict(content.georeference),
+            licence=content.licence,
+            files=files,
+            tool_versions=dict(content.tool_versions),
+        ).stamped()
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise BundleError(f"the map cannot be described: {where}: {first['msg']}", field=where) from error
+
+
+def _counts_of(content: BundleContent) -> Counts:
+    return Counts(
+        places=len(content.T_map_place),
+        views=len(content.view_place),
+        descriptor_size=content.descriptors.shape[1],
+        cloud_points=sum(len(tile) for tile in content.cloud.values()),
+        streets=0 if content.streets is None else len(content.streets.get("features", ())),
+    )
+
+
+def _require_valid(content: BundleContent) -> None:
+    """Refuse what would be refused again on opening, before hours of work are on the disk."""
+    named = 0 if content.streets is None else len(streets.Streets.from_geojson(content.streets))
+    tiles = [name for name in content.cloud if not manifest.is_confined(name) or "/" in name]
+    if content.rows_seen.shape != (content.grid.rows,):
+        what = f"rows_seen has {len(content.rows_seen)} entries for {content.grid.rows} rows"
+    elif len(content.T_map_place) == 0 or len(content.view_place) == 0:
+        what = "it has no place or no view"
+    elif content.view_place.min() < 0 or content.view_place.max() >= len(content.T_map_place):
+        what = "a view belongs to a place that is not there"
+    elif content.place_street.min() < -1 or content.place_street.max() >= named:
+        what = f"a place lies in a street that is not among the {named} of streets.geojson"
+    elif not np.isfinite(content.descriptors).all() or not np.isfinite(content.T_map_place).all():
+        what = "a descriptor or a pose is not finite"
+    elif "lidar_height_m" not in content.parameters:
+        what = "parameters lacks lidar_height_m"
+    elif tiles:
+        what = f"{tiles[0]!r} is no name for a tile"
+    elif any(tile.dtype.hasobject for tile in content.cloud.values()):
+        what = "a tile of the cloud holds Python objects"
+    else:
+        return
+    raise BundleError(f"the map {content.name!r} contradicts itself: {what}; mend what builds it")
+
+
+def sha256_of(path: Path) -> str:
+    """Hash of a file, read in pieces."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _sync(path: Path) -> None:
+    """Bring a file's or folder's content to the disk, so that no rename can overtake it."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _put_in_place(partial: Path, out: Path) -> None:
+    if not out.exists():
+        partial.rename(out)
+    else:
+        aside = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".replaced", dir=out.parent))
+        out.rename(aside / out.name)
+        try:
+            partial.rename(out)
+        except OSError:
+            (aside / out.name).rename(out)
+            raise
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+    _sync(out.parent)

@@ -1,0 +1,118 @@
+"""The composition root: settings in, a running engine out; every face calls this and nothing below it."""
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.geometry.camera import PinholeCamera
+from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
+from service.localization.answer import Answer
+from service.localization.query import Query
+from service.maps.reader import MapBundle
+from service.runtime.admission import Admission
+from service.runtime.map_registry import MapRegistry
+from service.runtime.settings import Settings
+from service.runtime.threads import limit_pools, usable_cores
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EncodedQuery:
+    """A query as it comes in: pictures not yet decoded, numbers already checked by the face.
+
+    Attributes:
+        map_name: which map; None where only one is mounted.
+        scale_m: metres for each stored unit; None lets the format decide.
+    """
+
+    rgb: bytes
+    depth: bytes
+    camera: PinholeCamera
+    map_name: str | None = None
+    depth_encoding: DepthEncoding = "auto"
+    depth_kind: DepthKind = "z"
+    scale_m: float | None = None
+    baseline_m: float | None = None
+    max_range_m: float | None = None
+    down_camera: NDArray[np.float64] | None = None
+    T_vehicle_camera: NDArray[np.float64] | None = None
+    neighbours: int = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """An answer and the map that gave it."""
+
+    answer: Answer
+    bundle: MapBundle
+
+
+class Engine:
+    """Open maps and the workers that serve them."""
+
+    def __init__(self, registry: MapRegistry, settings: Settings) -> None:
+        self.registry = registry
+        self.settings = settings
+        self.threads = settings.threads or usable_cores()
+        self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
+
+    @classmethod
+    def open(cls, settings: Settings) -> "Engine":
+        """Open all maps of the settings.
+
+        Raises:
+            BundleError: a map is missing, damaged or mismatched.
+        """
+        limit_pools()
+        return cls(MapRegistry.open(settings.maps), settings)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there is a map to answer from."""
+        return len(self.registry) > 0
+
+    def localize(self, encoded: EncodedQuery) -> Located:
+        """Decode and localize, in the thread of the caller.
+
+        Raises:
+            UnknownMapError: no map of that name.
+            RequestError: a picture is undecodable, of the wrong size, or without depth.
+            UnsupportedFormatError: a picture's format is not read.
+            TooLargeError: a picture is beyond the limits.
+        """
+        localizer = self.registry.get(encoded.map_name)
+        started = perf_counter()
+        query = self._decode(encoded)
+        decode_ms = 1e3 * (perf_counter() - started)
+        answer = localizer.localize(query)
+        timings = replace(answer.timings, decode_ms=decode_ms, total_ms=answer.timings.total_ms + decode_ms)
+        return Located(replace(answer, timings=timings), localizer.bundle)
+
+    def close(self) -> None:
+        """Let running work end and drop what waits."""
+        self.admission.close()
+
+    def _decode(self, encoded: EncodedQuery) -> Query:
+        limits = self.settings.limits
+        image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels)
+        rgb = decode_rgb(encoded.rgb, limits=image_limits)
+        depth_m = decode_depth(
+            encoded.depth,
+            camera=encoded.camera,
+            encoding=encoded.depth_encoding,
+            scale_m=encoded.scale_m,
+            kind=encoded.depth_kind,
+            baseline_m=encoded.baseline_m,
+            max_range_m=encoded.max_range_m,
+            limits=image_limits,
+        )
+        require_sizes(rgb, depth_m, encoded.camera)
+        return Query(
+            rgb=rgb,
+            depth_m=depth_m,
+            camera=encoded.camera,
+            down_camera=encoded.down_camera,
+            T_vehicle_camera=encoded.T_vehicle_camera,
+            neighbours=encoded.neighbours,
+        )

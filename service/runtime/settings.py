@@ -1,0 +1,57 @@
+"""Settings of a service: defaults < environment ``STREETFIX_*`` < flags. Made once, in the command line."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from service.errors import RequestError
+from service.imaging.picture_headers import DEFAULT_LIMITS
+
+
+class Limits(BaseModel):
+    """What one request may cost; checked before memory is taken."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_request_bytes: int = Field(40 * 2**20, ge=1024, description="whole body of a request")
+    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, description="one picture, encoded")
+    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, description="one picture, decoded")
+    max_parts: int = Field(8, ge=3, description="parts of a multipart body")
+
+
+class Settings(BaseSettings):
+    """All that an operator may set. Nested names are joined by two underscores: ``STREETFIX_LIMITS__MAX_PIXELS``."""
+
+    model_config = SettingsConfigDict(
+        env_prefix="STREETFIX_", env_nested_delimiter="__", frozen=True, extra="forbid", cli_parse_args=False
+    )
+
+    maps: Annotated[tuple[Path, ...], NoDecode] = Field((), description="map bundles, or folders of them; ':' between")
+    host: str = Field("127.0.0.1", description="address to listen on; loopback unless told otherwise")
+    port: int = Field(8000, ge=0, le=65535, description="0 lets the system choose")
+    threads: int | None = Field(None, ge=1, le=256, description="requests worked on at once; default: the usable cores")
+    queue: int = Field(64, ge=0, le=100_000, description="requests that may wait for a thread before 503")
+    request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
+    limits: Limits = Limits()
+
+    @field_validator("maps", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        return tuple(part for part in value.split(":") if part) if isinstance(value, str) else value
+
+
+def load_settings(**flags: object) -> Settings:
+    """Settings from the environment, with flags that are not None above it.
+
+    Raises:
+        RequestError: a value makes no sense; its name is in the message.
+    """
+    given = {name: value for name, value in flags.items() if value is not None}
+    try:
+        return Settings.model_validate(Settings(**given))  # type: ignore[arg-type]  # checked by pydantic
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise RequestError(f"setting {where}: {first['msg']} (it is {first['input']!r})", field=where) from error

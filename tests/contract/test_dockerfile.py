@@ -1,0 +1,100 @@
+"""There may be no container engine where this runs: the Dockerfile is parsed instead."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def instructions() -> list[tuple[str, str]]:
+    """Instruction and arguments, continued lines joined, comments left out."""
+    lines = [line for line in (ROOT / "Dockerfile").read_text().splitlines() if not line.lstrip().startswith("#")]
+    joined = re.sub(r"\s*\\\n\s*", " ", "\n".join(lines))
+    return [
+        (name.upper(), rest.strip()) for name, _, rest in (line.partition(" ") for line in joined.splitlines() if line)
+    ]
+
+
+def stages() -> list[list[tuple[str, str]]]:
+    found: list[list[tuple[str, str]]] = []
+    for name, rest in instructions():
+        if name == "FROM":
+            found.append([])
+        found[-1].append((name, rest))
+    return found
+
+
+def values(stage: list[tuple[str, str]], name: str) -> list[str]:
+    return [rest for each, rest in stage if each == name]
+
+
+def sources() -> list[str]:
+    """What is copied from the repository, not from another stage."""
+    copies = [shlex.split(rest) for stage in stages() for rest in values(stage, "COPY")]
+    return [source for copy in copies if not copy[0].startswith("--from=") for source in copy[:-1]]
+
+
+@pytest.mark.parametrize("source", sources())
+def test_what_is_copied_exists_and_is_not_ignored(source: str) -> None:
+    assert (ROOT / source).exists()
+    kept = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
+    assert source in kept
+
+
+def test_there_are_two_stages_on_slim_images() -> None:
+    images = [values(stage, "FROM")[0].split()[0] for stage in stages()]
+    assert len(images) == 2
+    assert all(re.fullmatch(r"python:3\.\d+-slim\S*", image) for image in images)
+
+
+def test_the_last_stage_copies_from_the_first_only() -> None:
+    assert all(rest.startswith("--from=build ") for rest in values(stages()[-1], "COPY"))
+
+
+def test_the_service_runs_as_a_user_without_rights() -> None:
+    user, group = values(stages()[-1], "USER")[-1].split(":")
+    assert int(user) >= 1000
+    assert int(group) >= 1000
+
+
+def test_packages_are_installed_from_the_lock_by_hash() -> None:
+    run = " ".join(values(stages()[0], "RUN"))
+    assert "--require-hashes --requirement locks/service.txt" in run
+    lock = (ROOT / "locks" / "service.txt").read_text()
+    pinned = re.findall(r"^[A-Za-z0-9._-]+(?:\[[^\]]*\])?==", lock, flags=re.MULTILINE)
+    assert pinned
+    assert lock.count("--hash=sha256:") >= len(pinned)
+
+
+def test_no_torch_and_no_build_tool_gets_in() -> None:
+    lock = (ROOT / "locks" / "service.txt").read_text()
+    assert not re.search(r"^(torch|embreex|tensorboard|nvidia|pytest|setuptools|wheel)\b", lock, flags=re.MULTILINE)
+    last = " ".join(rest for _, rest in stages()[-1])
+    assert not re.search(r"\b(apt|apt-get|gcc|make|pip install)\b", last)
+    assert "pip uninstall" in last
+
+
+def test_nothing_is_written_at_run_time() -> None:
+    assert "PYTHONDONTWRITEBYTECODE=1" in " ".join(values(stages()[-1], "ENV"))
+    assert values(stages()[-1], "WORKDIR") == ["/tmp"]  # noqa: S108  # the one folder that may be written
+
+
+def test_health_is_asked_at_the_port_that_is_exposed() -> None:
+    stage = stages()[-1]
+    port = values(stage, "EXPOSE")[0]
+    assert f"STREETFIX_PORT={port}" in values(stage, "ENV")[0]
+    health = values(stage, "HEALTHCHECK")[0]
+    code = json.loads(health[health.index("CMD ") + 4 :])[2]
+    compile(code, "HEALTHCHECK", "exec")
+    assert "/readyz" in code
+
+
+def test_the_command_serves_the_mounted_maps_on_all_addresses_of_the_container() -> None:
+    stage = stages()[-1]
+    assert json.loads(values(stage, "CMD")[0]) == ["streetfix", "serve", "--host", "0.0.0.0"]  # noqa: S104
+    assert values(stage, "VOLUME") == ['["/maps"]']
+    assert "STREETFIX_MAPS=/maps" in values(stage, "ENV")[0]

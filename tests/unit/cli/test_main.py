@@ -1,0 +1,118 @@
+import sys
+import types
+from collections.abc import Callable
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+
+from service.cli import main as command_line
+from service.cli.main import main
+from service.errors import DatasetError
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    return int(end.value.code or 0)
+
+
+@pytest.fixture
+def mount(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Put commands behind the entry-point group, as an installed package would."""
+
+    def put(**functions: Callable[..., None] | None) -> None:
+        module = types.ModuleType("fake_commands")
+        for name, function in functions.items():
+            if function is not None:
+                setattr(module, name, function)
+        monkeypatch.setitem(sys.modules, "fake_commands", module)
+        points = [
+            EntryPoint(name.replace("_", "-"), f"fake_commands:{name}", "streetfix.commands") for name in functions
+        ]
+        monkeypatch.setattr(command_line, "entry_points", lambda **_: points)
+
+    return put
+
+
+def test_help_lists_all_commands_with_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    out = capsys.readouterr().out
+    for name in ("serve", "localize", "simulate", "import", "train", "export", "build-map", "evaluate"):
+        assert f"\n  {name} " in out
+
+
+def test_no_arguments_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 2
+    assert "Commands" in "".join(capsys.readouterr())
+
+
+def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--version") == 0
+    assert capsys.readouterr().out.startswith("streetfix 0.")
+
+
+@pytest.mark.parametrize("arguments", [["serve", "--prot", "1"], ["nothing"], ["localize"]])
+def test_wrong_usage_is_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*arguments) == 2
+    assert "Error" in capsys.readouterr().err
+
+
+def test_a_mounted_command_gets_its_arguments(mount: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    def build_map(source: Path, spacing_m: Annotated[float, typer.Option()] = 1.0) -> None:
+        """Build."""
+        typer.echo(f"{source.name} {spacing_m}")
+
+    mount(build_map=build_map)
+    assert run("build-map", "city", "--spacing-m", "2.5") == 0
+    assert capsys.readouterr().out == "city 2.5\n"
+
+
+def test_a_mounted_commands_own_help_is_shown(mount: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    def simulate() -> None:
+        """Raise a city from its seed."""
+
+    mount(simulate=simulate)
+    assert run("simulate", "--help") == 0
+    assert "Raise a city from its seed." in capsys.readouterr().out
+
+
+def test_only_the_called_command_is_imported(mount: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    # The function ``train`` is not there: loading it would fail.
+    mount(simulate=lambda: None, train=None)
+    assert run("simulate") == 0
+    assert run("--help") == 0
+
+
+@pytest.mark.parametrize(("name", "extra"), [("train", "training"), ("build_map", "mapping"), ("evaluate", "mapping")])
+def test_a_missing_package_names_the_extra(
+    mount: Callable[..., None], capsys: pytest.CaptureFixture[str], name: str, extra: str
+) -> None:
+    def needs_much() -> None:
+        import a_package_that_is_not_there  # noqa: F401  # type: ignore[import-not-found]  # that is the point
+
+    mount(**{name: needs_much})
+    assert run(name.replace("_", "-")) == 1
+    assert f'pip install "streetfix[{extra}]"' in capsys.readouterr().err
+
+
+def test_a_package_missing_at_import_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = [EntryPoint("train", "a_package_that_is_not_there:command", "streetfix.commands")]
+    monkeypatch.setattr(command_line, "entry_points", lambda **_: points)
+    assert run("train", "anything", "at all") == 1
+    assert "'a_package_that_is_not_there'" in capsys.readouterr().err
+
+
+def test_an_error_of_ours_is_a_message_without_a_traceback(
+    mount: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def evaluate() -> None:
+        raise DatasetError("queries/a: poses.txt is missing; give a set with truth")
+
+    mount(evaluate=evaluate)
+    assert run("evaluate") == 1
+    assert capsys.readouterr().err == "streetfix: queries/a: poses.txt is missing; give a set with truth\n"

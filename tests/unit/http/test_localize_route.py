@@ -1,0 +1,252 @@
+import json
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from typing import Any
+
+import httpx
+import pytest
+
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
+
+Parts = Callable[..., dict[str, bytes]]
+
+
+def post(client: httpx.Client, parts: dict[str, bytes], **headers: str) -> httpx.Response:
+    files = {name: (name, data) for name, data in parts.items()}
+    return client.post("/v1/localize", files=files, headers=headers)
+
+
+def require_problem(response: httpx.Response, status: int, code: str, field: str | None) -> dict[str, Any]:
+    problem: dict[str, Any] = response.json()
+    assert (response.status_code, problem["code"], problem["field"]) == (status, code, field), problem
+    assert response.headers["content-type"] == "application/problem+json"
+    assert problem["type"] == f"/problems/{code}"
+    assert problem["status"] == status
+    assert problem["request_id"] == response.headers["x-request-id"]
+    return problem
+
+
+def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts) -> None:
+    response = post(client, parts_of())
+    answer = response.json()
+    assert response.status_code == 200
+    assert list(answer) == [
+        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings_ms",
+    ]  # fmt: skip
+    assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
+    assert answer["street"] | {"vote": 1} == {
+        "id": "s2", "name": "End of street 2", "street": "2", "section": "end", "class_index": 2, "vote": 1,
+    }  # fmt: skip
+    assert answer["pose"]["position"]["x"] == pytest.approx(20, abs=0.05)
+    assert answer["pose"]["heading_deg"] == pytest.approx(90, abs=1)
+    assert answer["pose"]["covariance"] is None
+    assert answer["map"]["name"] == "tiny"
+    assert list(answer["timings_ms"]) == ["decode", "fuse", "encode", "search", "register", "total"]
+    assert answer["neighbours"][0]["street"] == "s2"
+    assert len(answer["neighbours"]) == 5
+
+
+def test_as_many_neighbours_as_asked_for(client: httpx.Client, parts_of: Parts) -> None:
+    answer = post(client, parts_of(options={"neighbours": 2, "refine": False})).json()
+    assert len(answer["neighbours"]) == 2
+
+
+def test_the_vehicles_pose_is_answered_where_asked_for(client: httpx.Client, parts_of: Parts) -> None:
+    # The camera looks forward, 1 m before and 0.5 m above the vehicle's origin.
+    T = {"position": {"x": 1, "y": 0, "z": 0.5}, "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}}
+    answer = post(client, parts_of(T_vehicle_camera=T)).json()
+    camera, vehicle = answer["pose"], answer["vehicle_pose"]
+    assert vehicle["heading_deg"] == pytest.approx(camera["heading_deg"], abs=1e-6)
+    assert vehicle["position"]["y"] == pytest.approx(camera["position"]["y"] - 1, abs=0.05)
+    assert vehicle["position"]["z"] == pytest.approx(camera["position"]["z"] - 0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("part", ["rgb", "depth", "request"])
+def test_a_missing_part_is_named(client: httpx.Client, parts_of: Parts, part: str) -> None:
+    parts = parts_of()
+    del parts[part]
+    require_problem(post(client, parts), 422, "request", part)
+
+
+def test_an_unknown_part_is_named(client: httpx.Client, parts_of: Parts) -> None:
+    require_problem(post(client, parts_of() | {"lidar": b"1"}), 422, "request", "lidar")
+
+
+@pytest.mark.parametrize("part", ["rgb", "depth"])
+def test_a_damaged_picture_is_named(client: httpx.Client, parts_of: Parts, part: str) -> None:
+    parts = parts_of()
+    parts[part] = parts[part][: len(parts[part]) // 2]
+    require_problem(post(client, parts), 422, "undecodable", part)
+
+
+@pytest.mark.parametrize("part", ["rgb", "depth"])
+def test_a_picture_in_no_known_format_is_named(client: httpx.Client, parts_of: Parts, part: str) -> None:
+    require_problem(post(client, parts_of() | {part: b"GIF89a" + bytes(50)}), 415, "format", part)
+
+
+def test_pictures_that_do_not_fit_the_intrinsics_are_named(client: httpx.Client, parts_of: Parts) -> None:
+    camera = {"width": 64, "height": 36, "fx": 32, "fy": 32, "cx": 31.5, "cy": 17.5}
+    problem = require_problem(post(client, parts_of(camera=camera)), 422, "image-size", "rgb")
+    assert "64x48" in problem["detail"]
+    assert "64x36" in problem["detail"]
+
+
+def test_a_picture_of_too_many_pixels_is_refused(client: httpx.Client, parts_of: Parts) -> None:
+    import cv2
+    import numpy as np
+
+    large = cv2.imencode(".png", np.zeros((200, 200, 3), np.uint8))[1].tobytes()
+    require_problem(post(client, parts_of() | {"rgb": large}), 413, "too-large", "rgb")
+
+
+def test_a_picture_of_too_many_bytes_is_refused(client: httpx.Client, parts_of: Parts) -> None:
+    large = parts_of()["rgb"] + bytes(150_000)
+    require_problem(post(client, parts_of() | {"rgb": large}), 413, "too-large", "rgb")
+
+
+def test_too_many_parts_are_refused(client: httpx.Client, parts_of: Parts) -> None:
+    require_problem(post(client, parts_of() | {"a": b"", "b": b""}), 413, "too-large", None)
+
+
+def test_an_announced_body_beyond_the_limit_is_refused_unread(client: httpx.Client) -> None:
+    response = client.post("/v1/localize", content=bytes(200_001), headers={"content-type": "multipart/form-data"})
+    assert "200001 bytes" in require_problem(response, 413, "too-large", None)["detail"]
+
+
+def test_a_body_of_unknown_length_is_counted(client: httpx.Client) -> None:
+    def chunks() -> Iterator[bytes]:
+        for _ in range(300):
+            yield bytes(1000)
+
+    response = client.post("/v1/localize", content=chunks(), headers={"content-type": "multipart/form-data"})
+    require_problem(response, 413, "too-large", None)
+
+
+def test_another_content_type_is_refused(client: httpx.Client) -> None:
+    require_problem(client.post("/v1/localize", json={}), 415, "format", None)
+
+
+def test_an_unknown_map_is_refused_with_the_mounted_ones(client: httpx.Client, parts_of: Parts) -> None:
+    problem = require_problem(post(client, parts_of(map="west")), 404, "unknown-map", "map")
+    assert "mounted: tiny" in problem["detail"]
+
+
+def test_no_depth_is_a_problem_of_its_own(client: httpx.Client, parts_of: Parts) -> None:
+    require_problem(post(client, parts_of(depth={"scale_m": 0.001, "max_range_m": 0.001})), 422, "no-depth", "depth")
+
+
+ORIGIN = {"x": 0, "y": 0, "z": 0}
+CAMERA = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
+
+
+@pytest.mark.parametrize(
+    ("changed", "field"),
+    [
+        ({"camera": None}, "camera"),
+        ({"camera": CAMERA | {"fx": 0}}, "camera.fx"),
+        ({"camera": CAMERA | {"fx": "wide"}}, "camera.fx"),
+        ({"camera": CAMERA | {"model": "FISHEYE"}}, "camera.model"),
+        ({"camera": CAMERA | {"skew": 1}}, "camera.skew"),
+        ({"depth": {"kind": "inverse"}}, "depth.kind"),
+        ({"depth": {"scale": 1}}, "depth.scale"),
+        ({"gravity": {"x": 0, "y": 0, "z": 0}}, "gravity"),
+        ({"gravity": {"x": 0, "y": 1}}, "gravity.z"),
+        ({"options": {"neighbours": 51}}, "options.neighbours"),
+        ({"surprise": 1}, "surprise"),
+        ({"T_vehicle_camera": {"position": ORIGIN, "orientation": ORIGIN | {"w": 0}}}, "T_vehicle_camera.orientation"),
+    ],
+)
+def test_a_bad_field_is_named(client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str) -> None:
+    require_problem(post(client, parts_of(**changed)), 422, "request", field)
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[]", b"\xff", b"[" * 100_000, b'{"camera": NaN}'])
+def test_a_request_that_is_no_json_object_is_refused(client: httpx.Client, parts_of: Parts, text: bytes) -> None:
+    response = post(client, parts_of() | {"request": text})
+    assert (response.status_code, response.json()["code"]) == (422, "request")
+
+
+@pytest.mark.parametrize(
+    ("changed", "field"),
+    [
+        ({"prior": {"position": {"x": 0, "y": 0, "z": 0, "std_m": 20}}}, "prior"),
+        ({"options": {"refine": True}}, "options.refine"),
+        ({"camera": CAMERA | {"distortion": [0.1, 0, 0, 0]}}, "camera.distortion"),
+    ],
+)
+def test_what_this_release_cannot_use_is_refused_and_not_ignored(
+    client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str
+) -> None:
+    require_problem(post(client, parts_of(**changed)), 422, "not-yet", field)
+
+
+def test_gravity_of_any_length_is_taken(client: httpx.Client, parts_of: Parts) -> None:
+    answer = post(client, parts_of(gravity={"x": 0, "y": 9.81, "z": 0}))
+    assert answer.status_code == 200
+
+
+def test_a_request_id_of_the_callers_is_kept(client: httpx.Client, parts_of: Parts) -> None:
+    response = post(client, parts_of(), **{"X-Request-Id": "robot-7.42"})
+    assert response.headers["x-request-id"] == "robot-7.42"
+
+
+def test_a_request_id_that_could_forge_a_log_is_replaced(client: httpx.Client, parts_of: Parts) -> None:
+    response = post(client, parts_of(), **{"X-Request-Id": "a b"})
+    assert len(response.headers["x-request-id"]) == 32
+
+
+def test_what_nobody_foresaw_shows_the_request_id_and_nothing_else(
+    client: httpx.Client,
+    engine: Engine,
+    parts_of: Parts,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def fail(_: object) -> None:
+        raise ZeroDivisionError("secret inner state")
+
+    monkeypatch.setattr(engine, "localize", fail)
+    response = post(client, parts_of())
+    problem = require_problem(response, 500, "internal", None)
+    assert "secret" not in json.dumps(problem)
+    assert "secret inner state" in caplog.text
+    assert problem["request_id"] in caplog.text
+
+
+def test_beyond_the_queue_the_answer_is_busy_with_retry_after(
+    client: httpx.Client, engine: Engine, parts_of: Parts
+) -> None:
+    release, running = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        running.set()
+        release.wait(30)
+
+    held: list[Future[None]] = [engine.admission.submit(hold)]
+    assert running.wait(30)
+    held.append(engine.admission.submit(lambda: None))
+    try:
+        response = post(client, parts_of())
+        require_problem(response, 503, "busy", None)
+        assert response.headers["retry-after"] == "1"
+        assert client.get("/livez").status_code == 200
+    finally:
+        release.set()
+        for future in held:
+            future.result(30)
+
+
+def test_a_request_that_takes_too_long_is_told_so(
+    engine: Engine, parts_of: Parts, client_of: Callable[[Engine], httpx.Client]
+) -> None:
+    hurried = Engine(engine.registry, Settings(threads=1, request_timeout_s=0.05))
+    release = threading.Event()
+    held = hurried.admission.submit(lambda: release.wait(30))
+    try:
+        require_problem(post(client_of(hurried), parts_of()), 504, "deadline", None)
+    finally:
+        release.set()
+        held.result(30)
+        hurried.close()

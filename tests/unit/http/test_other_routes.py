@@ -1,0 +1,60 @@
+from collections.abc import Callable
+
+import httpx
+import pytest
+
+from service.runtime.engine import Engine
+from service.runtime.map_registry import MapRegistry
+from service.runtime.settings import Settings
+
+
+def test_maps_are_listed_with_version_and_counts(client: httpx.Client, engine: Engine) -> None:
+    (entry,) = client.get("/v1/maps").json()["maps"]
+    assert entry["version"] == engine.registry.get("tiny").bundle.manifest.version
+    assert (entry["name"], entry["places"], entry["views"], entry["streets"]) == ("tiny", 12, 48, 3)
+
+
+def test_streets_are_geojson(client: httpx.Client) -> None:
+    response = client.get("/v1/maps/tiny/streets")
+    assert response.headers["content-type"] == "application/geo+json"
+    assert [feature["properties"]["id"] for feature in response.json()["features"]] == ["s0", "s1", "s2"]
+
+
+@pytest.mark.parametrize("name", ["west", "..%2f..%2fetc%2fpasswd", "%00"])
+def test_streets_of_an_unknown_map_are_a_problem(client: httpx.Client, name: str) -> None:
+    response = client.get(f"/v1/maps/{name}/streets")
+    assert response.status_code == 404
+    assert response.headers["content-type"] == "application/problem+json"
+
+
+def test_the_version_says_which_maps_are_served(client: httpx.Client) -> None:
+    version = client.get("/v1/version").json()
+    assert (version["api"], version["threads"], version["maps"][0]["name"]) == ("v1", 1, "tiny")
+
+
+@pytest.mark.parametrize("path", ["/livez", "/readyz"])
+def test_a_service_with_a_map_lives_and_is_ready(client: httpx.Client, path: str) -> None:
+    assert client.get(path).json() == {"status": "ok"}
+
+
+def test_a_service_without_a_map_lives_and_is_not_ready(client_of: Callable[[Engine], httpx.Client]) -> None:
+    engine = Engine(MapRegistry(), Settings(threads=1))
+    client = client_of(engine)
+    assert client.get("/livez").status_code == 200
+    response = client.get("/readyz")
+    assert (response.status_code, response.json()["code"]) == (503, "bundle")
+    engine.close()
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "code"),
+    [("GET", "/nowhere", 404, "not-found"), ("GET", "/v1/localize", 405, "method-not-allowed")],
+)
+def test_what_http_refuses_is_a_problem_too(
+    client: httpx.Client, method: str, path: str, status: int, code: str
+) -> None:
+    response = client.request(method, path)
+    problem = response.json()
+    assert (response.status_code, problem["code"]) == (status, code)
+    assert response.headers["content-type"] == "application/problem+json"
+    assert problem["request_id"] == response.headers["x-request-id"]

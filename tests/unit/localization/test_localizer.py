@@ -1,0 +1,117 @@
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from service.errors import BundleError, NoDepthError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import heading_of_camera, transform_from
+from service.localization.encoder import Encoder
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+from service.localization.search import distinct_places, search_views
+from service.maps.content import BundleContent
+from service.maps.reader import MapBundle
+from service.maps.writer import write_bundle
+
+Pictures = tuple[NDArray[np.uint8], NDArray[np.float32], PinholeCamera]
+
+
+@pytest.fixture(scope="module")
+def localizer(bundle_path: Path) -> Localizer:
+    return Localizer.open(MapBundle.open(bundle_path))
+
+
+@pytest.fixture
+def query(pictures: Pictures) -> Query:
+    rgb, depth_m, camera = pictures
+    return Query(rgb=rgb, depth_m=depth_m, camera=camera)
+
+
+def test_a_query_finds_the_place_where_it_was_taken(localizer: Localizer, query: Query) -> None:
+    answer = localizer.localize(query)
+    assert answer.neighbours[0].place == 8
+    assert answer.neighbours[0].similarity == pytest.approx(1, abs=1e-5)
+    assert answer.neighbours[0].distance == pytest.approx(0, abs=5e-3)
+    assert answer.vote is not None
+    assert (answer.status, answer.vote.street) == ("LOCALIZED", 2)
+
+
+def test_the_pose_stands_at_the_place_at_the_cameras_own_height(localizer: Localizer, query: Query) -> None:
+    answer = localizer.localize(query)
+    # The place's LiDAR is at (20, 100, 2), 1.8 m above the ground; the camera 1.5 m.
+    np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, 100, 0.2 + answer.height_m], atol=0.05)
+    assert answer.height_m == pytest.approx(1.5, abs=0.05)
+    assert np.rad2deg(heading_of_camera(answer.T_map_camera)) == pytest.approx(90, abs=1)
+
+
+def test_the_camera_axis_lies_level_where_the_camera_is_level(localizer: Localizer, query: Query) -> None:
+    R_map_camera = localizer.localize(query).T_map_camera[:3, :3]
+    np.testing.assert_allclose(R_map_camera.T @ R_map_camera, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(R_map_camera[:, 1], [0, 0, -1], atol=0.02)
+
+
+def test_the_vehicles_pose_follows_from_where_the_camera_sits(localizer: Localizer, query: Query) -> None:
+    T_vehicle_camera = transform_from(np.eye(3), np.array([1.0, 0.0, 0.5]))
+    answer = localizer.localize(replace(query, T_vehicle_camera=T_vehicle_camera))
+    assert answer.T_map_vehicle is not None
+    np.testing.assert_allclose(answer.T_map_vehicle @ T_vehicle_camera, answer.T_map_camera, atol=1e-9)
+    assert localizer.localize(query).T_map_vehicle is None
+
+
+@pytest.mark.parametrize("k", [1, 5, 12])
+def test_neighbours_are_distinct_places_the_best_first(localizer: Localizer, query: Query, k: int) -> None:
+    neighbours = localizer.localize(replace(query, neighbours=k)).neighbours
+    similarities = [each.similarity for each in neighbours]
+    assert len({each.place for each in neighbours}) == k
+    assert similarities == sorted(similarities, reverse=True)
+
+
+def test_more_neighbours_than_places_gives_every_place(localizer: Localizer, query: Query) -> None:
+    assert len(localizer.localize(replace(query, neighbours=50)).neighbours) == 12
+
+
+def test_distinct_places_agree_with_a_slow_loop(localizer: Localizer, query: Query) -> None:
+    bundle = localizer.bundle
+    descriptor = np.random.default_rng(5).normal(size=16).astype(np.float32)
+    matches = search_views(bundle, descriptor / np.linalg.norm(descriptor), places=7, fewest=1)
+    slow: list[int] = []
+    for place in matches.place.tolist():
+        if place not in slow:
+            slow.append(place)
+    assert [each.place for each in distinct_places(matches, 7)] == slow[:7]
+
+
+def test_a_map_without_streets_has_no_vote(
+    content_of: Callable[..., BundleContent], tmp_path: Path, query: Query
+) -> None:
+    write_bundle(tmp_path / "m", content_of(streets=None, place_street=np.full(12, -1, np.int32)))
+    assert Localizer.open(MapBundle.open(tmp_path / "m")).localize(query).vote is None
+
+
+def test_another_encoder_is_refused(bundle_path: Path, encoder_of: Callable[..., bytes]) -> None:
+    with pytest.raises(BundleError, match="use the bundle's own"):
+        Localizer(MapBundle.open(bundle_path), Encoder.open(encoder_of(seed=99)))
+
+
+def test_an_encoder_of_another_view_grid_is_refused(
+    content_of: Callable[..., BundleContent], content: BundleContent, tmp_path: Path
+) -> None:
+    taller = replace(content.grid, rows=9)
+    write_bundle(tmp_path / "m", content_of(grid=taller, rows_seen=np.ones(9, np.bool_)))
+    with pytest.raises(BundleError, match="reads views of 8 x 16 cells, the map's have 9 x 16"):
+        Localizer.open(MapBundle.open(tmp_path / "m"))
+
+
+def test_no_depth_is_an_error_of_its_own(localizer: Localizer, query: Query) -> None:
+    with pytest.raises(NoDepthError):
+        localizer.localize(replace(query, depth_m=np.zeros_like(query.depth_m)))
+
+
+def test_the_stages_times_sum_to_the_total(localizer: Localizer, query: Query) -> None:
+    times = localizer.localize(query).timings
+    assert times.fuse_ms + times.encode_ms + times.search_ms == pytest.approx(times.total_ms)
+    assert min(times.fuse_ms, times.encode_ms, times.search_ms) > 0

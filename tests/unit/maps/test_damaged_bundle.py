@@ -1,0 +1,171 @@
+"""Every way in which a bundle can be wrong is an error that names the file and the remedy."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.errors import BundleError
+from service.maps.manifest import Manifest
+from service.maps.reader import MapBundle
+
+NEEDED = ["encoder.onnx", "views.faiss", "places.npy", "views.npy", "calibration.json"]
+FILES = [*NEEDED, "streets.geojson", "cloud/0_0.npy"]
+OUTSIDE = ["../outside.npy", "/etc/passwd", "cloud/../../outside.npy", "a//b", "manifest.json", ""]
+
+
+def edit_manifest(bundle: Path, edit: Callable[[dict[str, Any]], object], *, stamp: bool = True) -> None:
+    """Change the manifest; with ``stamp`` its version follows, as a forger's would."""
+    document = json.loads((bundle / "manifest.json").read_text())
+    edit(document)
+    (bundle / "manifest.json").write_text(json.dumps(document))
+    if stamp:
+        stamped = Manifest.model_validate_json((bundle / "manifest.json").read_text()).stamped()
+        (bundle / "manifest.json").write_bytes(stamped.to_bytes())
+
+
+def replace_file(bundle: Path, name: str, data: bytes) -> None:
+    """Put another file in and make the manifest agree, so that only the content's own check is left."""
+    (bundle / name).write_bytes(data)
+    entry = {"sha256": hashlib.sha256(data).hexdigest(), "size": len(data)}
+    edit_manifest(bundle, lambda document: document["files"].update({name: entry}))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_truncated_file_is_refused(bundle_copy: Path, name: str) -> None:
+    data = (bundle_copy / name).read_bytes()
+    (bundle_copy / name).write_bytes(data[:-1])
+    with pytest.raises(BundleError, match=f"{name}: it has {len(data) - 1} bytes instead of {len(data)}.*again"):
+        MapBundle.open(bundle_copy)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_flipped_bit_is_refused(bundle_copy: Path, name: str) -> None:
+    data = bytearray((bundle_copy / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (bundle_copy / name).write_bytes(data)
+    with pytest.raises(BundleError, match=f"{name}: its content is not what the manifest says"):
+        MapBundle.open(bundle_copy)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_missing_file_is_refused(bundle_copy: Path, name: str) -> None:
+    (bundle_copy / name).unlink()
+    with pytest.raises(BundleError, match=f"{name}: it is missing"):
+        MapBundle.open(bundle_copy)
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_a_needed_file_must_be_listed(bundle_copy: Path, name: str) -> None:
+    edit_manifest(bundle_copy, lambda document: document["files"].pop(name))
+    with pytest.raises(BundleError, match=f"{name}: the manifest does not list it"):
+        MapBundle.open(bundle_copy)
+
+
+def test_a_folder_without_a_manifest_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="no readable manifest"):
+        MapBundle.open(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "[" * 100_000])
+def test_a_manifest_that_is_none_is_refused(bundle_copy: Path, text: str) -> None:
+    (bundle_copy / "manifest.json").write_text(text)
+    with pytest.raises(BundleError, match="this is not a manifest"):
+        MapBundle.open(bundle_copy)
+
+
+def test_another_format_version_is_refused_with_both_versions(bundle_copy: Path) -> None:
+    edit_manifest(bundle_copy, lambda document: document.update(format=2), stamp=False)
+    with pytest.raises(BundleError, match="format 2, but this program reads format 1"):
+        MapBundle.open(bundle_copy)
+
+
+def test_an_unknown_field_is_refused(bundle_copy: Path) -> None:
+    edit_manifest(bundle_copy, lambda document: document.update(more=1), stamp=False)
+    with pytest.raises(BundleError, match="more: Extra inputs"):
+        MapBundle.open(bundle_copy)
+
+
+def test_an_edited_manifest_is_refused(bundle_copy: Path) -> None:
+    edit_manifest(bundle_copy, lambda document: document.update(spacing_m=7.0), stamp=False)
+    with pytest.raises(BundleError, match="is not that of its content"):
+        MapBundle.open(bundle_copy)
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_path_out_of_the_bundle_is_refused(bundle_copy: Path, name: str) -> None:
+    entry = {"sha256": "0" * 64, "size": 3}
+    edit_manifest(bundle_copy, lambda document: document["files"].update({name: entry}))
+    with pytest.raises(BundleError, match="would lie outside the bundle"):
+        MapBundle.open(bundle_copy)
+
+
+def test_a_link_out_of_the_bundle_is_refused(bundle_copy: Path) -> None:
+    outside = bundle_copy.parent / "outside.npy"
+    (bundle_copy / "places.npy").rename(outside)
+    (bundle_copy / "places.npy").symlink_to(outside)
+    with pytest.raises(BundleError, match=r"places\.npy: it is missing, or lies outside"):
+        MapBundle.open(bundle_copy)
+
+
+def test_another_encoder_is_refused(bundle_copy: Path, encoder_of: Callable[..., bytes]) -> None:
+    replace_file(bundle_copy, "encoder.onnx", encoder_of(seed=99))
+    with pytest.raises(BundleError, match="not the encoder that made the descriptors"):
+        MapBundle.open(bundle_copy)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda document: document["counts"].update(places=13), "places.npy: it holds 12 places instead of 13"),
+        (lambda document: document["counts"].update(views=47), "views.npy: it holds 48 views instead of 47"),
+        (lambda document: document["counts"].update(descriptor_size=8), "descriptors of 16, not 8"),
+        (lambda document: document["counts"].update(cloud_points=6), "cloud: it holds 5 points instead of 6"),
+        (lambda document: document["counts"].update(streets=2), "streets.geojson: it holds 3 streets instead of 2"),
+        (lambda document: document.update(rows_seen=[True]), "rows_seen has 1 entries for 8 rows"),
+        (lambda document: document.update(parameters={}), "lacks lidar_height_m"),
+        (lambda document: document["grid"].update(min_range_m=50.0), "wrong way round"),
+    ],
+)
+def test_counts_and_limits_must_agree(
+    bundle_copy: Path, edit: Callable[[dict[str, Any]], object], message: str
+) -> None:
+    edit_manifest(bundle_copy, edit)
+    with pytest.raises(BundleError, match=message):
+        MapBundle.open(bundle_copy)
+
+
+def npy_bytes(path: Path, array: np.ndarray, *, allow_pickle: bool = False) -> bytes:
+    np.save(path, array, allow_pickle=allow_pickle)
+    return path.read_bytes()
+
+
+def test_an_array_of_another_type_is_refused(bundle_copy: Path, tmp_path: Path) -> None:
+    replace_file(bundle_copy, "places.npy", npy_bytes(tmp_path / "a.npy", np.zeros(12)))
+    with pytest.raises(BundleError, match=r"places\.npy: it holds float64"):
+        MapBundle.open(bundle_copy)
+
+
+def test_a_pickled_array_is_never_loaded(bundle_copy: Path, tmp_path: Path) -> None:
+    pickled = npy_bytes(tmp_path / "a.npy", np.array([{}], object), allow_pickle=True)
+    replace_file(bundle_copy, "cloud/0_0.npy", pickled)
+    with pytest.raises(BundleError, match=r"0_0\.npy: it is no array of ours"):
+        MapBundle.open(bundle_copy)
+
+
+def test_a_view_of_a_place_that_is_not_there_is_refused(bundle_copy: Path, tmp_path: Path) -> None:
+    views = np.load(bundle_copy / "views.npy")
+    views["place"][0] = 12
+    replace_file(bundle_copy, "views.npy", npy_bytes(tmp_path / "a.npy", views))
+    with pytest.raises(BundleError, match=r"views\.npy: a view belongs to a place that is not there"):
+        MapBundle.open(bundle_copy)
+
+
+def test_without_verification_sizes_are_still_compared(bundle_copy: Path) -> None:
+    (bundle_copy / "views.npy").write_bytes((bundle_copy / "views.npy").read_bytes()[:-8])
+    with pytest.raises(BundleError, match="bytes instead of"):
+        MapBundle.open(bundle_copy, verify=False)

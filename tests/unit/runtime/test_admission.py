@@ -1,0 +1,76 @@
+import threading
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+
+import pytest
+
+from service.errors import BusyError
+from service.runtime.admission import Admission
+
+
+@pytest.fixture
+def blocked() -> Iterator[tuple[Admission, threading.Event]]:
+    """One worker at work until the event is set, one place in the queue."""
+    admission, release, running = Admission(threads=1, queue=1), threading.Event(), threading.Event()
+
+    def hold() -> None:
+        running.set()
+        release.wait(30)
+
+    admission.submit(hold)
+    assert running.wait(30)
+    yield admission, release
+    release.set()
+    admission.close()
+
+
+def test_a_task_gives_its_result() -> None:
+    admission = Admission(threads=1, queue=0)
+    assert admission.submit(lambda: 7).result(30) == 7
+    admission.close()
+
+
+def test_a_tasks_error_is_its_futures() -> None:
+    admission = Admission(threads=1, queue=0)
+    with pytest.raises(ZeroDivisionError):
+        admission.submit(lambda: 1 // 0).result(30)
+    admission.close()
+
+
+def test_beyond_the_queue_a_task_is_refused_at_once(blocked: tuple[Admission, threading.Event]) -> None:
+    admission, _ = blocked
+    admission.submit(lambda: None)
+    with pytest.raises(BusyError, match="2 requests"):
+        admission.submit(lambda: None)
+
+
+def test_a_cancelled_task_gives_its_place_back_and_never_runs(blocked: tuple[Admission, threading.Event]) -> None:
+    admission, release = blocked
+    ran: list[int] = []
+    waiting = admission.submit(lambda: ran.append(1))
+    assert waiting.cancel()
+    after = admission.submit(lambda: ran.append(2))
+    release.set()
+    after.result(30)
+    assert ran == [2]
+    with pytest.raises(CancelledError):
+        waiting.result()
+
+
+def test_all_places_are_free_again_when_all_is_done() -> None:
+    admission = Admission(threads=2, queue=1)
+    for _ in range(20):
+        for future in [admission.submit(lambda: None) for _ in range(3)]:
+            future.result(30)
+        # A place is given back by a callback, a moment after the result.
+        for _ in range(3):
+            assert admission._slots.acquire(timeout=30)
+        admission._slots.release(3)
+    admission.close()
+
+
+def test_a_closed_pool_refuses() -> None:
+    admission = Admission(threads=1, queue=0)
+    admission.close()
+    with pytest.raises(BusyError, match="shutting down"):
+        admission.submit(lambda: None)

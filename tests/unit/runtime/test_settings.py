@@ -1,0 +1,44 @@
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from service.errors import RequestError
+from service.runtime.settings import Settings, load_settings
+
+
+def test_the_service_binds_to_loopback_unless_told_otherwise() -> None:
+    assert Settings().host == "127.0.0.1"
+
+
+def test_the_environment_goes_above_defaults_and_flags_above_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_PORT", "9000")
+    monkeypatch.setenv("STREETFIX_QUEUE", "3")
+    settings = load_settings(port=9001, host=None)
+    assert (settings.port, settings.queue, settings.host) == (9001, 3, "127.0.0.1")
+
+
+def test_limits_are_nested_by_two_underscores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_LIMITS__MAX_PIXELS", "1000")
+    assert load_settings().limits.max_pixels == 1000
+
+
+def test_maps_are_joined_by_colons_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_MAPS", "/maps/a:/maps/b")
+    assert load_settings().maps == (Path("/maps/a"), Path("/maps/b"))
+
+
+def test_a_value_that_makes_no_sense_is_refused_with_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_PORT", "70000")
+    with pytest.raises(RequestError, match=r"setting port: .*70000"):
+        load_settings()
+
+
+def test_an_unknown_setting_is_refused() -> None:
+    with pytest.raises(RequestError, match="setting prot"):
+        load_settings(prot=1)
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError):
+        Settings().port = 1  # type: ignore[misc]  # that is the point
