@@ -26,6 +26,7 @@ COPY --from=build /opt/streetfix /opt/streetfix
 ENV PATH=/opt/streetfix/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1 \
+    ORT_DISABLE_TELEMETRY=1 \
     STREETFIX_MAPS=/maps \
     STREETFIX_PORT=8000
 USER 10001:10001

@@ -6,6 +6,7 @@ is taken off. The best of them is what an honest comparison must beat.
 """
 
 from collections.abc import Callable
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,10 +43,12 @@ def similarities(queries: Ranges, views: Ranges) -> dict[str, Ranges]:
     gaps = (mq.sum(axis=1)[:, None] + mv.sum(axis=1)[None] - 2 * both) / cells
 
     def unit(x: Ranges) -> Ranges:
-        return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-6)
+        scaled: Ranges = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-6)
+        return scaled
 
     def centred(x: Ranges, mask: Ranges) -> Ranges:
-        return (x - (x.sum(axis=1) / np.maximum(mask.sum(axis=1), 1))[:, None]) * mask
+        moved: Ranges = (x - (x.sum(axis=1) / np.maximum(mask.sum(axis=1), 1))[:, None]) * mask
+        return moved
 
     return {
         "masked_l2": -l2,
@@ -56,10 +59,14 @@ def similarities(queries: Ranges, views: Ranges) -> dict[str, Ranges]:
 
 
 def raw_best_views(
-    bundle: MapBundle, dataset: Dataset, names: list[str], *, report: Callable[[str, int, int], None] = lambda *_: None
-) -> dict[str, NDArray[np.int64]]:
-    """Number of the best place of every query of the sets, by every setting; -1 where a query measures nothing."""
-    queries, usable = _query_ranges(bundle, dataset, names)
+    bundle: MapBundle, dataset: Dataset, names: list[str], *, limit: int | None = None,
+    report: Callable[[str, int, int], None] = lambda *_: None,
+) -> dict[str, NDArray[np.int64]]:  # fmt: skip
+    """Number of the best place of every query of the sets, by every setting; -1 where a query measures nothing.
+
+    ``limit`` takes only the first queries of each set.
+    """
+    queries, usable = _query_ranges(bundle, dataset, names, limit)
     best = {name: np.full(len(usable), -1, np.int64) for name in SETTINGS}
     score = {name: np.full(len(usable), -np.inf, np.float32) for name in SETTINGS}
     settings = BuildSettings(
@@ -85,13 +92,17 @@ def raw_best_views(
     return best
 
 
-def _query_ranges(bundle: MapBundle, dataset: Dataset, names: list[str]) -> tuple[Ranges, NDArray[np.bool_]]:
+def _query_ranges(
+    bundle: MapBundle, dataset: Dataset, names: list[str], limit: int | None
+) -> tuple[Ranges, NDArray[np.bool_]]:
     grid: ViewGrid = bundle.grid
     rows, usable = [], []
     for name in names:
-        for frame in dataset.queries(name):
+        for frame in islice(dataset.queries(name), limit):
             try:
-                view = query_view(frame.rgb(), frame.depth_m(), frame.camera.pinhole(), grid=grid, rows_seen=bundle.rows_seen)
+                view = query_view(
+                    frame.rgb(), frame.depth_m(), frame.camera.pinhole(), grid=grid, rows_seen=bundle.rows_seen
+                )
                 rows.append(view.planes[0])
                 usable.append(True)
             except NoDepthError:

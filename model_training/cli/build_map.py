@@ -15,7 +15,9 @@ from model_training.stock import ENCODER
 def command(
     dataset: Annotated[Path, typer.Argument(help="dataset folder with a survey")],
     out: Annotated[Path, typer.Option(help="folder of the bundle")],
-    encoder: Annotated[Path, typer.Option(help="ONNX file of `streetfix export` [default: the stock encoder]")] = ENCODER,
+    encoder: Annotated[
+        Path, typer.Option(help="ONNX file of `streetfix export` [default: the stock encoder]")
+    ] = ENCODER,
     name: Annotated[str, typer.Option(help="how requests address the map [default: the dataset's name]")] = "",
     spacing: Annotated[float, typer.Option(help="travelled metres between places")] = 1.0,
     headings: Annotated[int, typer.Option(help="views of each place; the stock encoder was trained for 24")] = 24,
@@ -28,7 +30,6 @@ def command(
     """Build a map bundle of a dataset's survey.
 
     Example:
-
       streetfix build-map data/paper --out maps/paper-city
     """
     opened = Dataset(dataset)

@@ -31,17 +31,24 @@ SHOWN = (
 def command(
     bundle: Annotated[Path, typer.Argument(help="map bundle")],
     dataset: Annotated[Path, typer.Argument(help="dataset with query sets that have truth")],
-    queries: Annotated[list[str] | None, typer.Option(help="query set; repeat for several [default: all with truth]")] = None,
+    queries: Annotated[
+        list[str] | None, typer.Option(help="query set; repeat for several [default: all with truth]")
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="write all figures here")] = None,
-    raw_baseline: Annotated[bool, typer.Option("--raw-baseline", help="compare with the raw range image's nearest neighbour")] = False,
-    trajectory: Annotated[Path | None, typer.Option(help="write the answered poses in TUM format (one query set)")] = None,
-    predictions: Annotated[Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")] = None,
+    raw_baseline: Annotated[
+        bool, typer.Option("--raw-baseline", help="compare with the raw range image's nearest neighbour")
+    ] = False,
+    trajectory: Annotated[
+        Path | None, typer.Option(help="write the answered poses in TUM format (one query set)")
+    ] = None,
+    predictions: Annotated[
+        Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")
+    ] = None,
     workers: Annotated[int, typer.Option(help="queries at a time")] = 2,
 ) -> None:
     """Measure a map against queries whose truth is known.
 
     Example:
-
       streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
     """
     opened, data = MapBundle.open(bundle), Dataset(dataset)
@@ -49,7 +56,10 @@ def command(
         result = evaluate(opened, data, queries, workers=workers, report=report)
         figures = result.figures
         if trajectory is not None and len(result.predictions) != 1:
-            raise DatasetError(f"trajectory: one query set is wanted, not {len(result.predictions)}: name it by --queries", field="queries")
+            raise DatasetError(
+                f"trajectory: one query set is wanted, not {len(result.predictions)}: name it by --queries",
+                field="queries",
+            )
         if raw_baseline:
             _add_raw(figures, opened, data, list(result.predictions), report)
     if trajectory is not None:
@@ -67,7 +77,9 @@ def command(
 
 def _add_raw(figures: dict[str, Any], bundle: MapBundle, dataset: Dataset, names: list[str], report: Any) -> None:
     """The raw range image's R@1 at its best setting, which is named."""
-    truth = np.concatenate([np.array([f.T_map_camera[:2, 3] for f in dataset.queries(n) if f.T_map_camera is not None]) for n in names])
+    truth = np.concatenate(
+        [np.array([f.T_map_camera[:2, 3] for f in dataset.queries(n) if f.T_map_camera is not None]) for n in names]
+    )
     xy = bundle.T_map_place[:, :2, 3]
     recalls = {}
     for setting, place in raw_best_views(bundle, dataset, names, report=report).items():
@@ -84,7 +96,10 @@ def _table(figures: dict[str, Any]) -> Table:
     table.add_column("")
     for name, values in columns:
         table.add_column(f"{name}\n{values['split'].replace('_', ' ')}", justify="right")
-    merged = [values | {k: v for k, v in figures.items() if k.startswith("raw") and len(columns) == 1} for _, values in columns]
+    merged = [
+        values | {k: v for k, v in figures.items() if k.startswith("raw") and len(columns) == 1}
+        for _, values in columns
+    ]
     for key, label, form in SHOWN:
         cells = [form.format(v[key]) if v.get(key) is not None else "-" for v in merged]
         if any(cell != "-" for cell in cells):

@@ -17,7 +17,6 @@ def command(
     """Export a trained encoder to ONNX and check it against torch.
 
     Example:
-
       streetfix export runs/stock --out encoder.onnx
     """
     difference = export(load_run(run), out, trained_on=trained_on(run))

@@ -17,12 +17,13 @@ def command(
     kind: Annotated[str, typer.Argument(help="layout of the recording: kitti-object")],
     source: Annotated[Path, typer.Argument(help="folder of the recording")],
     out: Annotated[Path, typer.Option(help="folder to write the dataset to")],
-    depth: Annotated[str, typer.Option(help="stored: the depth that lies beside; sgbm: from the stereo pair by OpenCV")] = "sgbm",
+    depth: Annotated[
+        str, typer.Option(help="stored: the depth that lies beside; sgbm: from the stereo pair by OpenCV")
+    ] = "sgbm",
 ) -> None:
     """Turn somebody else's recording into a dataset folder.
 
     Example:
-
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
     """
     if kind not in KINDS:

@@ -25,7 +25,9 @@ An interrupted run goes on where it stopped. Same seed, same bytes, for any numb
 
 def command(
     out: Annotated[Path, typer.Option(help="folder to write the dataset to")],
-    city: Annotated[str, typer.Option(help="paper: the paper's nine streets; city: another city for each seed")] = "city",
+    city: Annotated[
+        str, typer.Option(help="paper: the paper's nine streets; city: another city for each seed")
+    ] = "city",
     seed: Annotated[int, typer.Option(help="decides everything that is random")] = 0,
     name: Annotated[str, typer.Option(help="name of the dataset [default: that of the folder]")] = "",
     size: Annotated[str, typer.Option(help="extent of a random city, metres")] = "300x400",
@@ -34,10 +36,18 @@ def command(
     spacing: Annotated[float, typer.Option(help="metres between scans")] = 1.0,
     queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none")] = 200,
     drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light")] = 1,
-    table1: Annotated[bool, typer.Option("--table1", help="as many queries of each class as the paper's Table I (626)")] = False,
-    on_track: Annotated[int, typer.Option(help="queries at the survey's own poses too: the paper's split, which leaks")] = 0,
-    depth: Annotated[list[str] | None, typer.Option(help="ideal, precise or stereo; repeat for several [default: precise]")] = None,
-    condition: Annotated[str, typer.Option(help="of the query drives: clear, rain, snow, fog, night or low_sun")] = "clear",
+    table1: Annotated[
+        bool, typer.Option("--table1", help="as many queries of each class as the paper's Table I (626)")
+    ] = False,
+    on_track: Annotated[
+        int, typer.Option(help="queries at the survey's own poses too: the paper's split, which leaks")
+    ] = 0,
+    depth: Annotated[
+        list[str] | None, typer.Option(help="ideal, precise or stereo; repeat for several [default: precise]")
+    ] = None,
+    condition: Annotated[
+        str, typer.Option(help="of the query drives: clear, rain, snow, fog, night or low_sun")
+    ] = "clear",
     survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
     survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
     parked_changed: Annotated[float, typer.Option(help="share of parking slots that differ from drive to drive")] = 0.5,
@@ -87,5 +97,7 @@ def _pair(text: str, field: str) -> tuple[float, float]:
     try:
         first, second = (float(part) for part in parts)
     except ValueError as error:
-        raise DatasetError(f"{field}: {text!r} is not two numbers with an x between, such as 640x480", field=field) from error
+        raise DatasetError(
+            f"{field}: {text!r} is not two numbers with an x between, such as 640x480", field=field
+        ) from error
     return first, second

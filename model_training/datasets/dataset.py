@@ -98,7 +98,7 @@ class QueryFrame:
         return decode_rgb(self.rgb_path.read_bytes(), limits=ImageLimits())
 
     def depth_m(self) -> NDArray[np.float32]:
-        """z (H, W), metres, 0 where nothing was measured."""
+        """Z (H, W), metres, 0 where nothing was measured."""
         spec = self.camera.depth
         return decode_depth(
             self.depth_path.read_bytes(), encoding=None, scale_m=spec.scale_m, kind=spec.kind, camera=self.camera.pinhole(),
@@ -131,7 +131,9 @@ class Dataset:
             where = ".".join(str(part) for part in first["loc"])
             raise DatasetError(f"{path}: {where}: {first['msg']}", field=where) from error
         if self.description.format != FORMAT:
-            raise DatasetError(f"{path}: format {self.description.format} is not {FORMAT}; make the dataset anew", field="format")
+            raise DatasetError(
+                f"{path}: format {self.description.format} is not {FORMAT}; make the dataset anew", field="format"
+            )
 
     @property
     def name(self) -> str:
@@ -160,7 +162,9 @@ class Dataset:
             raise DatasetError(f"{path} is missing, but survey/poses.txt has a line for it", field=str(path.name))
         size = path.stat().st_size
         if size == 0 or size % 16:
-            raise DatasetError(f"{path}: {size} bytes are no rows of four float32; the file is truncated", field=str(path.name))
+            raise DatasetError(
+                f"{path}: {size} bytes are no rows of four float32; the file is truncated", field=str(path.name)
+            )
         points = np.fromfile(path, np.float32).reshape(-1, 4)
         finite: NDArray[np.float32] = points[np.isfinite(points).all(axis=1)]
         return finite
@@ -194,8 +198,12 @@ class Dataset:
                 raise DatasetError(f"{poses_path} has {len(truth)} lines, none for {rgb_path.name}", field="poses.txt")
             camera_name = names[number] if names else first
             if camera_name not in cameras:
-                raise DatasetError(f"{folder}/cameras.txt names {camera_name!r}, which dataset.json does not", field="cameras.txt")
-            yield QueryFrame(number, rgb_path, depth_path, cameras[camera_name], None if truth is None else truth[number])
+                raise DatasetError(
+                    f"{folder}/cameras.txt names {camera_name!r}, which dataset.json does not", field="cameras.txt"
+                )
+            yield QueryFrame(
+                number, rgb_path, depth_path, cameras[camera_name], None if truth is None else truth[number]
+            )
 
 
 def _camera_names(folder: Path, count: int) -> list[str] | None:
@@ -255,7 +263,8 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], Transforms]:
             raise DatasetError(f"{path}, line {number}: not numbers: {line[:60]!r}", field=path.name) from error
         if len(values) != 8 or not np.isfinite(values).all() or np.linalg.norm(values[4:]) < 1e-6:
             raise DatasetError(
-                f"{path}, line {number}: not `timestamp x y z qx qy qz qw` with a unit quaternion: {line[:60]!r}", field=path.name
+                f"{path}, line {number}: not `timestamp x y z qx qy qz qw` with a unit quaternion: {line[:60]!r}",
+                field=path.name,
             )
         stamps.append(values[0])
         transforms.append(transform_from(rotation_from_quaternion_xyzw(values[4:]), values[1:4]))

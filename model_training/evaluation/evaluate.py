@@ -26,7 +26,12 @@ class Evaluation:
 
 
 def evaluate(
-    bundle: MapBundle, dataset: Dataset, names: list[str] | None = None, *, workers: int = 2, report: Report = lambda *_: None
+    bundle: MapBundle,
+    dataset: Dataset,
+    names: list[str] | None = None,
+    *,
+    workers: int = 2,
+    report: Report = lambda *_: None,
 ) -> Evaluation:
     """Measure a map with query sets; all that have truth where none is named.
 
@@ -37,7 +42,9 @@ def evaluate(
     """
     names = names or dataset.query_sets(with_truth=True)
     if not names:
-        raise DatasetError(f"{dataset.folder} has no query set with poses.txt, so nothing can be measured", field="queries")
+        raise DatasetError(
+            f"{dataset.folder} has no query set with poses.txt, so nothing can be measured", field="queries"
+        )
     localizer = Localizer.open(bundle)
     classes = [] if bundle.streets is None else [street.name for street in bundle.streets.features]
     predictions = {name: predict(localizer, dataset, name, workers=workers, report=report) for name in names}

@@ -56,7 +56,11 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
     result["error_rate"] = error_rate(shares["street_accuracy"]) if in_street.any() else None
     result |= _distances(distance[answered])
     result["forced"] = _distances(distance[has_pose]) | {"answered": float(np.mean(has_pose))}
-    headings = heading_errors_deg(headings_of(p.T_answer[answered]), headings_of(p.T_true[answered])) if answered.any() else None
+    headings = (
+        heading_errors_deg(headings_of(p.T_answer[answered]), headings_of(p.T_true[answered]))
+        if answered.any()
+        else None
+    )
     result["median_heading_error_deg"] = None if headings is None else float(np.median(headings))
     result["ms_per_query"] = float(np.median(p.ms))
     result["ci95"] = {name: list(wilson_interval(int(flags.sum()), len(flags))) for name, flags in shares.items()}
@@ -66,7 +70,13 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
 
 def _distances(distance: NDArray[np.float64]) -> dict[str, float | None]:
     if not len(distance):
-        keys = ("mean_distance_error_m", "median_distance_error_m", "p95_distance_error_m", "rms_distance_error_m", "mse_m2")
+        keys = (
+            "mean_distance_error_m",
+            "median_distance_error_m",
+            "p95_distance_error_m",
+            "rms_distance_error_m",
+            "mse_m2",
+        )
         return dict.fromkeys(keys)
     return {
         "mean_distance_error_m": mean_error_distance(distance),

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from service.localization.query import Query
 
 RANKED = 10
 Report = Callable[[str, int, int], None]
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,9 @@ class Predictions:
 
 def joined(parts: list[Predictions]) -> Predictions:
     """Several sets as one."""
-    return Predictions(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in Predictions.__dataclass_fields__})
+    return Predictions(
+        **{name: np.concatenate([getattr(p, name) for p in parts]) for name in Predictions.__dataclass_fields__}
+    )
 
 
 def predict(
@@ -59,16 +64,20 @@ def predict(
     """
     frames = list(dataset.queries(name))
     if not frames or frames[0].T_map_camera is None:
-        raise DatasetError(f"query set {name!r} of {dataset.folder} has no poses.txt, so nothing can be measured", field="queries")
+        raise DatasetError(
+            f"query set {name!r} of {dataset.folder} has no poses.txt, so nothing can be measured", field="queries"
+        )
     answers: list[tuple[Answer | None, float]] = []
     with ThreadPoolExecutor(workers) as pool:
-        for done, answer in enumerate(_in_order(pool, lambda frame: _ask(localizer, frame), frames, ahead=4 * workers), 1):
+        for done, answer in enumerate(
+            _in_order(pool, lambda frame: _ask(localizer, frame), frames, ahead=4 * workers), 1
+        ):
             answers.append(answer)
             report(f"queries {name}", done, len(frames))
     return _table(localizer, frames, answers)
 
 
-def _in_order[T, R](pool: ThreadPoolExecutor, work: Callable[[T], R], items: list[T], *, ahead: int) -> Iterator[R]:
+def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: list[T], *, ahead: int) -> Iterator[R]:
     """Results in order, never more than ``ahead`` items in memory."""
     rest = iter(items)
     waiting = [pool.submit(work, item) for item in islice(rest, ahead)]
@@ -105,7 +114,16 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
     street_true = np.full(count, -1)
     if streets is not None:
         street_true = np.array([streets.index_at(T[:2, 3]) for T in T_true])
-    return Predictions(T_true, T_answer, street_true, street_answer, ranked, ranked_place, localized, np.array([ms for _, ms in answers]))
+    return Predictions(
+        T_true,
+        T_answer,
+        street_true,
+        street_answer,
+        ranked,
+        ranked_place,
+        localized,
+        np.array([ms for _, ms in answers]),
+    )
 
 
 def headings_of(transforms: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -83,7 +83,9 @@ def build_map(
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
     poses = dataset.survey_poses()
     if not len(poses):
-        raise DatasetError(f"{dataset.folder}/survey/poses.txt is empty: there is nothing to build a map of", field="survey")
+        raise DatasetError(
+            f"{dataset.folder}/survey/poses.txt is empty: there is nothing to build a map of", field="survey"
+        )
     kept = thinned(poses, settings.spacing_m)
     rows_seen = _rows_seen(dataset, kept, grid, settings)
     cloud = VoxelMap(settings.voxel_m, np.round(poses[:, :3, 3].mean(axis=0)))
@@ -154,11 +156,11 @@ def _fan_ranges(scan: LevelledScan, turns: NDArray[np.float64], grid: ViewGrid) 
 
 
 def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:
-    """Numbers of the poses that stand at least ``spacing_m`` of travel after the last one kept."""
+    """Numbers of the poses that stand ``spacing_m`` of travel, less a tenth for noisy poses, after the last one kept."""
     travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))]
     kept, last = [0], 0.0
     for k in range(1, len(poses)):
-        if travelled[k] - last >= spacing_m * 0.999:
+        if travelled[k] - last >= 0.9 * spacing_m:
             kept.append(k)
             last = travelled[k]
     return np.array(kept)

@@ -31,5 +31,7 @@ def preview_webp(
     grey = (ground > 0)[..., None] * np.array([26, 25, 22], np.float32)
     picture = (_PAPER - grey) * (1 - dark) + np.array([52, 44, 40], np.float32) * dark
     for x, y in ((track[:, :2] - low) * metre).astype(int):
-        cv2.circle(picture, (int(x), int(height - 1 - y)), max(1, round(0.6 * metre)), (40.0, 90.0, 225.0), -1, cv2.LINE_AA)
+        cv2.circle(
+            picture, (int(x), int(height - 1 - y)), max(1, round(0.6 * metre)), (40.0, 90.0, 225.0), -1, cv2.LINE_AA
+        )
     return cv2.imencode(".webp", picture.astype(np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 80])[1].tobytes()

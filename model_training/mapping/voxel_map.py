@@ -84,7 +84,9 @@ class VoxelMap:
         order = np.lexsort((tile[:, 1], tile[:, 0]))
         tile, positions = tile[order], positions[order]
         corners, first, count = np.unique(tile, axis=0, return_index=True, return_counts=True)
-        origins = np.concatenate([self.origin[:2] + (corners + 0.5) * TILE_M, np.full((len(corners), 1), self.origin[2])], axis=1)
+        origins = np.concatenate(
+            [self.origin[:2] + (corners + 0.5) * TILE_M, np.full((len(corners), 1), self.origin[2])], axis=1
+        )
         surfels = np.zeros(len(positions), SURFEL)
         surfels["xyz"] = positions - np.repeat(origins, count, axis=0)
         surfels["normal"], surfels["thickness_m"] = found.normals[order], found.thickness_m[order]

@@ -66,10 +66,18 @@ def add_building(
     if roof == "flat":
         builder.box(top, (plan.width + 0.3, plan.depth + 0.3, 0.35), plan.yaw, wall * 0.7, Material.MATTE)
         if rng.random() < 0.5:
-            builder.box(top, (plan.width * 0.5, plan.depth * 0.5, rng.uniform(1.5, 4)), plan.yaw, wall * 0.6, Material.MATTE)
+            builder.box(
+                top, (plan.width * 0.5, plan.depth * 0.5, rng.uniform(1.5, 4)), plan.yaw, wall * 0.6, Material.MATTE
+            )
         for _ in range(int(rng.integers(0, 4))):  # chimneys, plant
             offset = rng.uniform(-0.4, 0.4, 2) * (plan.width, plan.depth)
-            builder.box(top + [*_turned(offset, plan.yaw), 0.3], (0.8, 0.8, rng.uniform(0.6, 1.8)), plan.yaw, wall * 0.5, Material.MATTE)
+            builder.box(
+                top + [*_turned(offset, plan.yaw), 0.3],
+                (0.8, 0.8, rng.uniform(0.6, 1.8)),
+                plan.yaw,
+                wall * 0.5,
+                Material.MATTE,
+            )
     else:
         _pitched_roof(builder, plan, hipped=roof == "hip", rng=rng)
 
@@ -100,7 +108,9 @@ def _facade(
     for k in range(bays + 1):
         width = pier if 0 < k < bays else pier / 2
         u = float(np.clip(-along / 2 + k * step, -along / 2 + width / 2, along / 2 - width / 2))
-        builder.box(at(u, style.relief / 2, ground - 2.0), (width, style.relief, plan.height + 2.0), yaw, wall, material)
+        builder.box(
+            at(u, style.relief / 2, ground - 2.0), (width, style.relief, plan.height + 2.0), yaw, wall, material
+        )
     spandrel = max(0.3, style.storey - style.window_height)
     for storey in range(storeys + 1):
         low = ground - 2.0 if storey == 0 else ground + storey * style.storey - (spandrel - style.sill)
@@ -109,7 +119,9 @@ def _facade(
         if storey == storeys:
             high = ground + plan.height
         if high - low > 0.05:
-            builder.box(at(0.0, style.relief * 0.49, low), (along, style.relief * 0.98, high - low), yaw, wall * 0.96, material)
+            builder.box(
+                at(0.0, style.relief * 0.49, low), (along, style.relief * 0.98, high - low), yaw, wall * 0.96, material
+            )
     if rng.random() < lively:
         depth = rng.uniform(0.7, 1.4)
         for storey in range(1, storeys):
@@ -117,7 +129,9 @@ def _facade(
                 if rng.random() < 0.4:
                     u = -along / 2 + (k + 0.5) * step
                     z = ground + storey * style.storey - 0.1
-                    builder.box(at(u, style.relief + depth / 2, z), (step * 0.85, depth, 1.1), yaw, wall * 0.85, Material.METAL)
+                    builder.box(
+                        at(u, style.relief + depth / 2, z), (step * 0.85, depth, 1.1), yaw, wall * 0.85, Material.METAL
+                    )
     door = float(rng.uniform(-along / 2 + 1, along / 2 - 1)) if along > 3 else 0.0
     door_colour = rng.uniform(0.08, 0.5, 3)
     builder.box(at(door, style.relief * 0.2, ground), (1.1, style.relief * 0.4, 2.1), yaw, door_colour, Material.MATTE)
@@ -129,12 +143,16 @@ def _facade(
         colour = AWNINGS[rng.integers(len(AWNINGS))]
         for _ in range(int(rng.integers(1, 4))):
             u = float(rng.uniform(-along / 2 + 1.5, along / 2 - 1.5))
-            builder.box(at(u, 0.8, ground + rng.uniform(2.5, 3.0)), (rng.uniform(2, 4), 1.6, 0.25), yaw, colour, Material.MATTE)
+            builder.box(
+                at(u, 0.8, ground + rng.uniform(2.5, 3.0)), (rng.uniform(2, 4), 1.6, 0.25), yaw, colour, Material.MATTE
+            )
     if rng.random() < 0.5:  # a rain pipe or a projecting bay
         u = float(rng.uniform(-along / 2 + 0.3, along / 2 - 0.3))
         if along > 6 and rng.random() < 0.4 and storeys > 1:
             z = ground + rng.uniform(0, style.storey)
-            builder.box(at(u * 0.6, 0.5, z), (rng.uniform(1.5, 3), 1.0, plan.height - (z - ground)), yaw, wall * 1.03, material)
+            builder.box(
+                at(u * 0.6, 0.5, z), (rng.uniform(1.5, 3), 1.0, plan.height - (z - ground)), yaw, wall * 1.03, material
+            )
         else:
             builder.box(at(u, style.relief + 0.06, ground), (0.12, 0.12, plan.height), yaw, wall * 0.4, Material.METAL)
 
@@ -144,11 +162,15 @@ def _pitched_roof(builder: MeshBuilder, plan: Footprint, *, hipped: bool, rng: n
     x, y = plan.width / 2 + overhang, plan.depth / 2 + overhang
     if rng.random() < 0.6:  # the ridge along the street
         inset = x * 0.45 if hipped else 0.0
-        corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x + inset, 0, rise], [x - inset, 0, rise]])
+        corners = np.array(
+            [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x + inset, 0, rise], [x - inset, 0, rise]]
+        )
         faces = np.array([[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [3, 0, 4], [1, 2, 5]])
     else:
         inset = y * 0.45 if hipped else 0.0
-        corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [0, -y + inset, rise], [0, y - inset, rise]])
+        corners = np.array(
+            [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [0, -y + inset, rise], [0, y - inset, rise]]
+        )
         faces = np.array([[1, 2, 5], [1, 5, 4], [3, 0, 4], [3, 4, 5], [0, 1, 4], [2, 3, 5]])
     c, s = np.cos(plan.yaw), np.sin(plan.yaw)
     turned = corners @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + plan.centre + [0, 0, plan.height]

@@ -37,7 +37,9 @@ class District:
 
 DISTRICTS = (
     District((9, 26), (9, 16), (9, 26), (0, 2.0), (1, 8), 0.75, 16.0, 0.5, 0.6, 2.5, ("flat", "flat", "flat", "hip")),
-    District((7, 15), (7, 12), (3.2, 8), (2, 8), (2, 12), 0.15, 15.0, 0.5, 0.35, 0.8, ("gable", "gable", "hip", "flat")),
+    District(
+        (7, 15), (7, 12), (3.2, 8), (2, 8), (2, 12), 0.15, 15.0, 0.5, 0.35, 0.8, ("gable", "gable", "hip", "flat")
+    ),
     District((6, 13), (6, 10), (3, 6.5), (4, 14), (12, 35), 0.0, 7.0, 0.8, 0.12, 0.3, ("gable", "gable", "hip")),
 )
 
@@ -70,7 +72,8 @@ class City:
         self.terrain.add_to(builder, self.half_size_m)
         lines = [(street, line) for street in self.streets for line in street.lines]
         for k in rng.permutation(len(lines)):
-            self._line_up(builder, *lines[k], rng)
+            street, line = lines[k]
+            self._line_up(builder, street, line, rng)
         self._background(builder, rng)
         self.static: Mesh = builder.mesh()
 
@@ -137,9 +140,7 @@ class City:
         if self.clearance(around) <= clearance_m:
             return False
         middle = corners.mean(axis=0)
-        return not any(
-            np.abs(other[0] - middle).max() < 60.0 and _overlap(corners, other) for other in self._occupied
-        )
+        return not any(np.abs(other[0] - middle).max() < 60.0 and _overlap(corners, other) for other in self._occupied)
 
     def _line_up(self, builder: MeshBuilder, street: Street, line: Vector, rng: np.random.Generator) -> None:
         """Everything along both sides of one centre line."""
@@ -148,7 +149,8 @@ class City:
 
         def at(u: float) -> tuple[Vector, Vector]:
             point, ahead, behind = (
-                np.array([np.interp(t, travelled, line[:, 0]), np.interp(t, travelled, line[:, 1])]) for t in (u, u + 1, u - 1)
+                np.array([np.interp(t, travelled, line[:, 0]), np.interp(t, travelled, line[:, 1])])
+                for t in (u, u + 1, u - 1)
             )
             direction = ahead - behind
             return point, direction / (np.linalg.norm(direction) + 1e-9)
@@ -176,7 +178,9 @@ class City:
                                   [foot[0], foot[1], quad[1]], [foot[0], quad[1], quad[0]]])  # fmt: skip
                 builder.triangles(faces, np.array([0.36, 0.35, 0.33]), Material.GROUND)
 
-    def _houses(self, builder: MeshBuilder, at: Any, length: float, side: float, edge: float, rng: np.random.Generator) -> None:
+    def _houses(
+        self, builder: MeshBuilder, at: Any, length: float, side: float, edge: float, rng: np.random.Generator
+    ) -> None:
         base_style, setback_share = FacadeStyle.random(rng), rng.random()
         u = rng.uniform(2, 8)
         while u < length - 4:
@@ -199,7 +203,9 @@ class City:
                     style = base_style if rng.random() < 0.4 else FacadeStyle.random(rng)
                     plan = Footprint(np.array([*centre, ground]), width, depth, height, yaw)
                     roof = str(rng.choice(district.roofs))
-                    add_building(builder, plan, style, roof=roof, lively=0.45 if district.joined > 0.5 else 0.2, rng=rng)
+                    add_building(
+                        builder, plan, style, roof=roof, lively=0.45 if district.joined > 0.5 else 0.2, rng=rng
+                    )
                     self._annex(builder, plan, rng)
                     break
                 width, depth = 0.7 * width, 0.75 * depth
@@ -224,9 +230,15 @@ class City:
     ) -> None:  # fmt: skip
         """A fence, a hedge or a wall with a gate, following the slope piece by piece."""
         kind = rng.choice(["fence", "hedge", "wall"])
-        height = {"fence": rng.uniform(0.8, 1.6), "hedge": rng.uniform(0.8, 1.9), "wall": rng.uniform(0.5, 1.8)}[str(kind)]
+        height = {"fence": rng.uniform(0.8, 1.6), "hedge": rng.uniform(0.8, 1.9), "wall": rng.uniform(0.5, 1.8)}[
+            str(kind)
+        ]
         thick = {"fence": 0.08, "hedge": 0.7, "wall": 0.25}[str(kind)]
-        colour = {"fence": np.array([0.3, 0.22, 0.15]), "hedge": np.array([0.1, 0.18, 0.06]), "wall": np.array([0.5, 0.46, 0.4])}[str(kind)]
+        colour = {
+            "fence": np.array([0.3, 0.22, 0.15]),
+            "hedge": np.array([0.1, 0.18, 0.06]),
+            "wall": np.array([0.5, 0.46, 0.4]),
+        }[str(kind)]
         material = {"fence": Material.MATTE, "hedge": Material.FOLIAGE, "wall": Material.BRICK}[str(kind)]
         yaw = float(np.arctan2(direction[1], direction[0]))
         gate = rng.uniform(-0.3, 0.3) * length
@@ -241,7 +253,9 @@ class City:
                 base = np.array([*centre, self.height(*centre) - 0.3])
                 builder.box(base, (width, thick, bumpy + 0.3), yaw, colour * rng.uniform(0.9, 1.1), material)
 
-    def _verge(self, builder: MeshBuilder, at: Any, length: float, side: float, half: float, rng: np.random.Generator) -> None:
+    def _verge(
+        self, builder: MeshBuilder, at: Any, length: float, side: float, half: float, rng: np.random.Generator
+    ) -> None:
         """Street trees, furniture, parking slots and where people walk."""
 
         def spot(u: float, aside: float) -> tuple[Vector, float]:
@@ -295,7 +309,8 @@ class City:
 def _corners(centre: Vector, width: float, depth: float, yaw: float) -> Vector:
     c, s = np.cos(yaw), np.sin(yaw)
     local = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2]
-    return local @ np.array([[c, s], [-s, c]]) + centre
+    corners: Vector = local @ np.array([[c, s], [-s, c]]) + centre
+    return corners
 
 
 def _overlap(a: Vector, b: Vector) -> bool:

@@ -73,7 +73,7 @@ def measured_depth(
     zoom = shape[1] / 640.0
 
     def patch(pixels: float) -> int:
-        return max(1, round(pixels * zoom))
+        return max(1, int(round(pixels * zoom)))
 
     there = clean_m > 0
     z = np.where(there, clean_m, np.float32(BEYOND_M))
@@ -94,7 +94,9 @@ def measured_depth(
         weight = model.correlated
         noise = _unit(common) * np.float32(weight**0.5) + own * np.float32((1 - weight) ** 0.5)
     offset = np.float32(model.offset_px * rng.standard_normal())
-    disparity = np.float32(model.focal_baseline_px_m) / np.maximum(z, np.float32(0.2)) + noise * np.float32(sigma) + offset
+    disparity = (
+        np.float32(model.focal_baseline_px_m) / np.maximum(z, np.float32(0.2)) + noise * np.float32(sigma) + offset
+    )
     if model.step_px > 0:
         disparity = np.rint(disparity / np.float32(model.step_px)) * np.float32(model.step_px)
     seen = np.float32(model.focal_baseline_px_m) / np.maximum(disparity, np.float32(0.1))

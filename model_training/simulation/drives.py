@@ -41,7 +41,9 @@ def driven(city: City, plan: SimulationPlan, step_m: float) -> list[Station]:
     known = [street.street for street in city.streets]
     for wanted in plan.streets:
         if wanted not in known:
-            raise DatasetError(f"streets: there is no street {wanted!r} here; there are: {', '.join(known)}", field="streets")
+            raise DatasetError(
+                f"streets: there is no street {wanted!r} here; there are: {', '.join(known)}", field="streets"
+            )
     if not plan.streets:
         return stations(city, step_m)
     part = City.__new__(City)

@@ -28,7 +28,9 @@ class LidarModel:
         elevation = np.deg2rad(np.linspace(self.top_deg, self.bottom_deg, self.channels))[:, None]
         azimuth = (np.arange(self.columns) / self.columns * 2 * np.pi - np.pi)[None, :]
         flat = np.cos(elevation) * np.ones_like(azimuth)
-        rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) * np.ones_like(azimuth)], axis=-1)
+        rays = np.stack(
+            [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) * np.ones_like(azimuth)], axis=-1
+        )
         return rays.reshape(-1, 3).astype(np.float32)
 
 

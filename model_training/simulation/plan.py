@@ -1,6 +1,7 @@
 """What to simulate: the settings of a dataset, frozen and checked."""
 
 import math
+from collections.abc import Iterable
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -71,16 +72,21 @@ class SimulationPlan(_Model):
         Raises:
             DatasetError: naming the field, the value and what there is.
         """
-        named = [("lidar", self.lidar, LIDARS), ("survey_condition", self.survey_condition, CONDITIONS)]
+        named: list[tuple[str, str, Iterable[str]]] = [
+            ("lidar", self.lidar, LIDARS),
+            ("survey_condition", self.survey_condition, CONDITIONS),
+        ]
         for query in self.queries:
             named.append(("condition", query.condition, CONDITIONS))
             named += [("depth", depth, DEPTHS) for depth in query.depths]
         for field, value, known in named:
-            if value not in known:
+            if value not in set(known):
                 raise DatasetError(f"{field}: {value!r} is no preset; there are: {', '.join(known)}", field=field)
         names = [query.name for query in self.queries]
         if len(set(names)) != len(names):
             raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")
         if self.city != "paper" and any(query.per_class for query in self.queries):
-            raise DatasetError("table1: only the paper's city has the classes of Table I; add --city paper", field="per_class")
+            raise DatasetError(
+                "table1: only the paper's city has the classes of Table I; add --city paper", field="per_class"
+            )
         return self

@@ -69,7 +69,9 @@ def _sky(rays: NDArray[np.float32], light: Light, condition: Condition) -> Colou
     up = np.clip(rays[:, 2:3], 0, 1)
     colour = light.horizon + (light.zenith - light.horizon) * np.sqrt(up)
     spread = rays[:, :2] / (up + 0.15)
-    wave = np.sin(spread[:, 0] * 3.1 + 1.7 * np.sin(spread[:, 1] * 2.3)) * np.sin(spread[:, 1] * 3.7 + 1.3 * np.sin(spread[:, 0] * 1.9))
+    wave = np.sin(spread[:, 0] * 3.1 + 1.7 * np.sin(spread[:, 1] * 2.3)) * np.sin(
+        spread[:, 1] * 3.7 + 1.3 * np.sin(spread[:, 0] * 1.9)
+    )
     cover = np.clip(wave + light.clouds, 0, 1)[:, None].astype(np.float32)
     colour = colour + (np.float32(0.95 * condition.ambient) - colour) * cover * 0.8
     if condition.sun_strength > 0:
@@ -121,12 +123,20 @@ def shade(
         forward: optical axis, for the headlights.
         lit: which hits see the sun; None casts shadow rays here.
     """
-    met = hits.primitive >= 0
+    met, missed = np.flatnonzero(hits.primitive >= 0), np.flatnonzero(hits.primitive < 0)
     colour = np.empty((len(rays), 3), np.float32)
-    colour[~met] = _sky(rays[~met], light, condition)
-    solid = Hits(hits.distance[met], hits.primitive[met], hits.normal[met])
+    colour[missed] = _sky(rays.take(missed, axis=0), light, condition)
+    solid = Hits(hits.distance.take(met), hits.primitive.take(met), hits.normal.take(met, axis=0))
     colour[met] = _surfaces(
-        scene, ground, origin, rays[met], solid, light, condition, forward, None if lit is None else lit[met]
+        scene,
+        ground,
+        origin,
+        rays.take(met, axis=0),
+        solid,
+        light,
+        condition,
+        forward,
+        None if lit is None else lit.take(met),
     )
     return colour
 

@@ -44,6 +44,7 @@ from service.geometry.camera import PinholeCamera
 
 DEPTH_SCALE_M = 0.001
 TOO_NEAR_M = 1.5  # a picture that is mostly nearer shows a vehicle's side: the robot would not stand there
+ROOM_M = 1.0  # half the robot's width: nothing may stand nearer, all round
 Report = Callable[[str, int, int], None]  # stage, done, of
 
 
@@ -80,7 +81,9 @@ def _claim(out: Path, plan: SimulationPlan) -> bool:
         path = out / name
         if path.exists():
             if path.read_text() != text:
-                raise DatasetError(f"{out} holds the simulation of another plan; choose another --out or remove it", field="out")
+                raise DatasetError(
+                    f"{out} holds the simulation of another plan; choose another --out or remove it", field="out"
+                )
             return name == "simulation.json"
     if out.exists() and any(out.iterdir()):
         raise DatasetError(f"{out} is not empty and holds no simulation; choose another --out", field="out")
@@ -131,7 +134,7 @@ def _survey(city: City, plan: SimulationPlan, survey: Survey, out: Path, workers
         job = _Job(plan, city, scene, out, survey=survey, rays=LIDARS[plan.lidar].rays())
         for done, _ in enumerate(_run(job, _one_scan, todo, workers), count - len(todo) + 1):
             report("survey", done, count)
-    write_tum(out / "survey" / "poses.txt", np.arange(count) * 0.1, survey.T_map_lidar_written)
+    write_tum(out / "survey" / "poses.txt", np.arange(count, dtype=np.float64) * 0.1, survey.T_map_lidar_written)
 
 
 def _one_scan(number: int) -> int:
@@ -140,7 +143,12 @@ def _one_scan(number: int) -> int:
         raise RuntimeError("a worker was started without its job")
     rng = np.random.default_rng([job.plan.seed, 31, number])
     points = scan(
-        job.scene, LIDARS[job.plan.lidar], job.rays, job.survey.T_map_lidar[number], CONDITIONS[job.plan.survey_condition], rng
+        job.scene,
+        LIDARS[job.plan.lidar],
+        job.rays,
+        job.survey.T_map_lidar[number],
+        CONDITIONS[job.plan.survey_condition],
+        rng,
     )
     _write(scan_path(job.out, number), points.tobytes())
     return number
@@ -158,7 +166,18 @@ def _queries(
     rays, z_of_ray = unit_rays(camera)
     light = Light.of(CONDITIONS[query.condition], np.random.default_rng([plan.seed, 32, query.traversal]))
     scene = Scene(joined([city.static, city.occupants(query.traversal, parked_changed=query.parked_changed)]))
-    job = _Job(plan, city, scene, out, query=query, light=light, camera=camera, rays=rays, z_of_ray=z_of_ray, candidates=candidates)
+    job = _Job(
+        plan,
+        city,
+        scene,
+        out,
+        query=query,
+        light=light,
+        camera=camera,
+        rays=rays,
+        z_of_ray=z_of_ray,
+        candidates=candidates,
+    )
     chosen = _free_candidates(job, quota, workers)
     for folder in sets.values():
         for part in ("rgb", "depth"):
@@ -167,8 +186,9 @@ def _queries(
     todo = [k for k in range(len(chosen)) if not all(_pair(folder, k)[1].exists() for folder in sets.values())]
     for done, _ in enumerate(_run(job, _one_pair, todo, workers), len(chosen) - len(todo) + 1):
         report(f"queries {query.name}", done, len(chosen))
+    stamps = np.arange(len(chosen), dtype=np.float64)
     for folder in sets.values():
-        write_tum(folder / "poses.txt", np.arange(len(chosen)) * 1.0, job.candidates)
+        write_tum(folder / "poses.txt", stamps, job.candidates)
 
 
 def _free_candidates(job: _Job, quota: Quota, workers: int) -> NDArray[np.int64]:
@@ -194,6 +214,7 @@ def _free_candidates(job: _Job, quota: Quota, workers: int) -> NDArray[np.int64]
     return np.array([k for index in sorted(chosen) for k in chosen[index]])
 
 
+_RING = np.stack([np.cos(a := np.arange(72) * np.pi / 36), np.sin(a), np.zeros(72)], axis=1)
 _COARSE = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
 
 
@@ -205,7 +226,9 @@ def _is_free(k: int) -> bool:
     T = job.candidates[k]
     distance = job.scene.distances(T[:3, 3], rays @ T[:3, :3].T.astype(np.float32))
     met = distance[distance > 0]
-    return len(met) > 0 and float(np.percentile(met, 40)) > TOO_NEAR_M
+    around = job.scene.distances(T[:3, 3] - [0.0, 0.0, 0.6], _RING)
+    beside = around[around > 0]
+    return len(met) > 0 and float(np.percentile(met, 40)) > TOO_NEAR_M and bool((beside > ROOM_M).all())
 
 
 def _pair(folder: Path, number: int) -> tuple[Path, Path]:
@@ -231,7 +254,9 @@ def _one_pair(number: int) -> int:
     for index, name in enumerate(query.depths):
         folder = query_folder(job.out, f"{query.name}_{name}")
         rgb_path, depth_path = _pair(folder, number)
-        depth = measured_depth(picture.depth_m, picture.blank, DEPTHS[name], condition, np.random.default_rng([*key, index]))
+        depth = measured_depth(
+            picture.depth_m, picture.blank, DEPTHS[name], condition, np.random.default_rng([*key, index])
+        )
         if query.max_depth_m is not None:
             depth[depth > query.max_depth_m] = 0
         steps = np.rint(depth / DEPTH_SCALE_M).clip(0, 65535).astype(np.uint16)
@@ -273,4 +298,3 @@ def _description(plan: SimulationPlan) -> DatasetDescription:
         conditions={"survey": plan.survey_condition, "queries": {query.name: query.condition for query in plan.queries}},
         seed=plan.seed,
     )  # fmt: skip
-

@@ -9,7 +9,9 @@ Vector = NDArray[np.float64]
 
 CAR_COLOURS = np.array([[.75, .75, .76], [.08, .08, .09], [.30, .31, .33], [.55, .06, .06], [.07, .12, .35], [.85, .85, .84],
                         [.12, .22, .14], [.45, .38, .25]])  # fmt: skip
-CLOTHES = np.array([[0.1, 0.12, 0.25], [0.5, 0.1, 0.1], [0.15, 0.15, 0.15], [0.55, 0.5, 0.4], [0.2, 0.35, 0.2], [0.7, 0.7, 0.72]])
+CLOTHES = np.array(
+    [[0.1, 0.12, 0.25], [0.5, 0.1, 0.1], [0.15, 0.15, 0.15], [0.55, 0.5, 0.4], [0.2, 0.35, 0.2], [0.7, 0.7, 0.72]]
+)
 
 
 def add_tree(builder: MeshBuilder, base: Vector, rng: np.random.Generator, *, kind: str | None = None) -> None:
@@ -51,7 +53,11 @@ def add_tree(builder: MeshBuilder, base: Vector, rng: np.random.Generator, *, ki
         if kind == "poplar":
             middle = base + [*rng.normal(0, 0.2 * crown, 2), bottom + crown * (1 + 1.3 * k)]
         radius = crown * rng.uniform(0.45, 0.8)
-        builder.triangles(blob(middle, np.array([radius, radius, radius * 0.9]), rng), green * rng.uniform(0.85, 1.15), Material.FOLIAGE)
+        builder.triangles(
+            blob(middle, np.array([radius, radius, radius * 0.9]), rng),
+            green * rng.uniform(0.85, 1.15),
+            Material.FOLIAGE,
+        )
         direction = rng.normal(size=(50, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         points = middle + direction * radius * rng.uniform(0.9, 1.45, (50, 1))
@@ -66,7 +72,9 @@ def add_bush(builder: MeshBuilder, base: Vector, rng: np.random.Generator) -> No
     builder.triangles(blob(base + [0, 0, radius * 0.5], radii, rng), green, Material.FOLIAGE)
     direction = rng.normal(size=(24, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    builder.triangles(leaves(base + [0, 0, radius * 0.5] + direction * radii * 1.05, 0.1, rng), green * 1.2, Material.FOLIAGE)
+    builder.triangles(
+        leaves(base + [0, 0, radius * 0.5] + direction * radii * 1.05, 0.1, rng), green * 1.2, Material.FOLIAGE
+    )
 
 
 def add_furniture(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.Generator) -> None:
@@ -88,17 +96,27 @@ def add_furniture(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random
         builder.box(base + [0, 0, 0.35], (1.8, 0.5, 0.12), yaw, np.array([0.35, 0.22, 0.12]), Material.MATTE)
         builder.box(low, (1.6, 0.1, 0.9), yaw, steel, Material.METAL)
     elif kind == "cabinet":
-        builder.box(low, (rng.uniform(0.6, 1.4), 0.45, rng.uniform(1.2, 2.0)), yaw, np.array([0.5, 0.52, 0.48]), Material.MATTE)
+        builder.box(
+            low, (rng.uniform(0.6, 1.4), 0.45, rng.uniform(1.2, 2.0)), yaw, np.array([0.5, 0.52, 0.48]), Material.MATTE
+        )
     elif kind == "hoarding":
         builder.box(low, (0.2, 0.2, 1.5), yaw, steel, Material.METAL)
-        builder.box(base + [0, 0, 0.9], (rng.uniform(1.2, 2.8), 0.2, rng.uniform(1.5, 2.2)), yaw, rng.uniform(0.1, 0.8, 3), Material.MATTE)
+        builder.box(
+            base + [0, 0, 0.9],
+            (rng.uniform(1.2, 2.8), 0.2, rng.uniform(1.5, 2.2)),
+            yaw,
+            rng.uniform(0.1, 0.8, 3),
+            Material.MATTE,
+        )
     else:
         builder.box(base + [0, 0, 2.3], (3.4, 1.5, 0.12), yaw, steel, Material.METAL)
         back = np.array([-np.sin(yaw), np.cos(yaw), 0.0]) * 0.7
         builder.box(low + back, (3.4, 0.06, 2.7), yaw, np.array([0.3, 0.35, 0.36]), Material.GLASS)
 
 
-def add_vehicle(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.Generator, *, kind: str | None = None) -> None:
+def add_vehicle(
+    builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.Generator, *, kind: str | None = None
+) -> None:
     """A car, a van or a lorry, standing on its wheels."""
     kind = kind or str(rng.choice(["car", "van", "lorry"], p=[0.88, 0.09, 0.03]))
     ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
@@ -108,7 +126,9 @@ def add_vehicle(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.G
         length, width, height = rng.uniform(3.6, 5.0), rng.uniform(1.6, 1.9), rng.uniform(1.35, 1.9)
         builder.box(base + [0, 0, 0.25], (length, width, height * 0.5), yaw, colour, Material.METAL)
         cabin = base - 0.1 * length * ahead + [0, 0, 0.25 + height * 0.5]
-        builder.box(cabin, (length * 0.58, width * 0.88, height * 0.4), yaw, np.array([0.08, 0.1, 0.12]), Material.GLASS)
+        builder.box(
+            cabin, (length * 0.58, width * 0.88, height * 0.4), yaw, np.array([0.08, 0.1, 0.12]), Material.GLASS
+        )
         builder.box(cabin + [0, 0, height * 0.38], (length * 0.5, width * 0.84, 0.06), yaw, colour, Material.METAL)
         builder.box(base, (length * 0.8, width * 0.85, 0.3), yaw, tyre, Material.MATTE)
         return
@@ -116,11 +136,21 @@ def add_vehicle(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.G
     if kind == "lorry":
         length, width, height = rng.uniform(7, 10), 2.5, rng.uniform(3.2, 3.9)
         white = np.array([0.75, 0.75, 0.73]) * rng.uniform(0.5, 1.1)
-        builder.box(base + ahead * (-1.2) + [0, 0, 0.9], (length - 2.4, width, height - 0.9), yaw, white, Material.METAL)
-        builder.box(base + ahead * (length / 2 - 1.1) + [0, 0, 0.5], (2.1, width * 0.96, 2.3), yaw, colour, Material.METAL)
+        builder.box(
+            base + ahead * (-1.2) + [0, 0, 0.9], (length - 2.4, width, height - 0.9), yaw, white, Material.METAL
+        )
+        builder.box(
+            base + ahead * (length / 2 - 1.1) + [0, 0, 0.5], (2.1, width * 0.96, 2.3), yaw, colour, Material.METAL
+        )
     else:
         builder.box(base + [0, 0, 0.3], (length, width, height - 0.3), yaw, colour, Material.METAL)
-        builder.box(base + ahead * (length / 2 - 0.8) + [0, 0, 1.3], (1.62, width * 1.01, 0.7), yaw, np.array([0.08, 0.1, 0.12]), Material.GLASS)
+        builder.box(
+            base + ahead * (length / 2 - 0.8) + [0, 0, 1.3],
+            (1.62, width * 1.01, 0.7),
+            yaw,
+            np.array([0.08, 0.1, 0.12]),
+            Material.GLASS,
+        )
     builder.box(base, (length * 0.85, width * 0.85, 0.9), yaw, tyre, Material.MATTE)
 
 
@@ -133,4 +163,6 @@ def add_person(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.Ge
     for sign in (-1, 1):
         builder.box(base + sign * stride * ahead, (0.18, 0.2, height * 0.48), yaw, legs, Material.MATTE)
     builder.box(base + [0, 0, height * 0.45], (0.28, 0.48, height * 0.4), yaw, coat, Material.MATTE)
-    builder.box(base + [0, 0, height * 0.86], (0.2, 0.2, height * 0.14), yaw, np.array([0.6, 0.42, 0.33]), Material.MATTE)
+    builder.box(
+        base + [0, 0, height * 0.86], (0.2, 0.2, height * 0.14), yaw, np.array([0.6, 0.42, 0.33]), Material.MATTE
+    )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 Line = NDArray[np.float64]
 
+GRID_M = 0.01  # coordinates of polygons, as they are written; rounding afterwards would make some cross themselves
 PAVEMENT_M = 3.0  # either side of the carriageway, part of the street's polygon
 
 #: Table I: class names and the number of test images of each, in the paper's order.
@@ -59,7 +60,8 @@ def smooth_line(points: list[tuple[float, float]], bend_m: float, rng: np.random
     bend = rng.normal(0, bend_m) * np.sin(np.pi * share) + rng.normal(0, 0.4 * bend_m) * np.sin(2 * np.pi * share)
     direction = line[-1] - line[0]
     direction = direction / np.linalg.norm(direction)
-    return line + bend[:, None] * np.array([-direction[1], direction[0]])
+    bent: Line = line + bend[:, None] * np.array([-direction[1], direction[0]])
+    return bent
 
 
 def paper_streets(rng: np.random.Generator) -> list[Street]:
@@ -120,17 +122,15 @@ def random_streets(rng: np.random.Generator, size_m: tuple[float, float]) -> lis
 def streets_geojson(streets: list[Street]) -> dict[str, Any]:
     """Polygons of all classes; where two meet, the first named one keeps the crossing, so no point has two streets."""
     features = []
-    taken = shapely.Polygon()
+    taken: shapely.Geometry = shapely.Polygon()
     index = 0
     for street in streets:
-        polygons = []
+        polygons: list[shapely.Geometry] = []
         for section, lines in street.classes():
             corridor = shapely.union_all(
                 [shapely.LineString(line).buffer(street.half_width_m + PAVEMENT_M, cap_style="flat") for line in lines]
             )
-            own = shapely.difference(corridor, taken)
-            for earlier in polygons:
-                own = shapely.difference(own, earlier)
+            own = shapely.difference(corridor, shapely.union_all([taken, *polygons]), grid_size=GRID_M)
             polygons.append(own)
             features.append(
                 {
@@ -146,12 +146,12 @@ def streets_geojson(streets: list[Street]) -> dict[str, Any]:
                 }
             )
             index += 1
-        taken = shapely.union_all([taken, *polygons])
+        taken = shapely.union_all([taken, *polygons], grid_size=GRID_M)
     return {"type": "FeatureCollection", "features": features}
 
 
 def _geometry(shape: shapely.Geometry) -> dict[str, Any]:
-    """GeoJSON coordinates to the centimetre, slivers under 1 m2 left out."""
+    """GeoJSON coordinates, slivers under 1 m2 left out; rounding only cuts the digits, the points lie on the grid."""
     parts = [p for p in shapely.get_parts(shape) if isinstance(p, shapely.Polygon) and p.area > 1.0]
     polygons = [
         [[[round(x, 2), round(y, 2)] for x, y in ring.coords] for ring in (p.exterior, *p.interiors)] for p in parts

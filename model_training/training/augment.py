@@ -39,7 +39,9 @@ class Augmentation(BaseModel):
 class Augmenter:
     """Draws errors for batches of views; all its chance comes from one generator."""
 
-    def __init__(self, settings: Augmentation, grid: ViewGrid, generator: torch.Generator, device: torch.device) -> None:
+    def __init__(
+        self, settings: Augmentation, grid: ViewGrid, generator: torch.Generator, device: torch.device
+    ) -> None:
         self.settings, self.grid, self._generator, self._device = settings, grid, generator, device
         self.elevation = torch.tensor(grid.elevations_rad, dtype=torch.float32, device=device)[:, None]
         self.azimuth = torch.tensor(grid.azimuths_rad.copy(), dtype=torch.float32, device=device)[None, :]
@@ -88,7 +90,9 @@ class Augmenter:
             torch.full((count, 1, 1), self.grid.max_range_m, device=self._device),
         )
         distance = z / self.z_of_range
-        keep = measured & observed & (z < reach) & (distance < self.grid.max_range_m) & (distance > self.grid.min_range_m)
+        keep = (
+            measured & observed & (z < reach) & (distance < self.grid.max_range_m) & (distance > self.grid.min_range_m)
+        )
         height = height_m + self._normal(count) * s.height_error_m
         return self._planes(distance * keep, height, observed, self._colour(rgb))
 
@@ -99,7 +103,11 @@ class Augmenter:
         low, high = (torch.log(torch.tensor(v)) for v in s.disparity_noise_px)
         sigma = torch.exp(low + (high - low) * self._uniform(count, 1, 1))
         rows, columns = self.grid.rows, self.grid.columns
-        noise = 1.0 * self._field(count, 12, 40) + 0.5 * self._field(count, 4, 12) + 0.5 * self._normal(count, rows, columns)
+        noise = (
+            1.0 * self._field(count, 12, 40)
+            + 0.5 * self._field(count, 4, 12)
+            + 0.5 * self._normal(count, rows, columns)
+        )
         disparity = FOCAL_BASELINE_PX_M / z.clamp(min=0.3) + sigma * noise
         far = 150.0
         seen = torch.where(measured, FOCAL_BASELINE_PX_M / disparity.clamp(min=0.5), torch.full_like(z, far))
@@ -149,7 +157,9 @@ class Augmenter:
         balance = 1 + 0.12 * self._normal(count, 3, 1, 1)
         r, g, b = ((rgb * balance)[:, k] for k in range(3))
         planes = torch.stack([(2 * b - r - g) / 6**0.5, (g - r) / 2**0.5], dim=1)
-        saturation = torch.exp(0.4 * self._normal(count, 1, 1, 1)) * (self._uniform(count, 1, 1, 1) > self.settings.no_colour)
+        saturation = torch.exp(0.4 * self._normal(count, 1, 1, 1)) * (
+            self._uniform(count, 1, 1, 1) > self.settings.no_colour
+        )
         return (planes + 3.0 * self._normal(*planes.shape)) * saturation
 
     def _planes(self, ranges: Tensor, height_m: Tensor, observed: Tensor, colour: Tensor | None) -> Tensor:
@@ -159,5 +169,3 @@ class Augmenter:
         seen = observed.to(ranges.dtype)
         colour = colour * seen[:, None]
         return torch.cat([ranges[:, None], colour, heights[:, None], seen[:, None]], dim=1)
-
-

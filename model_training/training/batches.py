@@ -52,12 +52,17 @@ class City:
         near = np.array(self._queries.query_ball_point(middle, NEIGHBOURHOOD_M))
         near = near[np.isin(near, self.usable)]
         half = rng.choice(near, min(len(near), pairs // 2), replace=False) if len(near) else np.zeros(0, int)
-        chosen = np.unique(np.concatenate([half, rng.choice(self.usable, pairs - len(half), replace=False)]).astype(int))
+        chosen = np.unique(
+            np.concatenate([half, rng.choice(self.usable, pairs - len(half), replace=False)]).astype(int)
+        )
         place = np.array([rng.choice(self._places_near[k]) for k in chosen])
         queries, places = pack.queries[chosen], pack.places[place]
         turn = np.deg2rad(rng.uniform(-TURN_DEG, TURN_DEG, len(chosen)))
         heading = queries[:, 2] + turn - places[:, 2]
-        columns = np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int) % grid.around
+        columns = (
+            np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int)
+            % grid.around
+        )
         views: NDArray[np.float32] = np.stack(
             [pack.panoramas[p][:, c] for p, c in zip(place, columns, strict=True)]
         ).astype(np.float32)

@@ -81,7 +81,8 @@ def train(
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     generator = torch.Generator(device=place).manual_seed(config.seed)
-    net = EncoderNet(config.encoder).to(place, memory_format=torch.channels_last)
+    net = EncoderNet(config.encoder).to(place)
+    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
     log_scale = torch.nn.Parameter(torch.tensor(float(np.log(1 / 0.07)), device=place))
     optimiser = _optimiser([*net.parameters(), log_scale], config)
     checkpoint = run / "checkpoint.pt"
@@ -122,7 +123,11 @@ def train(
             descriptors = net(planes, side)
             scale = log_scale.exp().clamp(max=config.largest_scale)
             losses, first_ones = paired_info_nce(
-                descriptors[:count], descriptors[count:], batch.query_xy.to(place), batch.survey_xy.to(place), scale=scale
+                descriptors[:count],
+                descriptors[count:],
+                batch.query_xy.to(place),
+                batch.survey_xy.to(place),
+                scale=scale,
             )
             loss = losses.mean()
             optimiser.zero_grad(set_to_none=True)
@@ -131,7 +136,11 @@ def train(
             optimiser.step()
             images += batch.images
             state_now = Progress(
-                step + 1, config.steps, float(loss.detach()), float(first_ones.float().mean()), images / (time.perf_counter() - began)
+                step + 1,
+                config.steps,
+                float(loss.detach()),
+                float(first_ones.float().mean()),
+                images / (time.perf_counter() - began),
             )
             report(state_now)
             if (step + 1) % 10 == 0:
@@ -143,7 +152,8 @@ def train(
             if interrupt.asked:
                 save(step + 1)
                 raise KeyboardInterrupt
-    return net.eval()
+    trained: EncoderNet = net.eval()
+    return trained
 
 
 def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:
@@ -170,7 +180,9 @@ def _keep_config(run: Path, config: TrainingConfig) -> None:
     path = run / "config.json"
     if path.exists():
         if TrainingConfig.model_validate_json(path.read_bytes()) != config:
-            raise DatasetError(f"{path} is of another configuration; take another --run folder, or remove this one", field="run")
+            raise DatasetError(
+                f"{path} is of another configuration; take another --run folder, or remove this one", field="run"
+            )
         return
     path.write_text(config.model_dump_json(indent=2) + "\n")
 
@@ -178,7 +190,11 @@ def _keep_config(run: Path, config: TrainingConfig) -> None:
 def _optimiser(parameters: list[torch.nn.Parameter], config: TrainingConfig) -> torch.optim.Optimizer:
     if config.optimiser == "sgdm":
         return torch.optim.SGD(
-            parameters, lr=config.learning_rate, momentum=config.momentum, weight_decay=config.weight_decay, nesterov=True
+            parameters,
+            lr=config.learning_rate,
+            momentum=config.momentum,
+            weight_decay=config.weight_decay,
+            nesterov=True,
         )
     return torch.optim.AdamW(parameters, lr=config.learning_rate, weight_decay=config.weight_decay)
 
@@ -186,7 +202,7 @@ def _optimiser(parameters: list[torch.nn.Parameter], config: TrainingConfig) -> 
 def _set_rate(optimiser: torch.optim.Optimizer, config: TrainingConfig, step: int) -> None:
     """Linear warm-up, then half a cosine down to a hundredth."""
     warm = min(1.0, (step + 1) / max(1, config.warm_up_steps))
-    rate = config.learning_rate * warm * (0.5 * (1 + np.cos(np.pi * step / config.steps)) + 0.01)
+    rate = float(config.learning_rate * warm * (0.5 * (1 + np.cos(np.pi * step / config.steps)) + 0.01))
     for group in optimiser.param_groups:
         group["lr"] = rate
 

@@ -6,7 +6,13 @@ from torch.nn import functional
 
 
 def paired_info_nce(
-    queries: Tensor, surveys: Tensor, positions_q: Tensor, positions_s: Tensor, *, scale: Tensor, same_place_m: float = 6.0
+    queries: Tensor,
+    surveys: Tensor,
+    positions_q: Tensor,
+    positions_s: Tensor,
+    *,
+    scale: Tensor,
+    same_place_m: float = 6.0,
 ) -> tuple[Tensor, Tensor]:
     """InfoNCE both ways over a batch of pairs (van den Oord et al., 2018), places too near to be told apart left out.
 
@@ -28,6 +34,7 @@ def paired_info_nce(
     logits = logits.masked_fill(near, -1e4)
     own = torch.arange(len(queries), device=queries.device)
     loss = 0.5 * (
-        functional.cross_entropy(logits, own, reduction="none") + functional.cross_entropy(logits.T, own, reduction="none")
+        functional.cross_entropy(logits, own, reduction="none")
+        + functional.cross_entropy(logits.T, own, reduction="none")
     )
     return loss, logits.argmax(dim=1) == own

@@ -26,6 +26,7 @@ from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
 FORMAT = 1
+OWN_DRIVES = 1000  # traversals of the training set: no dataset's drive has the same vehicles and people
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,9 @@ class Pack:
     @staticmethod
     def open(folder: Path) -> "Pack":
         """Map a pack's arrays; they are read as they are needed."""
-        arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in Pack.__annotations__}
+        arrays = {
+            name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in Pack.__annotations__
+        }
         return Pack(**arrays)
 
 
@@ -118,7 +121,7 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
         places[k] = (x, y, heading_of_body(np.vstack([np.c_[R_map_level, [0, 0, 0]], [0, 0, 0, 1]])), level.height_m)
     del survey
     ranges, rgb, queries = _queries(city, plan, places, grid, rng)
-    arrays = {
+    arrays: dict[str, NDArray[np.generic]] = {
         "panoramas": panoramas, "places": places, "rows_seen": rows_seen_by(panoramas),
         "ranges": ranges, "rgb": rgb, "queries": queries,
     }  # fmt: skip
@@ -140,7 +143,7 @@ def _queries(
     queries = np.zeros((total, 4))
     cells = grid.rays_level().reshape(-1, 3)
     row = 0
-    for drive in range(1, drives + 1):  # each with its own vehicles and people, sun and clouds
+    for drive in range(OWN_DRIVES, OWN_DRIVES + drives):  # each with its own vehicles and people, sun and clouds
         scene = Scene(joined([city.static, city.occupants(drive)]))
         light, clear = Light.of(CONDITIONS["clear"], rng), CONDITIONS["clear"]
         for place in places:
@@ -170,8 +173,7 @@ def _near(place: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, 
     """A query pose within 2 m of a place; mostly along the street, either way."""
     angle, distance = rng.uniform(0, 2 * np.pi), 2.0 * np.sqrt(rng.random())
     x, y = place[0] + distance * np.cos(angle), place[1] + distance * np.sin(angle)
+    heading = rng.uniform(-np.pi, np.pi)
     if rng.random() < 0.7:
         heading = place[2] + rng.choice([0.0, np.pi]) + np.deg2rad(rng.uniform(-20, 20))
-    else:
-        heading = rng.uniform(-np.pi, np.pi)
     return float(x), float(y), float(heading)

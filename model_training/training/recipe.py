@@ -11,7 +11,18 @@ WATCH_SEEDS = range(2000, 3000)
 EVALUATION_SEEDS = range(9000, 10000)
 
 #: One LiDAR a city, so that the encoder meets 16 to 128 beams and sensors that do not look up.
-_LIDARS = ("paper_32", "paper_32", "vlp_16", "paper_32", "hdl_64", "paper_32", "paper_32", "hdl_64", "paper_32", "os1_128")
+_LIDARS = (
+    "paper_32",
+    "paper_32",
+    "vlp_16",
+    "paper_32",
+    "hdl_64",
+    "paper_32",
+    "paper_32",
+    "hdl_64",
+    "paper_32",
+    "os1_128",
+)
 
 
 def stock_plans(cities: int) -> list[PackPlan]:

@@ -19,6 +19,7 @@ _KNOWN = {
     "import": ("Bring recorded data into the dataset folder.", "mapping"),
     "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
     "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
+    "demo": ("Map streets, serve the map, ask it where pictures were taken.", "mapping"),
     "train": ("Train an encoder on simulated cities.", "training"),
     "export": ("Make an ONNX encoder from a training's checkpoint.", "training"),
 }
@@ -79,13 +80,7 @@ def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any]:
     try:
         function: Callable[..., Any] = point.load()
     except ModuleNotFoundError as error:
-        missing = _extra_missing(point, extra, error)
-
-        def refuse(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
-            del arguments
-            raise missing
-
-        return refuse
+        raise _extra_missing(point, extra, error) from error
 
     @functools.wraps(function)
     def run(*args: object, **kwargs: object) -> object:

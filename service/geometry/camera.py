@@ -28,7 +28,13 @@ class PinholeCamera:
         """The same camera with its picture resized; pixel centres, not corners, are at whole numbers."""
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(
-            width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, self.distortion
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+            self.distortion,
         )
 
     def rays_of_pixels(self) -> Float64[NDArray[np.float64], "H W 3"]:

@@ -60,9 +60,10 @@ def rotation_taking(a: Float64[NDArray[np.float64], "3"], b: Float64[NDArray[np.
         helper = np.eye(3)[int(np.argmin(np.abs(a)))]
         axis = np.cross(a, helper)
         axis /= np.linalg.norm(axis)
-        return 2.0 * np.outer(axis, axis) - np.eye(3)
+        return np.asarray(2.0 * np.outer(axis, axis) - np.eye(3))
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    return np.eye(3) + K + K @ K / (1.0 + cosine)
+    rotation: Rotation = np.eye(3) + K + K @ K / (1.0 + cosine)
+    return rotation
 
 
 def quaternion_xyzw_from(rotation: Rotation) -> Float64[NDArray[np.float64], "4"]:
@@ -81,7 +82,8 @@ def quaternion_xyzw_from(rotation: Rotation) -> Float64[NDArray[np.float64], "4"
     else:
         q = np.array([m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], s * s / 4, m[1, 0] - m[0, 1]]) / s
     q = q / np.linalg.norm(q)
-    return -q if q[3] < 0 else q
+    unit: Float64[NDArray[np.float64], "4"] = -q if q[3] < 0 else q
+    return unit
 
 
 def rotation_from_quaternion_xyzw(q_xyzw: Float64[NDArray[np.float64], "4"]) -> Rotation:

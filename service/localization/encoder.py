@@ -1,10 +1,14 @@
 """The encoder under ONNX Runtime: planes in, unit descriptors out."""
 
 import hashlib
+import os
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+
+# Importing ONNX Runtime would else write a device id and an event file into the user's home.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime
 from jaxtyping import Float32
 from numpy.typing import NDArray
@@ -52,8 +56,8 @@ class Encoder:
         """
         try:
             data = source if isinstance(source, bytes) else source.read_bytes()
-        except OSError as error:
-            raise EncoderError(f"the encoder {source} cannot be read: {error}", field="encoder") from error
+        except OSError as error:  # its text names the file
+            raise EncoderError(f"the encoder cannot be read: {error}", field="encoder") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1

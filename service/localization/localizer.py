@@ -6,7 +6,7 @@ import numpy as np
 
 from service.errors import BundleError
 from service.geometry.rigid import Transform, inverse, transform_from
-from service.imaging.query_view import QueryView, query_view
+from service.imaging.query_view import QueryViews, query_views
 from service.localization.answer import Answer, Timings
 from service.localization.encoder import Encoder
 from service.localization.hypotheses import ClusterSettings, Hypothesis, cluster
@@ -14,6 +14,10 @@ from service.localization.query import Query
 from service.localization.search import distinct_places, search_views
 from service.localization.street_vote import vote
 from service.maps.reader import MapBundle
+
+
+#: A query is also asked turned a third of the fan's 15 degrees either way: some turn is then within 2.5 degrees of a view.
+TURNS_RAD = tuple(float(turn) for turn in np.deg2rad([-5.0, 0.0, 5.0]))
 
 
 class Localizer:
@@ -41,6 +45,7 @@ class Localizer:
         self.bundle = bundle
         self.encoder = encoder
         self.clusters = clusters or ClusterSettings()
+        self.turns_rad = TURNS_RAD
 
     @classmethod
     def open(cls, bundle: MapBundle) -> "Localizer":
@@ -54,20 +59,24 @@ class Localizer:
             NoDepthError: the depth picture holds no measurement within the view grid.
         """
         started = perf_counter()
-        view = query_view(
-            query.rgb, query.depth_m, query.camera,
+        views = query_views(
+            query.rgb, query.depth_m, query.camera, turns_rad=self.turns_rad,
             grid=self.bundle.grid, rows_seen=self.bundle.rows_seen, down_camera=query.down_camera,
         )  # fmt: skip
         fused = perf_counter()
-        descriptor = self.encoder.encode(view.planes[None], side="query")[0]
+        descriptors = self.encoder.encode(views.planes, side="query")
         encoded = perf_counter()
         wanted = max(query.neighbours, query.ranked)
-        matches = search_views(self.bundle, descriptor, places=wanted, fewest=self.clusters.views)
+        matches = search_views(
+            self.bundle, descriptors, turns_rad=views.turns_rad, places=wanted, fewest=self.clusters.views
+        )
         neighbours = distinct_places(matches, wanted)
         hypotheses = cluster(matches, self.clusters)
-        streets = None if self.bundle.streets is None else vote(neighbours[: query.neighbours], self.clusters.temperature)
+        streets = (
+            None if self.bundle.streets is None else vote(neighbours[: query.neighbours], self.clusters.temperature)
+        )
         done = perf_counter()
-        T_map_camera = self._pose_of(hypotheses[0], view)
+        T_map_camera = self._pose_of(hypotheses[0], views)
         return Answer(
             status="LOCALIZED",
             confidence=None,
@@ -77,8 +86,8 @@ class Localizer:
             T_map_vehicle=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
             neighbours=neighbours,
             hypotheses=hypotheses,
-            measured_share=view.measured_share,
-            height_m=view.height_m,
+            measured_share=views.measured_share,
+            height_m=views.height_m,
             timings=Timings(
                 fuse_ms=1e3 * (fused - started),
                 encode_ms=1e3 * (encoded - fused),
@@ -87,7 +96,7 @@ class Localizer:
             ),
         )
 
-    def _pose_of(self, hypothesis: Hypothesis, view: QueryView) -> Transform:
+    def _pose_of(self, hypothesis: Hypothesis, view: QueryViews) -> Transform:
         """The camera stands at the hypothesis, at its own height above the ground under the places' LiDAR."""
         above_lidar_m = view.height_m - self.bundle.manifest.lidar_height_m
         position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])

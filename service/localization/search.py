@@ -46,20 +46,51 @@ class Neighbour:
 
 
 def search_views(
-    bundle: MapBundle, descriptor: Float32[NDArray[np.float32], " D"], *, places: int, fewest: int
+    bundle: MapBundle,
+    descriptors: Float32[NDArray[np.float32], "T D"],
+    *,
+    turns_rad: tuple[float, ...],
+    places: int,
+    fewest: int,
 ) -> ViewMatches:
-    """The most similar views: at least ``fewest``, and enough to hold that many distinct places if the map has them."""
+    """The views that are most similar to any of a query's turned views.
+
+    Args:
+        bundle: the map.
+        descriptors: of the turned views.
+        turns_rad: of the same; a match's heading is that of the map's view less the turn.
+        places: so many distinct places are wanted, if the map has them.
+        fewest: so many views at least.
+    """
     wanted = min(places, bundle.manifest.counts.places)
     count = max(fewest, 4 * wanted)
     while True:
-        similarities, views = bundle.view_index.search(descriptor[None], count)
-        if len(np.unique(bundle.view_place[views[0]])) >= wanted or views.shape[1] < count:
-            return _matches(bundle, similarities[0], views[0])
+        similarities, views = bundle.view_index.search(descriptors, count)
+        if len(np.unique(bundle.view_place[views])) >= wanted or views.shape[1] < count:
+            return _best_of_turns(bundle, similarities, views, np.array(turns_rad))
         count *= 2
 
 
+def _best_of_turns(
+    bundle: MapBundle,
+    similarities: Float32[NDArray[np.float32], "T n"],
+    views: Int64[NDArray[np.int64], "T n"],
+    turns_rad: Float64[NDArray[np.float64], " T"],
+) -> ViewMatches:
+    """Every view once, at the turn where it is most similar; the best view first."""
+    turn = np.repeat(turns_rad, views.shape[1])
+    order = np.argsort(-similarities.reshape(-1), kind="stable")
+    flat = views.reshape(-1)[order]
+    _, first = np.unique(flat, return_index=True)
+    kept = order[np.sort(first)]
+    return _matches(bundle, similarities.reshape(-1)[kept], views.reshape(-1)[kept], turn[kept])
+
+
 def _matches(
-    bundle: MapBundle, similarity: Float32[NDArray[np.float32], " n"], view: Int64[NDArray[np.int64], " n"]
+    bundle: MapBundle,
+    similarity: Float32[NDArray[np.float32], " n"],
+    view: Int64[NDArray[np.int64], " n"],
+    turn_rad: Float64[NDArray[np.float64], " n"],
 ) -> ViewMatches:
     place = np.array(bundle.view_place[view])
     return ViewMatches(
@@ -67,7 +98,7 @@ def _matches(
         similarity=similarity.astype(np.float64),
         place=place,
         street=np.array(bundle.place_street[place]),
-        heading_rad=np.array(bundle.view_heading_rad[view]),
+        heading_rad=np.array(bundle.view_heading_rad[view]) - turn_rad,
         T_map_place=np.array(bundle.T_map_place[place]),
     )
 

@@ -40,7 +40,7 @@ def mount(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 def test_help_lists_all_commands_with_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--help") == 0
     out = capsys.readouterr().out
-    for name in ("serve", "localize", "simulate", "import", "train", "export", "build-map", "evaluate"):
+    for name in ("serve", "localize", "simulate", "import", "train", "export", "build-map", "evaluate", "demo"):
         assert f"\n  {name} " in out
 
 
@@ -103,7 +103,7 @@ def test_a_package_missing_at_import_names_the_extra(
 ) -> None:
     points = [EntryPoint("train", "a_package_that_is_not_there:command", "streetfix.commands")]
     monkeypatch.setattr(command_line, "entry_points", lambda **_: points)
-    assert run("train", "anything", "at all") == 1
+    assert run("train", "anything", "--at", "all") == 1
     assert "'a_package_that_is_not_there'" in capsys.readouterr().err
 
 

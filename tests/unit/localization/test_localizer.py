@@ -77,7 +77,9 @@ def test_more_neighbours_than_places_gives_every_place(localizer: Localizer, que
 def test_distinct_places_agree_with_a_slow_loop(localizer: Localizer, query: Query) -> None:
     bundle = localizer.bundle
     descriptor = np.random.default_rng(5).normal(size=16).astype(np.float32)
-    matches = search_views(bundle, descriptor / np.linalg.norm(descriptor), places=7, fewest=1)
+    matches = search_views(
+        bundle, (descriptor / np.linalg.norm(descriptor))[None], turns_rad=(0.0,), places=7, fewest=1
+    )
     slow: list[int] = []
     for place in matches.place.tolist():
         if place not in slow:
@@ -115,3 +117,19 @@ def test_the_stages_times_sum_to_the_total(localizer: Localizer, query: Query) -
     times = localizer.localize(query).timings
     assert times.fuse_ms + times.encode_ms + times.search_ms == pytest.approx(times.total_ms)
     assert min(times.fuse_ms, times.encode_ms, times.search_ms) > 0
+
+
+def test_a_view_found_at_two_turns_is_kept_once_at_the_better_one_and_its_heading_less_that_turn(bundle_path):
+    bundle = MapBundle.open(bundle_path)
+    rng = np.random.default_rng(7)
+    descriptors = rng.normal(size=(2, bundle.manifest.counts.descriptor_size)).astype(np.float32)
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    turns = (-0.1, 0.1)
+    matches = search_views(bundle, descriptors, turns_rad=turns, places=3, fewest=bundle.manifest.counts.views)
+    assert len(np.unique(matches.view)) == len(matches) == bundle.manifest.counts.views
+    assert (np.diff(matches.similarity) <= 0).all()
+    by_turn = bundle.view_index.search(descriptors, bundle.manifest.counts.views)
+    for view, similarity, heading in zip(matches.view, matches.similarity, matches.heading_rad, strict=True):
+        each = [float(s[np.flatnonzero(v == view)[0]]) for s, v in zip(*by_turn, strict=True)]
+        assert similarity == pytest.approx(max(each), abs=1e-6)
+        assert heading == pytest.approx(float(bundle.view_heading_rad[view]) - turns[int(np.argmax(each))])

@@ -1,0 +1,106 @@
+# Needs make and a Python of 3.11 or later with venv and pip; each target makes .venv and installs what it needs, once.
+# The demo needs no torch; `test`, `check` and what trains do.
+
+PYTHON ?= python3
+# The CPU build where pip is offered one; `make TORCH="torch==2.13.0 --index-url ..." test` takes another.
+TORCH ?= torch==2.13.0
+# Optimiser steps of the stock encoder.
+STEPS ?= 3200
+# Further steps on the paper's city, for the encoder that stands beside it in the report.
+PAPER_STEPS ?= 400
+# Real stereo frames in KITTI's object layout.
+DATA ?= ../shared/data/kitti_stereo
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+UV := $(BIN)/uv
+INSTALL = $(UV) pip install --quiet --python $(BIN)/python
+COMPILE = $(UV) pip compile pyproject.toml --quiet --universal --fork-strategy fewest --python-version 3.11 \
+	--generate-hashes --no-annotate --no-header
+
+# ONNX Runtime reports its use to its maker unless told not to.
+export ORT_DISABLE_TELEMETRY := 1
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: help demo demo-real test check format generate lock evaluate bench-training reports encoder paper-encoder install-demo install-test clean
+
+help: ## say what there is
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
+
+demo: .venv/.mapping ## simulate streets, build their map, serve it, ask it over HTTP; ARGS="--once" ends then
+	$(BIN)/streetfix demo $(ARGS)
+
+demo-real: .venv/.mapping ## the same with real stereo frames: make demo-real DATA=../shared/data/kitti_stereo
+	$(BIN)/streetfix demo --real $(DATA) $(ARGS)
+
+test: .venv/.torch ## all tests
+	$(BIN)/python -m pytest $(ARGS)
+
+check: .venv/.torch ## lint, types, layers, and the contracts as the code says them
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m service.http.openapi --check
+	cd proto && ../$(BIN)/buf lint
+
+format: .venv/.torch ## put the code in shape
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+generate: .venv/.torch ## write openapi/openapi.json from the code
+	$(BIN)/python -m service.http.openapi
+
+lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
+	$(COMPILE) --extra dev --group oracle $(ARGS) --output-file locks/dev.txt
+	$(COMPILE) --extra mapping --constraint locks/dev.txt --output-file locks/mapping.txt
+	$(COMPILE) --constraint locks/dev.txt --output-file locks/service.txt
+
+evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json
+	$(BIN)/python -m benchmarks.accuracy $(ARGS)
+
+bench-training: .venv/.torch ## measure training and simulation -> reports/training.json
+	$(BIN)/python -m benchmarks.training $(ARGS)
+
+reports: .venv/.torch ## all reports as one page with plots
+	$(BIN)/python -m benchmarks.render $(ARGS)
+
+encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
+	$(BIN)/streetfix train --run runs/stock --steps $(STEPS)
+	$(BIN)/streetfix export runs/stock --out model_training/stock/encoder.onnx
+
+paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there
+	$(BIN)/streetfix train --recipe paper --start-from runs/stock --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper
+	$(BIN)/streetfix export runs/paper --out runs/paper/encoder.onnx
+
+install-demo: .venv/.mapping ## what the demo needs, and no more
+install-test: .venv/.torch ## what tests and checks need
+
+clean: ## remove what demos and tools left; .venv, data and runs stay
+	rm -rf out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
+
+# What is installed. A newer lock file or pyproject.toml installs again; nothing is ever removed.
+
+.venv/.uv:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed: make PYTHON=python3.12 ...")'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(PIP) install --quiet 'uv>=0.9,<1'
+	@touch $@
+
+.venv/.mapping: locks/mapping.txt pyproject.toml | .venv/.uv
+	$(INSTALL) --require-hashes --requirement locks/mapping.txt
+	$(INSTALL) --no-deps --editable .
+	@touch $@
+
+.venv/.dev: locks/dev.txt pyproject.toml | .venv/.uv
+	$(INSTALL) --require-hashes --requirement locks/dev.txt
+	$(INSTALL) --no-deps --editable .
+	@touch $@
+
+# By pip, outside the lock: which build of torch fits is a matter of the machine.
+.venv/.torch: .venv/.dev
+	$(PIP) install --quiet $(TORCH)
+	@touch $@

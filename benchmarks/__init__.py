@@ -1,0 +1,1 @@
+"""Measurements behind the reports; run by make targets, apart from the tests."""

@@ -1,0 +1,89 @@
+"""``reports/NAME.json``: rows with bars, and the run that they were made by."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+ROOT = Path(__file__).resolve().parents[1]
+REPORTS = ROOT / "reports"
+
+
+@dataclass
+class Report:
+    """Collects rows; ``write`` replaces the file in one go.
+
+    Args:
+        name: of the file.
+        command: that makes it, for people who want to run it again.
+    """
+
+    name: str
+    command: str
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    notes: dict[str, Any] = field(default_factory=dict)
+    _began: float = field(default_factory=time.monotonic)
+
+    def row(
+        self, row_id: str, value: float | None, unit: str, *, bar: float | None = None, better: Literal["higher", "lower"] = "higher",
+        n: int | None = None, ci95: list[float] | None = None, why: str | None = None,
+    ) -> None:  # fmt: skip
+        """Add a row; ``holds`` follows from value and bar."""
+        entry: dict[str, Any] = {"id": row_id, "value": value, "unit": unit}
+        if n is not None:
+            entry["n"] = n
+        if ci95 is not None:
+            entry["ci95"] = ci95
+        if bar is not None:
+            holds = value is not None and (value >= bar if better == "higher" else value <= bar)
+            entry |= {"bar": bar, "better": better, "holds": holds}
+        if why is not None:
+            entry["why"] = why
+        self.rows = [r for r in self.rows if r["id"] != row_id] + [entry]
+        mark = "" if bar is None else ("  holds" if entry["holds"] else "  MISSED")
+        shown = "-" if value is None else f"{value:.4f}"
+        print(f"{row_id:62} {shown:>10} {unit:8}{'' if bar is None else f' bar {bar:g}'}{mark}", flush=True)
+
+    def write(self) -> Path:
+        """Write the file and say where."""
+        made = {
+            "commit": _git("rev-parse", "HEAD"), "dirty": bool(_git("status", "--porcelain", "--", "service", "model_training", "benchmarks")),
+            "date": datetime.now(UTC).isoformat(timespec="seconds"), "machine": machine(), "command": self.command,
+            "minutes": round((time.monotonic() - self._began) / 60, 2),
+        }  # fmt: skip
+        REPORTS.mkdir(exist_ok=True)
+        path = REPORTS / f"{self.name}.json"
+        part = path.with_suffix(".part")
+        part.write_text(
+            json.dumps({"made": made, "rows": self.rows} | ({"notes": self.notes} if self.notes else {}), indent=1)
+            + "\n"
+        )
+        part.rename(path)
+        return path
+
+
+def machine() -> str:
+    """Processor, cores, Python: what a reader needs to judge a time."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        model = next(
+            (
+                line.split(":", 1)[1].strip()
+                for line in cpuinfo.read_text().splitlines()
+                if line.startswith("model name")
+            ),
+            model,
+        )
+    return f"{model}, {os.cpu_count()} cores, Python {sys.version.split()[0]}"
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip()

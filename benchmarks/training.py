@@ -1,0 +1,140 @@
+"""``make bench-training``: how fast training, simulation, the demo and the tests are on this machine.
+
+Run it on an otherwise idle machine. Speeds are of the command's own code paths, loading and writing included.
+"""
+
+import argparse
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from benchmarks.report import ROOT, Report
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.simulate import simulate
+from model_training.training.augment import Augmenter
+from model_training.training.batches import City
+from model_training.training.encoder_net import EncoderNet, EncoderShape
+from model_training.training.loop import Progress, TrainingConfig, train
+from model_training.training.losses import paired_info_nce
+from model_training.training.packs import Pack, PackPlan, make_packs
+from service.imaging.view_grid import ViewGrid
+
+PAPER_FRAMES, PAPER_EPOCHS, PAPER_MINUTES = 46_741, 4, 138
+BENCH_SEED = 1900  # of training, used by no recipe
+
+
+def packs_for_bench(work: Path) -> list[Path]:
+    """Two cities, as large as those of the stock recipe."""
+    plans = [PackPlan(seed=BENCH_SEED + k) for k in range(2)]
+    return make_packs(plans, work / "packs", ViewGrid())
+
+
+def own_size(report: Report, packs: list[Path], work: Path, steps: int) -> None:
+    """The training loop itself: drawing, augmenting, stepping, logging, saving."""
+    seen: list[tuple[float, int]] = []
+
+    def note(progress: Progress) -> None:
+        seen.append((time.perf_counter(), progress.step))
+
+    run = work / "bench-run"
+    shutil.rmtree(run, ignore_errors=True)
+    train(packs, run, TrainingConfig(steps=steps), device="cpu", report=note)
+    (began, first), (ended, last) = seen[4], seen[-1]  # the first steps read the packs from disk for the first time
+    images = (last - first) * 2 * TrainingConfig().pairs / (ended - began)
+    minutes = PAPER_FRAMES * PAPER_EPOCHS / images / 60
+    report.row("training.images_per_s", images, "1/s", n=last - first)
+    report.row("training.minutes_for_paper_images", minutes, "min", bar=10, better="lower", n=last - first,
+               why=f"{PAPER_FRAMES} x {PAPER_EPOCHS} branches of pairs at 32 x 128; the paper: {PAPER_MINUTES} min at 224 x 224")  # fmt: skip
+
+
+def paper_size(report: Report, packs: list[Path], steps: int) -> None:
+    """The same network and loss at the paper's 224 x 224: views are enlarged after augmentation."""
+    shape = EncoderShape(rows=224, columns=224)
+    net, grid, device = EncoderNet(shape).to(memory_format=torch.channels_last), ViewGrid(), torch.device("cpu")
+    rng, city = np.random.default_rng(0), City(Pack.open(packs[0]), grid)
+    augment = Augmenter(TrainingConfig().augmentation, grid, torch.Generator().manual_seed(0), device)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3)
+    images, began = 0, 0.0
+    for step in range(steps + 1):
+        if step == 1:
+            began = time.perf_counter()
+        batch = city.draw(32, rng)
+        count = len(batch.query_xy)
+        rows = augment.cut_rows(batch.rows_seen, count)
+        planes = torch.cat([augment.query(batch.query_ranges, batch.query_rgb, batch.query_height_m, rows),
+                            augment.survey(batch.survey_ranges, batch.survey_height_m, rows)])  # fmt: skip
+        large = functional.interpolate(planes, size=(224, 224), mode="nearest").contiguous(
+            memory_format=torch.channels_last
+        )
+        descriptors = net(large, torch.cat([torch.ones(count), torch.zeros(count)]))
+        loss = paired_info_nce(
+            descriptors[:count], descriptors[count:], batch.query_xy, batch.survey_xy, scale=torch.tensor(20.0)
+        )[0].mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        images += batch.images if step else 0
+    rate = images / (time.perf_counter() - began)
+    report.row("training.minutes_for_paper_images_224", PAPER_FRAMES * PAPER_EPOCHS / rate / 60, "min", n=steps)
+
+
+def simulation(report: Report, work: Path) -> None:
+    """Whole frames on disk a second: 32 x 1024 scans, and 640 x 480 pairs with JPEG and PNG."""
+    times: dict[str, list[tuple[float, int]]] = {}
+
+    def note(stage: str, done: int, _total: int) -> None:
+        times.setdefault(stage.split()[0], []).append((time.perf_counter(), done))
+
+    folder = work / "bench-simulation"
+    shutil.rmtree(folder, ignore_errors=True)
+    plan = SimulationPlan(
+        name="bench",
+        seed=BENCH_SEED,
+        size_m=(200.0, 260.0),
+        queries=(QueryPlan(name="drive1", traversal=1, count=160),),
+    )
+    simulate(plan, folder, report=note)
+    for stage, row, bar in (("survey", "simulate.scans_per_s", 60), ("queries", "simulate.rgbd_frames_per_s", 8)):
+        (began, first), (ended, last) = times[stage][0], times[stage][-1]
+        report.row(row, (last - first) / (ended - began), "1/s", bar=bar, n=last - first)
+    shutil.rmtree(folder)
+
+
+def walls(report: Report) -> None:
+    """The two commands of the README on a fresh clone; what they install comes from the package cache, as after the downloads."""
+    with tempfile.TemporaryDirectory() as folder:
+        clone = Path(folder) / "streetfix"
+        subprocess.run(["git", "clone", "-q", str(ROOT), str(clone)], check=True)
+        for row, target, bar in (("demo.minutes", ["demo", "ARGS=--once"], 4), ("test.minutes", ["test"], 15)):
+            subprocess.run(["make", "-s", f"install-{target[0]}"], cwd=clone, check=True)
+            began = time.perf_counter()
+            done = subprocess.run(["make", "-s", *target], cwd=clone, check=False)
+            minutes = (time.perf_counter() - began) / 60
+            why = None if done.returncode == 0 else f"make {' '.join(target)} ended with {done.returncode}"
+            report.row(row, minutes if why is None else None, "min", bar=bar, better="lower", why=why)
+
+
+def main() -> None:
+    """Parse, measure, write the report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "bench")
+    parser.add_argument("--steps", type=int, default=60)
+    arguments = parser.parse_args()
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    report = Report("training", "make bench-training")
+    simulation(report, arguments.work)
+    packs = packs_for_bench(arguments.work)
+    own_size(report, packs, arguments.work, arguments.steps)
+    paper_size(report, packs, 4)
+    walls(report)
+    print(f"written: {report.write()}")
+
+
+if __name__ == "__main__":
+    main()

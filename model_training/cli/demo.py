@@ -1,0 +1,51 @@
+"""``streetfix demo``."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from model_training.cli.demo_answers import ask, print_answers, print_next
+from model_training.cli.demo_map import CityDemo, DemoMap, city_demo, recorded_demo
+from model_training.cli.demo_service import serving
+from model_training.cli.progress import bars
+from model_training.stock import ENCODER
+
+
+def command(
+    out: Annotated[Path | None, typer.Option(help="where all is kept [default: out/demo, out/demo-real]")] = None,
+    real: Annotated[Path | None, typer.Option(help="stereo frames in KITTI's object layout, not a city")] = None,
+    encoder: Annotated[Path, typer.Option(help="ONNX file of an encoder [default: the stock encoder]")] = ENCODER,
+    streets: Annotated[str, typer.Option(help="streets of the paper's city to map")] = "1,5,7",
+    queries: Annotated[int, typer.Option(help="picture pairs to ask", min=1)] = 12,
+    depth: Annotated[str, typer.Option(help="depth camera: ideal, precise or stereo")] = "precise",
+    seed: Annotated[int, typer.Option(help="of the city and its drives")] = 0,
+    port: Annotated[int, typer.Option(help="of the service; 0 lets the system choose", min=0, max=65535)] = 0,
+    once: Annotated[bool, typer.Option("--once", help="end after the answers instead of serving on")] = False,
+) -> None:
+    """Make a map, serve it, ask it over HTTP where pictures were taken, and show the answers beside the truth.
+
+    Example: streetfix demo --real KITTI --once
+    """
+    began, console = time.monotonic(), Console(highlight=False)
+    with bars() as report:
+        if real is None:
+            plan = CityDemo(streets=tuple(s for s in streets.split(",") if s), queries=queries, depth=depth, seed=seed)
+            demo = city_demo(plan, out or Path("out/demo"), encoder, report)
+        else:
+            demo = recorded_demo(real, out or Path("out/demo-real"), encoder, report)
+    with serving(demo.bundle, port) as service:
+        _show(demo, service.url, console, began, goes_on=not once)
+        if not once:
+            service.wait_for_ctrl_c()
+            console.print("stopped")
+
+
+def _show(demo: DemoMap, url: str, console: Console, began: float, *, goes_on: bool) -> None:
+    outcomes = [ask(question, url) for question in demo.questions]
+    print_answers(outcomes, console, places=demo.place_names)
+    minutes, seconds = divmod(round(time.monotonic() - began), 60)
+    console.print(f"all of it took {minutes} min {seconds} s; map and pictures: {demo.folder}\n", soft_wrap=True)
+    print_next(outcomes, demo.bundle, url, console, goes_on=goes_on)

@@ -1,0 +1,180 @@
+"""Ask a service the demo's questions, and show what it answers beside the truth."""
+
+import math
+import os
+import shlex
+import shutil
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from model_training.cli.demo_map import Question
+from service.cli.localize import localize
+from service.errors import RefusedError
+from service.geometry.rigid import heading_of_camera, wrap_angle
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """A question and its answer of the REST contract, or why there is none; ``elapsed_s`` over HTTP."""
+
+    question: Question
+    answer: dict[str, Any] | None
+    problem: str
+    elapsed_s: float
+
+    @property
+    def right(self) -> bool | None:
+        """Whether the street, or where places are single frames the first place, is the true one; None: not known."""
+        if self.question.place is None and self.question.street is None:
+            return None
+        if self.answer is None:
+            return False
+        if self.question.place is not None:
+            return bool(self.answer["neighbours"][0]["place"] == self.question.place)
+        street = self.answer["street"]
+        return street is not None and self.question.street is not None and street["id"] == self.question.street[0]
+
+    @property
+    def error_m(self) -> float | None:
+        """Horizontal distance of the answered position from the true one; None in another one of single places."""
+        T = self.question.T_map_camera
+        if T is None or self.answer is None or self._is_elsewhere:
+            return None
+        position = self.answer["pose"]["position"]
+        return math.hypot(position["x"] - T[0, 3], position["y"] - T[1, 3])
+
+    @property
+    def heading_error_deg(self) -> float | None:
+        """Angle between the answered heading and the true one; None where ``error_m`` is."""
+        T = self.question.T_map_camera
+        if T is None or self.answer is None or self._is_elsewhere:
+            return None
+        return abs(math.degrees(wrap_angle(math.radians(self.answer["pose"]["heading_deg"]) - heading_of_camera(T))))
+
+    @property
+    def _is_elsewhere(self) -> bool:
+        """Single places have no distance that would mean anything."""
+        return self.question.place is not None and not self.right
+
+
+def ask(question: Question, url: str) -> Outcome:
+    """Post a pair of pictures, as ``streetfix localize`` does.
+
+    Raises:
+        UnreachableError: nothing answers any more.
+    """
+    began = time.perf_counter()
+    answer, problem = None, ""
+    try:
+        answer = localize(url, rgb=question.rgb, depth=question.depth, camera=question.camera)
+    except RefusedError as error:
+        problem = error.message
+    return Outcome(question, answer, problem, time.perf_counter() - began)
+
+
+def print_answers(outcomes: list[Outcome], console: Console, *, places: tuple[str, ...] = ()) -> None:
+    """Print a table, an answer a row, and a line that sums up.
+
+    Args:
+        outcomes: one or more.
+        console: where to.
+        places: names of the map's places where each is a single frame; then places are compared, not streets.
+    """
+    console.print(_places_table(outcomes, places) if places else _streets_table(outcomes))
+    console.print(_summary(outcomes, "first places" if places else "streets"))
+
+
+def print_next(outcomes: list[Outcome], bundle: Path, url: str, console: Console, *, goes_on: bool) -> None:
+    """Print what the user can do next."""
+    sample = next((outcome.question for outcome in outcomes if outcome.right), outcomes[0].question)
+    files = ["--rgb", str(sample.rgb), "--depth", str(sample.depth), "--camera", str(sample.camera)]
+    if not goes_on:
+        console.print("serve this map again, and ask it:", style="bold")
+        console.print(f"  {_shell('serve', str(bundle))}", soft_wrap=True)
+        console.print(f"  {_shell('localize', *files)}", soft_wrap=True)
+        return
+    console.print("ask yourself, in another terminal:", style="bold")
+    console.print(f"  {_shell('localize', '--url', url, *files)}\n", soft_wrap=True)
+    console.print(f"serving at {url} (what it can do: {url}/docs; stop: Ctrl-C)", soft_wrap=True)
+
+
+def _streets_table(outcomes: list[Outcome]) -> Table:
+    table = Table(title="Where was it? Street, (x, y) in metres, heading", title_justify="left", show_lines=True)
+    for heading in ("query", "answer", "truth", "street"):
+        table.add_column(heading)
+    table.add_column("error", justify="right")
+    for outcome in outcomes:
+        T = outcome.question.T_map_camera
+        street = outcome.question.street
+        truth = ""
+        if T is not None:
+            truth = _where(street[1] if street else None, T[0, 3], T[1, 3], math.degrees(heading_of_camera(T)))
+        table.add_row(outcome.question.name, _answered(outcome), truth, _verdict(outcome.right), _errors(outcome))
+    return table
+
+
+def _places_table(outcomes: list[Outcome], places: tuple[str, ...]) -> Table:
+    table = Table(title="Which place is it?", title_justify="left")
+    for heading in ("frame", "first place", "similarity", "own place first"):
+        table.add_column(heading)
+    table.add_column("error", justify="right")
+    for outcome in outcomes:
+        first = outcome.answer["neighbours"][0] if outcome.answer else None
+        name = _flat(outcome.problem) if first is None else places[first["place"]]
+        similarity = "" if first is None else f"{first['similarity']:.3f}"
+        own = "not in the map" if outcome.question.place is None else _verdict(outcome.right)
+        table.add_row(outcome.question.name, name, similarity, own, _errors(outcome))
+    return table
+
+
+def _answered(outcome: Outcome) -> str:
+    answer = outcome.answer
+    if answer is None:
+        return _flat(outcome.problem)
+    pose, street = answer["pose"], answer["street"]
+    text = _where(street and street["name"], pose["position"]["x"], pose["position"]["y"], pose["heading_deg"])
+    return text if answer["status"] == "LOCALIZED" else f"{answer['status']}\n{text}"
+
+
+def _where(street: str | None, x: float, y: float, heading_deg: float) -> str:
+    return f"{street or 'no street'}\n({x:.1f}, {y:.1f}) {heading_deg:.0f}°"
+
+
+def _verdict(right: bool | None) -> str:
+    return "" if right is None else "[green]right[/]" if right else "[bold red]wrong[/]"
+
+
+def _errors(outcome: Outcome) -> str:
+    if outcome.error_m is None:
+        return ""
+    return f"{outcome.error_m:.2f} m\n{outcome.heading_error_deg:.0f}°"
+
+
+def _flat(problem: str) -> str:
+    return " ".join(problem.split())
+
+
+def _summary(outcomes: list[Outcome], what: str) -> str:
+    verdicts = [outcome.right for outcome in outcomes if outcome.right is not None]
+    errors = sorted(error for outcome in outcomes if (error := outcome.error_m) is not None)
+    parts = [f"{sum(verdicts)} of {len(verdicts)} {what} right"]
+    if errors:
+        parts.append(f"position off by {median(errors):.2f} m (median), {errors[-1]:.2f} m (largest)")
+    parts.append(f"{1e3 * median(outcome.elapsed_s for outcome in outcomes):.0f} ms a query over HTTP (median)")
+    return "\n".join(parts)
+
+
+def _shell(*arguments: str) -> str:
+    """A command line that works where the user is, whether the virtual environment is active or not."""
+    script = Path(sys.executable).with_name("streetfix")
+    found = shutil.which("streetfix")
+    is_on_path = (found is not None and Path(found) == script) or not script.exists()
+    name = "streetfix" if is_on_path else os.path.relpath(script)
+    return shlex.join([name, *arguments])

@@ -1,0 +1,145 @@
+import json
+
+import numpy as np
+import pytest
+
+from model_training.datasets.dataset import (
+    CameraSensor,
+    Dataset,
+    DatasetDescription,
+    Sensors,
+    read_tum,
+    scan_path,
+    write_description,
+    write_tum,
+)
+from model_training.datasets.whole_folder import whole_or_not_at_all
+from service.errors import DatasetError
+from service.geometry.rigid import rotation_z, transform_from
+
+POSE = "0.000000 1 2 3 0 0 0 1"
+
+
+def make_dataset(folder):
+    """Two scans, one query set of two pairs with truth; pictures are never decoded here."""
+    camera = CameraSensor(name="front", width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
+    description = DatasetDescription(name="small", source={"kind": "test"}, sensors=Sensors(cameras=[camera]))
+    scan_path(folder, 0).parent.mkdir(parents=True)
+    for number in range(2):
+        np.arange(20, dtype=np.float32).tofile(scan_path(folder, number))
+    poses = np.stack([transform_from(rotation_z(0.3 * k), np.array([k, 2.0, 3.0])) for k in range(2)])
+    write_tum(folder / "survey" / "poses.txt", np.arange(2.0), poses)
+    queries = folder / "queries" / "drive"
+    for kind, end in (("rgb", "jpg"), ("depth", "png")):
+        (queries / kind).mkdir(parents=True)
+        for number in range(2):
+            (queries / kind / f"{number:06d}.{end}").write_bytes(b"not looked at")
+    write_tum(queries / "poses.txt", np.arange(2.0), poses)
+    write_description(folder, description)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return make_dataset(tmp_path / "small")
+
+
+def read_all(folder):
+    """Everything that reads of a dataset without decoding pictures."""
+    dataset = Dataset(folder)
+    for number in range(len(dataset.survey_poses())):
+        dataset.scan(number)
+    dataset.streets()
+    for name in dataset.query_sets():
+        list(dataset.queries(name))
+
+
+def replace_line(path, number, text):
+    lines = path.read_text().splitlines()
+    lines[number] = text
+    path.write_text("\n".join(lines) + "\n")
+
+
+def change_json(path, change):
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+DEFECTS = {
+    "description missing": ("dataset.json", lambda p: p.unlink(), "dataset.json is missing"),
+    "description is no JSON": ("dataset.json", lambda p: p.write_text("{"), "dataset.json"),
+    "description lacks the name": ("dataset.json", lambda p: change_json(p, lambda d: d.pop("name")), "dataset.json: name"),
+    "description knows more": ("dataset.json", lambda p: change_json(p, lambda d: d.update(extra=1)), "dataset.json: extra"),
+    "format of another time": ("dataset.json", lambda p: change_json(p, lambda d: d.update(format=9)), "format 9 is not 1"),
+    "no camera": ("dataset.json", lambda p: change_json(p, lambda d: d["sensors"].update(cameras=[])), "names no camera"),
+    "scan truncated": ("survey/scans/000001.bin", lambda p: p.write_bytes(p.read_bytes()[:-3]), "000001.bin: 77 bytes"),
+    "scan empty": ("survey/scans/000000.bin", lambda p: p.write_bytes(b""), "000000.bin: 0 bytes"),
+    "scan missing": ("survey/scans/000001.bin", lambda p: p.unlink(), "000001.bin is missing"),
+    "poses missing": ("survey/poses.txt", lambda p: p.unlink(), "survey/poses.txt is missing"),
+    "pose with NaN": ("survey/poses.txt", lambda p: replace_line(p, 1, "1 nan 2 3 0 0 0 1"), "poses.txt, line 2"),
+    "pose with a word": ("survey/poses.txt", lambda p: replace_line(p, 0, "0 1 2 x 0 0 0 1"), "poses.txt, line 1"),
+    "pose too short": ("survey/poses.txt", lambda p: replace_line(p, 1, "1 1 2 3 0 0 1"), "poses.txt, line 2"),
+    "pose without rotation": ("survey/poses.txt", lambda p: replace_line(p, 1, "1 1 2 3 0 0 0 0"), "poses.txt, line 2"),
+    "truth too short": ("queries/drive/poses.txt", lambda p: p.write_text(POSE + "\n"), "has 1 lines, none for 000001.jpg"),
+    "truth with infinity": ("queries/drive/poses.txt", lambda p: replace_line(p, 0, "0 inf 2 3 0 0 0 1"), "poses.txt, line 1"),
+    "depth missing": ("queries/drive/depth/000001.png", lambda p: p.unlink(), "drive/depth has no picture 000001"),
+    "streets are no JSON": ("streets.geojson", lambda p: p.write_text("{"), "streets.geojson: not JSON"),
+    "cameras too few": ("queries/drive/cameras.txt", lambda p: p.write_text("front\n"), "cameras.txt has 1 lines for 2"),
+    "camera unknown": ("queries/drive/cameras.txt", lambda p: p.write_text("front\nback\n"), "cameras.txt names 'back'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "damage", "message"), DEFECTS.values(), ids=DEFECTS)
+def test_a_defect_is_named_with_its_file(folder, file, damage, message):
+    damage(folder / file)
+    with pytest.raises(DatasetError, match=message):
+        read_all(folder)
+
+
+def test_a_whole_dataset_reads_without_complaint(folder):
+    read_all(folder)
+
+
+def test_points_that_are_not_finite_are_left_out(folder):
+    points = np.arange(20, dtype=np.float32).reshape(5, 4)
+    points[1, 2], points[3, 0] = np.nan, np.inf
+    points.tofile(scan_path(folder, 0))
+    np.testing.assert_array_equal(Dataset(folder).scan(0), points[[0, 2, 4]])
+
+
+def test_a_query_set_that_is_not_there_is_refused_with_those_that_are(folder):
+    with pytest.raises(DatasetError, match="no query set 'other'; it has: drive"):
+        list(Dataset(folder).queries("other"))
+
+
+def test_sets_without_truth_have_frames_without_pose(folder):
+    (folder / "queries" / "drive" / "poses.txt").unlink()
+    dataset = Dataset(folder)
+    assert dataset.query_sets(with_truth=True) == []
+    assert [frame.T_map_camera for frame in dataset.queries("drive")] == [None, None]
+
+
+def test_poses_survive_a_file(tmp_path):
+    rng = np.random.default_rng(0)
+    poses = np.stack([transform_from(rotation_z(a), rng.uniform(-9e3, 9e3, 3)) for a in np.linspace(-3, 3, 20)])
+    write_tum(tmp_path / "poses.txt", np.arange(20) * 0.1, poses)
+    stamps, found = read_tum(tmp_path / "poses.txt")
+    np.testing.assert_allclose(stamps, np.arange(20) * 0.1)
+    np.testing.assert_allclose(found, poses, atol=1e-8)
+
+
+def test_comments_and_blank_lines_of_tum_files_are_skipped(tmp_path):
+    (tmp_path / "poses.txt").write_text(f"# timestamp x y z qx qy qz qw\n\n{POSE}\n")
+    np.testing.assert_allclose(read_tum(tmp_path / "poses.txt")[1][0, :3, 3], [1, 2, 3])
+
+
+def test_a_folder_that_fails_half_way_is_not_there(tmp_path):
+    def write():
+        with whole_or_not_at_all(tmp_path / "out") as part:
+            (part / "half").write_text("")
+            raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="full"):
+        write()
+    assert list(tmp_path.iterdir()) == []

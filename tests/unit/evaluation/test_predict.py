@@ -1,0 +1,74 @@
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.predict import RANKED, predict
+from service.errors import DatasetError
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+from service.maps.reader import MapBundle
+
+NAME = "drive1_precise"
+
+
+@pytest.fixture(scope="module")
+def localizer(small_map):
+    return Localizer.open(MapBundle.open(small_map))
+
+
+@pytest.fixture
+def own_dataset(small_dataset, tmp_path):
+    return Dataset(shutil.copytree(small_dataset.folder, tmp_path / "own"))
+
+
+def test_every_query_gets_the_answer_that_the_localizer_gives(localizer, small_dataset):
+    found = predict(localizer, small_dataset, NAME)
+    for k, frame in enumerate(small_dataset.queries(NAME)):
+        answer = localizer.localize(
+            Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole(), ranked=RANKED)
+        )
+        np.testing.assert_allclose(found.T_answer[k], answer.T_map_camera)
+        np.testing.assert_allclose(found.ranked_xy[k, 0], answer.neighbours[0].position_m[:2])
+        assert found.street_answer[k] == answer.vote.street
+
+
+def test_truth_is_the_datasets(localizer, small_dataset):
+    found = predict(localizer, small_dataset, NAME, workers=1)
+    np.testing.assert_array_equal(found.T_true, [frame.T_map_camera for frame in small_dataset.queries(NAME)])
+    assert set(found.street_true.tolist()) <= {-1, 0, 1}
+
+
+def test_ranked_places_are_distinct(localizer, small_dataset):
+    for places in predict(localizer, small_dataset, NAME).ranked_place:
+        there = places[places >= 0]
+        assert len(set(there.tolist())) == len(there) > 1
+
+
+def test_the_number_of_workers_does_not_change_an_answer(localizer, small_dataset):
+    one, three = (predict(localizer, small_dataset, NAME, workers=workers) for workers in (1, 3))
+    np.testing.assert_array_equal(one.T_answer, three.T_answer)
+    np.testing.assert_array_equal(one.ranked_place, three.ranked_place)
+
+
+def test_a_query_without_depth_is_unanswered(localizer, own_dataset):
+    path = own_dataset.folder / "queries" / NAME / "depth" / "000002.png"
+    path.write_bytes(cv2.imencode(".png", np.zeros((72, 96), np.uint16))[1].tobytes())
+    found = predict(localizer, own_dataset, NAME)
+    assert found.localized.tolist() == [True, True, False, True, True]
+    assert np.isnan(found.T_answer[2]).all()
+    assert found.street_answer[2] == -1
+
+
+def test_a_set_without_truth_is_refused(localizer, own_dataset):
+    (own_dataset.folder / "queries" / NAME / "poses.txt").unlink()
+    with pytest.raises(DatasetError, match=r"has no poses\.txt"):
+        predict(localizer, own_dataset, NAME)
+
+
+def test_progress_is_told_for_every_query(localizer, small_dataset):
+    told = []
+    predict(localizer, small_dataset, NAME, report=lambda *event: told.append(event))
+    assert told == [(f"queries {NAME}", k, 5) for k in range(1, 6)]

@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z
+from service.imaging.level import level_camera, nominal_level
+
+CAMERA = PinholeCamera(160, 120, 80.0, 80.0, 79.5, 59.5)
+DOWN_AHEAD = np.array([0.0, 1.0, 0.0])
+
+
+def tilted(*, pitch_deg=0.0, roll_deg=0.0):
+    """R_level_camera of a camera that looks along x, pitched down and rolled."""
+    return rotation_y(np.deg2rad(pitch_deg)) @ rotation_x(np.deg2rad(roll_deg)) @ R_BODY_OPTICAL
+
+
+def ground_depth(R_level_camera, height_m, *, camera=CAMERA, reach_m=60.0):
+    """z of an endless plane ``height_m`` below the camera; 0 above the horizon."""
+    down = -(camera.rays_of_pixels() @ R_level_camera.T)[..., 2]
+    z = np.where(down > 1e-6, height_m / np.maximum(down, 1e-6), 0.0)
+    return np.where(z < reach_m, z, 0.0).astype(np.float32)
+
+
+def angle_deg(R, other):
+    return np.rad2deg(np.arccos(np.clip((np.trace(R.T @ other) - 1) / 2, -1, 1)))
+
+
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0, 0), (3, 0), (-3, 0), (0, 4), (2, -3)])
+def test_a_tilted_camera_over_a_plane_finds_its_tilt(pitch_deg, roll_deg):
+    R = tilted(pitch_deg=pitch_deg, roll_deg=roll_deg)
+    found = level_camera(ground_depth(R, 1.5), CAMERA, down_camera=None, nominal_height_m=1.5)
+    up = found.R_level_camera @ R.T @ [0, 0, 1]
+    assert np.rad2deg(np.arccos(min(1.0, up[2]))) < 0.3
+
+
+@pytest.mark.parametrize("height_m", [1.2, 1.5, 1.9])
+def test_a_camera_over_a_plane_finds_its_height(height_m):
+    R = tilted(pitch_deg=2)
+    found = level_camera(ground_depth(R, height_m), CAMERA, down_camera=None, nominal_height_m=1.5)
+    assert found.height_m == pytest.approx(height_m, abs=0.05)
+
+
+def test_the_view_keeps_the_heading_of_the_optical_axis():
+    found = level_camera(
+        ground_depth(tilted(pitch_deg=3, roll_deg=4), 1.5), CAMERA, down_camera=None, nominal_height_m=1.5
+    )
+    axis = found.R_level_camera[:, 2]
+    assert axis[1] == pytest.approx(0.0, abs=1e-9)
+    assert axis[0] > 0.9
+
+
+def test_without_ground_the_prior_stands():
+    found = level_camera(np.zeros((120, 160), np.float32), CAMERA, down_camera=None, nominal_height_m=1.4)
+    np.testing.assert_allclose(found.R_level_camera, R_BODY_OPTICAL, atol=1e-12)
+    assert found.height_m == pytest.approx(1.4)
+
+
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(25, 0), (-20, 10)])
+def test_gravity_stands_in_for_a_ground_that_is_not_seen(pitch_deg, roll_deg):
+    R = tilted(pitch_deg=pitch_deg, roll_deg=roll_deg)
+    down = R.T @ np.array([0.0, 0.0, -9.81])
+    found = level_camera(np.zeros((120, 160), np.float32), CAMERA, down_camera=down, nominal_height_m=1.5)
+    np.testing.assert_allclose(found.R_level_camera @ R.T @ [0, 0, 1], [0, 0, 1], atol=1e-9)
+
+
+def test_gravity_lets_a_strongly_tilted_camera_find_the_ground():
+    R = tilted(pitch_deg=20, roll_deg=8)
+    found = level_camera(ground_depth(R, 1.7), CAMERA, down_camera=R.T @ [0.0, 0.0, -1.0], nominal_height_m=1.5)
+    assert found.height_m == pytest.approx(1.7, abs=0.05)
+    assert angle_deg(found.R_level_camera, nominal_level(R.T @ np.array([0.0, 0.0, -1.0]))) < 0.3
+
+
+def test_the_foot_of_a_wall_seven_metres_ahead_tilts_the_ground_by_a_degree_and_a_half_at_most():
+    R = tilted(pitch_deg=2)
+    depth = np.minimum(np.where(ground_depth(R, 1.5) > 0, ground_depth(R, 1.5), np.inf), 7.0).astype(np.float32)
+    found = level_camera(depth, CAMERA, down_camera=None, nominal_height_m=1.5)
+    up = found.R_level_camera @ R.T @ [0, 0, 1]
+    assert np.rad2deg(np.arccos(min(1.0, up[2]))) < 1.5
+    assert found.height_m == pytest.approx(1.5, abs=0.08)
+
+
+def test_depth_of_another_size_gives_the_same_level():
+    R = tilted(pitch_deg=3, roll_deg=2)
+    small = CAMERA.scaled_to(80, 60)
+    one = level_camera(ground_depth(R, 1.6), CAMERA, down_camera=None, nominal_height_m=1.5)
+    other = level_camera(ground_depth(R, 1.6, camera=small), CAMERA, down_camera=None, nominal_height_m=1.5)
+    assert angle_deg(one.R_level_camera, other.R_level_camera) < 0.2
+    assert other.height_m == pytest.approx(one.height_m, abs=0.02)
+
+
+def test_the_nominal_level_of_a_camera_ahead_is_the_bodys():
+    np.testing.assert_allclose(nominal_level(2.0 * DOWN_AHEAD), R_BODY_OPTICAL, atol=1e-12)
+
+
+def test_the_nominal_level_is_a_rotation_whose_third_row_is_up():
+    down = rotation_z(0.1) @ rotation_x(-0.4) @ DOWN_AHEAD
+    R = nominal_level(down)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(R[2], -down, atol=1e-12)

@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+
+from service.imaging.view_grid import (
+    PLANES,
+    ViewGrid,
+    heights_of,
+    panorama_from_points,
+    ranges_from_panorama,
+    survey_planes,
+)
+
+GRID = ViewGrid(rows=9, columns=16)
+
+
+def points_at(elevation_deg, azimuth_deg, range_m):
+    elevation, azimuth = np.deg2rad(np.atleast_1d(elevation_deg)), np.deg2rad(np.atleast_1d(azimuth_deg))
+    flat = np.cos(elevation)
+    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    return (rays * np.atleast_1d(range_m)[:, None]).astype(np.float32)
+
+
+def view_of(points, heading_deg=0.0):
+    return ranges_from_panorama(panorama_from_points(points, GRID), float(np.deg2rad(heading_deg)), GRID)
+
+
+def test_rows_run_from_the_top_to_the_bottom():
+    np.testing.assert_allclose(np.rad2deg(GRID.elevations_rad[[0, 4, 8]]), [15, 0, -15], atol=1e-9)
+
+
+def test_azimuth_grows_to_the_left():
+    np.testing.assert_allclose(np.rad2deg(GRID.azimuths_rad[[0, 15]]), [45 - 90 / 32, -45 + 90 / 32])
+
+
+def test_rays_of_cells_are_unit_and_look_where_the_cell_lies():
+    rays = GRID.rays_level()
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1.0)
+    elevation, azimuth = np.arcsin(rays[..., 2]), np.arctan2(rays[..., 1], rays[..., 0])
+    np.testing.assert_allclose(elevation, np.broadcast_to(GRID.elevations_rad[:, None], elevation.shape))
+    np.testing.assert_allclose(azimuth, np.broadcast_to(GRID.azimuths_rad, azimuth.shape))
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 15), (4, 7), (8, 3)])
+def test_a_point_lands_in_the_cell_of_its_ray_with_its_range(row, column):
+    azimuth_deg = np.rad2deg(GRID.azimuths_rad[column])
+    view = view_of(points_at(np.rad2deg(GRID.elevations_rad[row]), azimuth_deg, 12.5))
+    assert view[row, column] == pytest.approx(12.5, abs=1e-4)
+    # The panorama is twice as dense as a view: a neighbour may see the point, no other cell does.
+    view[row, max(0, column - 1) : column + 2] = 0
+    assert not view.any()
+
+
+def test_of_two_points_in_a_cell_the_one_nearer_to_its_ray_counts():
+    elevation, azimuth = np.rad2deg(GRID.elevations_rad[4]), np.rad2deg(GRID.azimuths_rad[5])
+    view = view_of(points_at([elevation + 1.5, elevation + 0.2, elevation - 1.2], [azimuth] * 3, [7.0, 9.0, 8.0]))
+    assert view[4, 5] == pytest.approx(9.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("columns", [1, 10, 32, 64, -43, 130])
+def test_a_view_shifts_with_its_heading(columns):
+    step_deg = 360.0 / GRID.around
+    azimuths = np.arange(GRID.around) * step_deg
+    ranges = np.random.default_rng(1).uniform(3, 30, GRID.around)
+    turned = view_of(points_at(np.zeros(GRID.around), azimuths + columns * step_deg, ranges), columns * step_deg)
+    np.testing.assert_allclose(turned, view_of(points_at(np.zeros(GRID.around), azimuths, ranges)), atol=1e-4)
+
+
+def test_a_thing_moves_to_the_right_as_the_heading_turns_left():
+    thing = points_at(np.zeros(9), np.linspace(-6, 6, 9), np.full(9, 10.0))
+    columns = [np.flatnonzero(view_of(thing, heading)[4]).mean() for heading in (-30.0, -15.0, 0.0, 15.0, 30.0)]
+    assert (np.diff(columns) > 1).all()
+
+
+def test_the_panorama_closes_over_its_seam():
+    view = view_of(points_at(np.zeros(9), np.linspace(174, 186, 9), np.full(9, 10.0)), 180.0)
+    np.testing.assert_allclose(view[4, 7:9], 10.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("range_m", [0.3, 40.5, 90.0])
+def test_what_lies_outside_the_limits_is_no_measurement(range_m):
+    assert not view_of(points_at(0.0, 0.0, range_m)).any()
+
+
+@pytest.mark.parametrize("elevation_deg", [18.0, -18.0])
+def test_what_lies_above_or_below_the_rows_is_left_out(elevation_deg):
+    assert not view_of(points_at(elevation_deg, 0.0, 10.0)).any()
+
+
+@pytest.mark.parametrize("gap", [1, 2, 3])
+def test_rows_between_beams_are_filled_on_one_surface(gap):
+    elevations = np.rad2deg(GRID.elevations_rad)
+    azimuth = np.rad2deg(GRID.azimuths_rad[7])
+    view = view_of(points_at([elevations[2], elevations[3 + gap]], [azimuth] * 2, [10.0, 10.8]))
+    share = np.arange(1, gap + 1) / (gap + 1)
+    np.testing.assert_allclose(view[3 : 3 + gap, 7], 10.0 + 0.8 * share, atol=1e-4)
+
+
+def test_rows_between_beams_stay_empty_between_two_surfaces():
+    elevations = np.rad2deg(GRID.elevations_rad)
+    azimuth = np.rad2deg(GRID.azimuths_rad[7])
+    view = view_of(points_at([elevations[2], elevations[4]], [azimuth] * 2, [10.0, 14.0]))
+    assert view[3, 7] == 0
+
+
+def test_wide_gaps_between_beams_stay_empty():
+    elevations = np.rad2deg(GRID.elevations_rad)
+    azimuth = np.rad2deg(GRID.azimuths_rad[7])
+    view = view_of(points_at([elevations[1], elevations[6]], [azimuth] * 2, [10.0, 10.0]))
+    assert not view[2:6].any()
+
+
+def test_a_single_missing_column_is_filled_on_one_surface_only():
+    step = 360.0 / GRID.around
+    first = -180.0 + step * (GRID.around // 2)
+    same = panorama_from_points(points_at([0, 0], [first, first + 2 * step], [10.0, 10.6]), GRID)
+    other = panorama_from_points(points_at([0, 0], [first, first + 2 * step], [10.0, 12.0]), GRID)
+    assert same[4, GRID.around // 2 + 1] == pytest.approx(10.3, abs=1e-3)
+    assert other[4, GRID.around // 2 + 1] == 0
+
+
+def test_an_empty_scan_gives_an_empty_panorama():
+    assert not panorama_from_points(np.zeros((0, 3), np.float32), GRID).any()
+
+
+def test_heights_count_from_the_ground_and_only_where_something_was_measured():
+    ranges = np.zeros((9, 16), np.float32)
+    ranges[0, 0], ranges[8, 1] = 10.0, 4.0
+    heights = heights_of(ranges, 1.8, GRID)
+    sine = np.sin(np.deg2rad(15))
+    assert heights[0, 0] == pytest.approx(1.8 + 10 * sine, abs=1e-5)
+    assert heights[8, 1] == pytest.approx(1.8 - 4 * sine, abs=1e-5)
+    assert np.count_nonzero(heights) == 2
+
+
+def test_planes_of_a_survey_view_have_no_colour_and_are_blank_in_rows_that_it_does_not_see():
+    ranges = np.full((9, 16), 10.0, np.float32)
+    rows_seen = np.arange(9) > 2
+    planes = dict(zip(PLANES, survey_planes(ranges, sensor_height_m=1.8, rows_seen=rows_seen, grid=GRID), strict=True))
+    assert not planes["v1"].any()
+    assert not planes["v2"].any()
+    for name in ("range_m", "height_m", "observed"):
+        assert not planes[name][:3].any()
+    assert (planes["observed"][3:] == 1).all()
+    assert (planes["range_m"][3:] == 10).all()
+
+
+def test_survey_planes_forget_what_lies_beyond_the_limit():
+    ranges = np.full((9, 16), 41.0, np.float32)
+    planes = survey_planes(ranges, sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
+    assert not planes[[0, 3]].any()

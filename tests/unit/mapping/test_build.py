@@ -1,0 +1,173 @@
+import shutil
+
+import numpy as np
+import pytest
+
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.build import BuildSettings, build_map, describe, fan, thinned, view_ranges
+from service.errors import BundleError, DatasetError, EncoderError
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+from service.maps.reader import MapBundle
+
+SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0)
+
+
+def track(steps_m):
+    poses = np.tile(np.eye(4), (len(steps_m) + 1, 1, 1))
+    poses[1:, 0, 3] = np.cumsum(steps_m)
+    return poses
+
+
+@pytest.fixture(scope="module")
+def bundle(small_map):
+    return MapBundle.open(small_map)
+
+
+@pytest.mark.parametrize(
+    ("steps_m", "spacing_m", "kept"),
+    [
+        ([1.0] * 4, 1.0, [0, 1, 2, 3, 4]),
+        ([0.06] * 50, 1.0, [0, 17, 34]),
+        ([0.4] * 6, 1.0, [0, 3, 6]),
+        ([5.0, 0.2, 5.0], 1.0, [0, 1, 3]),
+    ],
+)
+def test_places_stand_the_spacing_apart_along_the_way(steps_m, spacing_m, kept):
+    assert thinned(track(steps_m), spacing_m).tolist() == kept
+
+
+def test_a_standing_vehicle_makes_one_place():
+    assert thinned(track([0.0] * 9), 1.0).tolist() == [0]
+
+
+def test_a_fan_goes_all_round_in_even_steps():
+    np.testing.assert_allclose(np.rad2deg(fan(6)), [0, 60, 120, 180, 240, 300])
+
+
+def test_a_built_map_opens_and_verifies_with_the_right_counts(small_dataset, bundle):
+    places = len(thinned(small_dataset.survey_poses(), 5.0))
+    counts = bundle.manifest.counts
+    assert (counts.places, counts.views, counts.descriptor_size) == (places, 6 * places, 16)
+    assert counts.streets == len(small_dataset.streets()["features"])
+    assert counts.cloud_points > 1000
+
+
+def test_places_lie_where_the_survey_drove(small_dataset, bundle):
+    np.testing.assert_allclose(bundle.T_map_place[:, :2, 3], small_dataset.survey_poses()[:, :2, 3], atol=0.2)
+
+
+def test_places_know_their_street(bundle):
+    assert set(bundle.place_street.tolist()) <= {0, 1}
+    assert np.mean(bundle.place_street >= 0) == 1.0
+
+
+def test_rows_above_a_lidar_that_looks_down_are_not_seen(bundle):
+    elevations = np.rad2deg(bundle.grid.elevations_rad)
+    assert not bundle.rows_seen[elevations > 5].any()
+    assert bundle.rows_seen[elevations < 0].all()
+
+
+def test_views_of_a_place_look_in_different_directions(bundle):
+    of_one = np.rad2deg(bundle.view_heading_rad[bundle.view_place == 2])
+    turns = np.sort((of_one - of_one[0]) % 360)
+    np.testing.assert_allclose(turns, np.arange(6) * 60, atol=1e-6)
+
+
+def test_the_ground_under_every_place_lies_one_lidar_height_below(small_dataset, bundle):
+    height_m = bundle.manifest.lidar_height_m
+    assert height_m == pytest.approx(1.8, abs=0.1)
+    written = small_dataset.survey_poses()[:, 2, 3]
+    np.testing.assert_allclose(bundle.T_map_place[:, 2, 3], written, atol=0.15)
+
+
+def test_the_same_build_twice_has_the_same_version(small_dataset, encoder_file, bundle, tmp_path):
+    again = build_map(small_dataset, encoder_file, tmp_path / "again", SETTINGS, threads=1)
+    assert again.version == bundle.manifest.version
+
+
+def test_another_spacing_has_another_version_and_fewer_places(small_dataset, encoder_file, bundle, tmp_path):
+    settings = BuildSettings(name="small", headings=6, spacing_m=15.0)
+    other = build_map(small_dataset, encoder_file, tmp_path / "other", settings, threads=1)
+    assert other.version != bundle.manifest.version
+    assert other.counts.places < bundle.manifest.counts.places
+    assert other.spacing_m == 15.0
+
+
+def test_weather_removal_is_recorded(small_dataset, encoder_file, tmp_path):
+    settings = BuildSettings(name="dry", headings=2, spacing_m=20.0, remove_weather=True)
+    assert (
+        build_map(small_dataset, encoder_file, tmp_path / "dry", settings, threads=1).parameters["weather_removed"]
+        == 1.0
+    )
+
+
+def test_progress_is_told_for_every_place(small_dataset, encoder_file, bundle, tmp_path):
+    told = []
+    build_map(
+        small_dataset, encoder_file, tmp_path / "told", SETTINGS, threads=1, report=lambda *event: told.append(event)
+    )
+    count = bundle.manifest.counts.places
+    assert told == [("places", k, count) for k in range(1, count + 1)]
+
+
+def test_pictures_of_another_drive_are_answered(small_dataset, bundle):
+    """An untrained encoder: that there is an answer, not that it is right."""
+    localizer = Localizer.open(bundle)
+    for frame in small_dataset.queries("drive1_precise"):
+        answer = localizer.localize(Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole()))
+        assert np.isfinite(answer.T_map_camera).all()
+        assert answer.vote is not None
+        assert len(answer.neighbours) == 5
+
+
+def test_view_ranges_are_blank_in_rows_that_are_not_seen(small_dataset, bundle):
+    fans = list(view_ranges(small_dataset, SETTINGS, bundle.grid, bundle.rows_seen))
+    assert len(fans) == bundle.manifest.counts.places
+    assert fans[0].shape == (6, 8, 16)
+    assert not fans[0][:, ~bundle.rows_seen].any()
+    assert fans[0][:, bundle.rows_seen].any()
+
+
+def test_a_map_that_is_there_is_not_replaced_unasked(small_dataset, encoder_file, small_map):
+    with pytest.raises(BundleError, match="exists"):
+        build_map(small_dataset, encoder_file, small_map, SETTINGS, threads=1)
+
+
+@pytest.fixture
+def own_dataset(small_dataset, tmp_path):
+    return shutil.copytree(small_dataset.folder, tmp_path / "own")
+
+
+def test_an_empty_survey_is_refused(own_dataset, encoder_file, tmp_path):
+    (own_dataset / "survey" / "poses.txt").write_text("")
+    with pytest.raises(DatasetError, match=r"poses\.txt is empty"):
+        build_map(Dataset(own_dataset), encoder_file, tmp_path / "out", SETTINGS, threads=1)
+
+
+def test_a_truncated_scan_is_named_and_no_map_appears(own_dataset, encoder_file, tmp_path):
+    path = own_dataset / "survey" / "scans" / "000003.bin"
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(DatasetError, match=r"000003\.bin"):
+        build_map(Dataset(own_dataset), encoder_file, tmp_path / "out", SETTINGS, threads=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_scans_in_millimetres_are_refused_with_a_hint(own_dataset, encoder_file, tmp_path):
+    for path in (own_dataset / "survey" / "scans").iterdir():
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        points[:, :3] *= 1000
+        points.tofile(path)
+    with pytest.raises(DatasetError, match="check units and axes"):
+        build_map(Dataset(own_dataset), encoder_file, tmp_path / "out", SETTINGS, threads=1)
+
+
+def test_a_file_that_is_no_encoder_is_refused(small_dataset, tmp_path):
+    (tmp_path / "encoder.onnx").write_bytes(b"nothing of the kind")
+    with pytest.raises(EncoderError):
+        build_map(small_dataset, tmp_path / "encoder.onnx", tmp_path / "out", SETTINGS, threads=1)
+
+
+def test_a_map_is_described_in_one_line(bundle):
+    text = describe(bundle.manifest)
+    assert text.startswith(f"map small, version {bundle.manifest.version}: {bundle.manifest.counts.places} places")

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+
+from model_training.mapping.voxel_map import TILE_M, VoxelMap
+
+
+def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
+    voxels = VoxelMap(voxel_m, np.array(origin))
+    for cloud in clouds:
+        voxels.add(np.asarray(cloud, np.float64))
+    return voxels
+
+
+def slow_surfels(points, *, voxel_m=0.5, origin=(100.0, -50.0, 2.0), fewest=5):
+    """Voxel by voxel: mean of its points; normal and thickness of those in it and its 26 neighbours."""
+    cells = np.floor((points - np.array(origin)) / voxel_m).astype(int)
+    rows = []
+    for cell in np.unique(cells, axis=0):
+        own = points[(cells == cell).all(axis=1)]
+        around = points[(np.abs(cells - cell) <= 1).all(axis=1)]
+        if len(around) >= fewest:
+            variances, axes = np.linalg.eigh(np.cov(around, rowvar=False, bias=True))
+            rows.append((own.mean(axis=0), axes[:, 0], np.sqrt(max(variances[0], 0)), len(own)))
+    return rows
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    rng = np.random.default_rng(0)
+    wall = np.stack([rng.uniform(98, 104, 900), np.full(900, -48.0), rng.uniform(0, 3, 900)], axis=1)
+    return np.concatenate([wall + rng.normal(0, 0.03, wall.shape), rng.uniform([97, -52, 0], [104, -46, 4], (60, 3))])
+
+
+def test_surfels_are_those_of_a_slow_loop(cloud):
+    found, expected = map_of(cloud).surfels(), slow_surfels(cloud)
+    assert len(found.positions) == len(expected)
+    order = np.lexsort(np.array([row[0] for row in expected]).T)
+    mine = np.lexsort(found.positions.T)
+    for k, (position, normal, thickness, count) in zip(mine, (expected[j] for j in order), strict=True):
+        np.testing.assert_allclose(found.positions[k], position, atol=1e-9)
+        assert abs(found.normals[k] @ normal) == pytest.approx(1.0, abs=1e-4)
+        assert found.thickness_m[k] == pytest.approx(thickness, abs=1e-5)
+        assert found.points[k] == count
+
+
+def test_scan_by_scan_gives_the_same_as_all_at_once(cloud):
+    one, parts = map_of(cloud).surfels(), map_of(*np.array_split(cloud, 150)).surfels()
+    np.testing.assert_allclose(parts.positions, one.positions, atol=1e-9)
+    np.testing.assert_allclose(parts.thickness_m, one.thickness_m, atol=1e-5)
+    np.testing.assert_array_equal(parts.points, one.points)
+
+
+def test_the_normal_of_a_plane_is_square_to_it():
+    rng = np.random.default_rng(1)
+    normal = np.array([1.0, 2.0, 2.0]) / 3
+    flat = rng.uniform(-2, 2, (6000, 3))
+    flat -= np.outer(flat @ normal, normal)
+    found = map_of(flat + [100, -50, 2]).surfels(fewest=30)
+    assert np.abs(found.normals @ normal).min() > 0.999
+    assert found.thickness_m.max() < 1e-3
+
+
+def test_thickness_is_the_deviation_across_the_plane():
+    rng = np.random.default_rng(2)
+    slab = np.stack(
+        [rng.uniform(98, 102, 40000), rng.uniform(-52, -48, 40000), 2.2 + rng.normal(0, 0.05, 40000)], axis=1
+    )
+    found = map_of(slab).surfels(fewest=500)
+    assert np.median(found.thickness_m) == pytest.approx(0.05, rel=0.1)
+
+
+def test_lonely_points_make_no_surfel():
+    assert len(map_of([[101.0, -49.0, 3.0]] * 4).surfels().positions) == 0
+
+
+def test_tiles_hold_every_surfel_once_and_within_their_edges():
+    rng = np.random.default_rng(3)
+    voxels = map_of(rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3)), voxel_m=2.0)
+    surfels = voxels.surfels()
+    tiled = voxels.tiles(surfels)
+    rows, own = tiled["tiles"], tiled["surfels"]
+    assert rows[:, 4].sum() == len(own) == len(surfels.positions)
+    np.testing.assert_array_equal(rows[:, 3], np.r_[0, np.cumsum(rows[:, 4])[:-1]])
+    restored = own["xyz"] + np.repeat(rows[:, :3], rows[:, 4].astype(int), axis=0)
+    np.testing.assert_allclose(
+        restored[np.lexsort(restored.T)], surfels.positions[np.lexsort(surfels.positions.T)], atol=1e-4
+    )
+    assert np.abs(own["xyz"][:, :2]).max() <= TILE_M
+
+
+def test_coordinates_far_from_zero_lose_nothing():
+    far = np.array([412_345.0, 5_654_321.0, 250.0])
+    rng = np.random.default_rng(4)
+    cloud = rng.uniform(-2, 2, (500, 3))
+    near_found = map_of(cloud, origin=(0, 0, 0)).surfels()
+    far_found = map_of(cloud + far, origin=far).surfels()
+    np.testing.assert_allclose(far_found.positions - far, near_found.positions, atol=1e-6)

@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+
+from model_training.simulation.blocker import Blocker
+from model_training.simulation.camera import take, unit_rays
+from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.meshes import Material, MeshBuilder
+from model_training.simulation.scene import Scene
+from model_training.simulation.shading import Light, shade
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+from service.imaging.view_grid import ViewGrid
+
+CAMERA = PinholeCamera(96, 72, 48.0, 48.0, 47.5, 35.5)
+GRID = ViewGrid()
+
+
+def pose(*, heading_deg=0.0, x_m=0.0, z_m=1.5):
+    return transform_from(rotation_z(np.deg2rad(heading_deg)) @ R_BODY_OPTICAL, np.array([x_m, 0.0, z_m]))
+
+
+def picture_of(wall, condition_name="clear", *, seed=0, T_map_camera=None, blocker=None):
+    condition = CONDITIONS[condition_name]
+    rays, z = unit_rays(CAMERA)
+    light = Light.of(condition, np.random.default_rng(seed))
+    return take(
+        wall.scene, wall.ground, CAMERA, pose() if T_map_camera is None else T_map_camera, light, condition,
+        np.random.default_rng(seed), rays_camera=rays, z_of_ray=z, blocker=blocker,
+    )  # fmt: skip
+
+
+def test_depth_of_a_wall_square_to_the_axis_is_its_distance(wall):
+    depth_m = picture_of(wall).depth_m
+    np.testing.assert_allclose(depth_m, wall.x_m, rtol=1e-5)
+
+
+def test_the_sky_has_no_depth(wall):
+    assert not picture_of(wall, T_map_camera=pose(heading_deg=180)).depth_m.any()
+
+
+def test_pictures_are_neither_black_nor_white(wall):
+    rgb = picture_of(wall).rgb
+    assert 60 < rgb.mean() < 210
+
+
+def test_matte_walls_are_blank_to_stereo_and_the_sky_is_not(wall):
+    assert picture_of(wall).blank.all()
+    assert not picture_of(wall, T_map_camera=pose(heading_deg=180)).blank.any()
+
+
+def linear_light(wall, condition_name, azimuth_deg, *, x_m):
+    """Light from the wall at an azimuth off the optical axis."""
+    azimuth = np.deg2rad(azimuth_deg)
+    rays = np.array([[np.cos(azimuth), np.sin(azimuth), 0.0]], np.float32)
+    origin, condition = np.array([x_m, 0.0, 1.5]), CONDITIONS[condition_name]
+    light = Light.of(condition, np.random.default_rng(0))
+    colour = shade(
+        wall.scene,
+        wall.ground,
+        origin,
+        rays,
+        wall.scene.hits(origin, rays),
+        light,
+        condition,
+        forward=np.array([1.0, 0, 0]),
+    )
+    return float(colour.mean())
+
+
+def test_night_is_dark_beyond_the_headlights(wall):
+    night, clear = (linear_light(wall, name, 40.0, x_m=12.0) for name in ("night", "clear"))
+    assert night < 0.05 * clear
+
+
+def test_headlights_light_what_is_near_and_ahead(wall):
+    near = linear_light(wall, "night", 0.0, x_m=14.0)
+    assert near > 5 * linear_light(wall, "night", 0.0, x_m=-30.0)
+    assert near > 20 * linear_light(wall, "night", 40.0, x_m=14.0)
+
+
+def test_fog_pales_what_is_far(wall):
+    """At a distance beyond the visibility the wall takes the colour of the air."""
+    light = Light.of(CONDITIONS["fog"], np.random.default_rng(0))
+    assert linear_light(wall, "fog", 0.0, x_m=-60.0) == pytest.approx(float(light.horizon.mean()), rel=0.02)
+
+
+def test_rain_and_snow_are_seen_in_the_air(wall):
+    for name in ("rain", "snow"):
+        picture = picture_of(wall, name).rgb.astype(float).mean(axis=2)
+        still = picture_of(wall, "clear").rgb.astype(float).mean(axis=2)
+        assert np.percentile(picture, 99) - np.median(picture) > 1.5 * (np.percentile(still, 99) - np.median(still))
+
+
+def test_a_shadow_falls_away_from_the_sun():
+    builder = MeshBuilder()
+    ground = np.array([[[-50, -50, 0], [50, -50, 0], [50, 50, 0]], [[-50, -50, 0], [50, 50, 0], [-50, 50, 0]]], float)
+    builder.triangles(ground, np.full(3, 0.4), Material.MATTE)
+    builder.box(np.array([0.0, 0.0, 0.0]), (1.0, 1.0, 4.0), 0.0, np.full(3, 0.4), Material.MATTE)
+    scene = Scene(builder.mesh())
+    toward_sun = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
+    lit = scene.lit(np.array([[-2.0, 0.0, 0.05], [2.0, 0.0, 0.05]], np.float32), toward_sun)
+    assert lit.tolist() == [False, True]
+
+
+def columns_behind(blocker, T_map_camera):
+    """Share of the view grid's columns that the body stops at the height of the camera."""
+    azimuths = GRID.azimuths_rad
+    rays_level = np.stack([np.cos(azimuths), np.sin(azimuths), np.zeros(len(azimuths))], axis=1)
+    R_map_level = T_map_camera[:3, :3] @ R_BODY_OPTICAL.T
+    distances = blocker.scene.distances(T_map_camera[:3, 3], rays_level @ R_map_level.T)
+    return np.mean(distances > 0), distances[distances > 0]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_blocker_hides_the_wanted_share_of_the_columns(seed):
+    T = pose(heading_deg=30.0 * seed)
+    share, _ = columns_behind(Blocker.before(T, 0.0, 0.25, np.random.default_rng(seed)), T)
+    assert share == pytest.approx(0.25, abs=0.03)
+
+
+def test_a_blocker_stands_three_to_eight_metres_away():
+    T = pose()
+    nearest = [
+        columns_behind(Blocker.before(T, 0.0, 0.25, np.random.default_rng(seed)), T)[1].min() for seed in range(30)
+    ]
+    assert min(nearest) >= 2.99
+    assert max(nearest) <= 8.01
+
+
+def test_a_blocker_is_in_depth_and_colour(wall):
+    T = pose()
+    blocked = picture_of(wall, blocker=Blocker.before(T, 0.0, 0.25, np.random.default_rng(1)))
+    hidden = blocked.depth_m < 10
+    assert 0.1 < hidden.mean() < 0.4
+    contrast = np.abs(blocked.rgb[hidden].mean(axis=0) - blocked.rgb[~hidden].mean(axis=0)).max()
+    assert contrast > 5
+
+
+def test_one_seed_gives_one_picture(wall):
+    one, other = picture_of(wall, "snow", seed=4), picture_of(wall, "snow", seed=4)
+    np.testing.assert_array_equal(one.rgb, other.rgb)

@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+
+from model_training.simulation.drives import driven, query_candidates, survey_of
+from model_training.simulation.plan import QueryPlan
+from model_training.simulation.traversal import stations, survey_error
+from service.errors import DatasetError
+from service.geometry.rigid import heading_of_body, heading_of_camera, inverse
+
+
+@pytest.fixture
+def plan(plan_of):
+    return plan_of(seed=5, size_m=(160.0, 160.0), spacing_m=1.0)
+
+
+QUERY = QueryPlan(name="a", traversal=1, count=100)
+
+
+def offsets(city, plan, query):
+    """Of every candidate: metres aside and ahead of the station it belongs to, degrees off the street (either way)."""
+    survey = survey_of(city, plan)
+    candidates = query_candidates(city, plan, query, survey)
+    order = np.random.default_rng([plan.seed, 22, query.traversal, 0]).permutation(len(survey.stations))
+    rows = []
+    for T, k in zip(candidates, order, strict=False):
+        station = survey.stations[k]
+        ahead = np.array([np.cos(station.heading), np.sin(station.heading)])
+        away = T[:2, 3] - [station.x, station.y]
+        turn = np.rad2deg(heading_of_camera(T) - station.heading)
+        rows.append((away @ [ahead[1], -ahead[0]], away @ ahead, (turn + 90) % 180 - 90, np.cos(np.deg2rad(turn)) > 0))
+    return np.array(rows, float)
+
+
+def test_queries_stand_within_two_metres_of_the_lane(city, plan):
+    aside, ahead, _, _ = offsets(city, plan, QUERY).T
+    assert np.abs(aside).max() <= 2.0
+    assert np.abs(aside).max() > 1.8
+    assert np.abs(ahead).max() <= 0.7
+
+
+def test_queries_look_within_fifteen_degrees_of_the_street(city, plan):
+    turn = offsets(city, plan, QUERY)[:, 2]
+    assert 13 < np.abs(turn).max() < 15.5  # half a degree for the sway on a slope
+
+
+def test_queries_go_both_ways(city, plan):
+    assert offsets(city, plan, QUERY)[:, 3].mean() == pytest.approx(0.5, abs=0.1)
+
+
+def test_cameras_ride_at_their_height_above_the_ground(city, plan):
+    T = query_candidates(city, plan, QUERY, survey_of(city, plan))
+    heights = np.array([t[2, 3] - city.height(t[0, 3], t[1, 3]) for t in T])
+    assert heights.mean() == pytest.approx(1.5, abs=0.03)
+    assert heights.std() == pytest.approx(0.1, rel=0.2)
+
+
+def test_a_turned_camera_is_turned_against_the_vehicle(city, plan):
+    turned = QUERY.model_copy(update={"turn_deg": 30.0})
+    assert offsets(city, plan, turned)[:, 2].mean() == pytest.approx(30.0, abs=1.5)
+
+
+def test_other_traversals_stand_elsewhere(city, plan):
+    survey = survey_of(city, plan)
+    one, other = (query_candidates(city, plan, QUERY.model_copy(update={"traversal": t}), survey) for t in (1, 2))
+    assert np.abs(one[:50, :2, 3] - other[:50, :2, 3]).min() > 1e-6
+
+
+def test_queries_on_the_track_stand_below_the_surveys_lidar(city, plan):
+    survey = survey_of(city, plan)
+    T_map_camera = query_candidates(city, plan, QueryPlan(name="a", traversal=0, count=9, on_track=True), survey)
+    own = {tuple(np.round(T[:2, 3], 6)): T for T in survey.T_map_lidar}
+    for T in T_map_camera[:20]:
+        nearest = min(own, key=lambda xy: np.hypot(*(np.array(xy) - T[:2, 3])))
+        in_lidar = inverse(own[nearest]) @ T
+        np.testing.assert_allclose(in_lidar[:3, 3], [0, 0, -0.3], atol=1e-9)
+        np.testing.assert_allclose(in_lidar[:3, 2], [1, 0, 0], atol=1e-9)
+
+
+def test_stations_stand_a_step_apart_in_each_street(city):
+    track = stations(city, 2.0)
+    steps = np.diff([s.travelled for s in track])
+    assert np.median(steps) == pytest.approx(2.0)
+    assert steps.max() <= 2.0 + 1e-6
+
+
+def test_only_the_wanted_streets_are_driven(city, plan):
+    part = driven(city, plan.model_copy(update={"streets": ("2",)}), 1.0)
+    line = next(street for street in city.streets if street.street == "2").lines[0]
+    distances = [np.linalg.norm(line - [s.x, s.y], axis=1).min() for s in part]
+    assert max(distances) < 2.5
+    assert len(part) < len(driven(city, plan, 1.0))
+
+
+def test_the_lidar_stands_upright_on_the_slope_but_for_its_sway(city, plan):
+    survey = survey_of(city, plan)
+    tilts = [
+        np.rad2deg(np.arccos(min(1.0, T[:3, 2] @ city.terrain.normal(T[:2, 3])))) for T in survey.T_map_lidar
+    ]  # fmt: skip
+    assert 0.2 < np.mean(tilts) < 0.8
+    turns = [heading_of_body(T) - s.heading for T, s in zip(survey.T_map_lidar, survey.stations, strict=True)]
+    assert np.abs(np.angle(np.exp(1j * np.array(turns)))).max() < np.deg2rad(0.3)
+
+
+def errors(*, length_m=4000.0, seed=0):
+    transforms = np.array(survey_error(np.arange(0.0, length_m, 1.0), np.random.default_rng(seed)))
+    angles = np.stack([transforms[:, 2, 1], transforms[:, 0, 2], transforms[:, 1, 0]], axis=1)
+    return transforms[:, :3, 3], np.rad2deg(angles)
+
+
+def test_the_survey_error_has_the_stated_size():
+    position_m, angle_deg = errors()
+    np.testing.assert_allclose(position_m.std(axis=0), 0.03, rtol=0.15)
+    np.testing.assert_allclose(angle_deg.std(axis=0), 0.05, rtol=0.15)
+
+
+def test_the_survey_error_is_smooth():
+    position_m, angle_deg = errors()
+    assert np.abs(np.diff(position_m, axis=0)).max() < 0.015
+    assert np.abs(np.diff(angle_deg, axis=0)).max() < 0.025
+
+
+def test_written_poses_are_the_true_ones_without_the_error(city, plan):
+    survey = survey_of(city, plan.model_copy(update={"survey_error": False}))
+    np.testing.assert_array_equal(survey.T_map_lidar, survey.T_map_lidar_written)
+
+
+def test_a_street_that_is_not_there_is_refused_with_those_that_are(city, plan):
+    with pytest.raises(DatasetError, match=r"no street 'x' here; there are: 1, 2"):
+        driven(city, plan.model_copy(update={"streets": ("x",)}), 1.0)

@@ -1,0 +1,110 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.lidar import LIDARS, scan
+
+CLEAR = CONDITIONS["clear"]
+MODEL = LIDARS["paper_32"]
+EXACT = replace(MODEL, range_noise_m=0.0, dropout=0.0)
+
+
+def scan_of(wall, model=MODEL, condition=CLEAR, *, seed=0, at_x_m=0.0):
+    T_map_lidar = np.eye(4)
+    T_map_lidar[0, 3] = at_x_m
+    return scan(wall.scene, model, model.rays(), T_map_lidar, condition, np.random.default_rng(seed))
+
+
+def along(points, wall, at_x_m=0.0):
+    """Errors of ranges along their beams: the wall stands at a known x."""
+    ranges = np.linalg.norm(points[:, :3], axis=1)
+    return ranges - (wall.x_m - at_x_m) * ranges / points[:, 0]
+
+
+def test_without_errors_all_points_lie_on_the_wall(wall):
+    points = scan_of(wall, EXACT)
+    np.testing.assert_allclose(points[:, 0], wall.x_m, atol=1e-3)
+
+
+def test_points_lie_on_the_beams_of_the_model(wall):
+    directions = scan_of(wall)[:, :3]
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    elevations = np.rad2deg(np.arcsin(directions[:, 2]))
+    beams = np.linspace(MODEL.top_deg, MODEL.bottom_deg, MODEL.channels)
+    assert np.abs(elevations[:, None] - beams).min(axis=1).max() < 1e-3
+
+
+@pytest.mark.parametrize("sigma_m", [0.02, 0.05])
+def test_range_noise_has_the_stated_size(wall, sigma_m):
+    errors = along(scan_of(wall, replace(EXACT, range_noise_m=sigma_m)), wall)
+    assert errors.std() == pytest.approx(sigma_m, rel=0.1)
+    assert abs(errors.mean()) < 0.1 * sigma_m
+
+
+@pytest.mark.parametrize("dropout", [0.03, 0.2])
+def test_the_stated_share_of_beams_drops_out(wall, dropout):
+    lost = 1 - len(scan_of(wall, replace(EXACT, dropout=dropout))) / len(scan_of(wall, EXACT))
+    assert lost == pytest.approx(dropout, abs=0.015)
+
+
+def test_nothing_is_measured_beyond_the_range_limit(wall):
+    points = scan_of(wall, replace(MODEL, max_range_m=30.0))
+    assert 25 < np.linalg.norm(points[:, :3], axis=1).max() < 30.0
+
+
+def test_a_wall_beyond_the_limit_is_not_seen(wall):
+    assert len(scan_of(wall, replace(MODEL, max_range_m=15.0))) == 0
+
+
+@pytest.mark.parametrize(("name", "channels"), [("vlp_16", 16), ("paper_32", 32), ("hdl_64", 64), ("os1_128", 128)])
+def test_presets_have_their_channels(name, channels):
+    rays = LIDARS[name].rays()
+    assert rays.shape == (channels * 1024, 3)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-6)
+
+
+def test_fog_shortens_the_range(wall):
+    def share(condition):
+        return np.mean(np.isclose(scan_of(wall, MODEL, condition, at_x_m=-20.0)[:, 0], 40.0, atol=0.2))
+
+    seen = {
+        name: len(scan_of(wall, MODEL, CONDITIONS[name], at_x_m=-20.0)) * share(CONDITIONS[name])
+        for name in ("clear", "fog")
+    }
+    assert seen["clear"] > 3000
+    assert seen["fog"] < 0.05 * seen["clear"]
+
+
+def test_fog_leaves_what_is_near(wall):
+    on_wall = np.abs(along(scan_of(wall, MODEL, CONDITIONS["fog"], at_x_m=14.0), wall, at_x_m=14.0)) < 0.1
+    assert on_wall.sum() > 3000
+
+
+@pytest.mark.parametrize("name", ["rain", "snow", "fog"])
+def test_drops_and_flakes_answer_near_the_sensor(wall, name):
+    points = scan_of(wall, MODEL, CONDITIONS[name])
+    false = points[np.abs(points[:, 0] - wall.x_m) > 0.5]
+    ranges = np.linalg.norm(false[:, :3], axis=1)
+    assert len(false) > 200
+    assert np.median(ranges) < 8.0
+
+
+@pytest.mark.parametrize("name", ["clear", "night", "low_sun"])
+def test_light_does_not_trouble_the_lidar(wall, name):
+    assert np.abs(scan_of(wall, MODEL, CONDITIONS[name])[:, 0] - wall.x_m).max() < 0.2
+
+
+def test_snow_gives_more_false_returns_than_rain(wall):
+    counts = [
+        np.sum(np.abs(scan_of(wall, MODEL, CONDITIONS[name])[:, 0] - wall.x_m) > 0.5) for name in ("rain", "snow")
+    ]
+    assert counts[1] > 2 * counts[0]
+
+
+@pytest.mark.parametrize(("name", "decibel_per_km"), [("rain", 9.3), ("snow", 14.3), ("fog", 339.8)])
+def test_extinctions_are_those_of_the_stated_strengths(name, decibel_per_km):
+    """25 mm/h: 1.076 * 25^0.67; 2 mm/h of water: 5.50 * 2^1.38; 50 m visibility: 3.912 / 50 a metre."""
+    in_decibel = CONDITIONS[name].extinction_per_m * 1000 * 10 / np.log(10)
+    assert in_decibel == pytest.approx(decibel_per_km, rel=0.01)
