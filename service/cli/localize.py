@@ -58,7 +58,10 @@ def localize(url: str, *, rgb: Path, depth: Path, camera: Path, map_name: str | 
         "request": ("request.json", json.dumps(request).encode(), "application/json"),
     }
     try:
-        response = httpx.post(f"{url.rstrip('/')}/v1/localize", files=files, timeout=_TIMEOUT_S)
+        # A proxy named in the environment is for other machines: it could not reach this one's loopback.
+        own = httpx.URL(url).host in ("127.0.0.1", "localhost", "::1")
+        with httpx.Client(timeout=_TIMEOUT_S, trust_env=not own) as client:
+            response = client.post(f"{url.rstrip('/')}/v1/localize", files=files)
         answer = response.json()
     except (httpx.HTTPError, httpx.InvalidURL) as error:
         raise UnreachableError(

@@ -106,10 +106,6 @@ def map_entry_from(bundle: MapBundle) -> schema.MapEntry:
 def _require_supported(request: schema.LocalizeRequest) -> None:
     if request.prior is not None:
         raise NotYetSupportedError("prior: this release cannot use a prior position; leave it out", field="prior")
-    if request.options.refine:
-        raise NotYetSupportedError(
-            "options.refine: this release answers from retrieval alone; send false", field="options.refine"
-        )
     if any(request.camera.distortion):
         raise NotYetSupportedError(
             "camera.distortion: this release reads rectified pictures only; rectify both and send no distortion",

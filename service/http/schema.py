@@ -71,7 +71,11 @@ class Options(_Strict):
     """What to answer."""
 
     neighbours: int = Field(5, ge=1, le=MOST_NEIGHBOURS, description="k: distinct places that vote and are answered")
-    refine: bool = Field(False, description="register on the map's cloud; true is refused in this release")
+    refine: bool = Field(
+        True,
+        description="allow registration on the map's cloud; this release has none, so every answer is of retrieval alone "
+        "and has covariance null",
+    )
 
 
 class LocalizeRequest(_Strict):

@@ -67,7 +67,7 @@ def router_for(engine: Engine) -> APIRouter:
         """Street, position and heading of one RGB and one depth picture.
 
         The answer rests on retrieval: its position is the similarity-weighted mean of the best hypothesis' places.
-        `prior` and `options.refine` are reserved names, refused until they mean something.
+        `prior` is a reserved name, refused until it means something; `options.refine` allows what a later release does.
         """
         try:
             async with asyncio.timeout(settings.request_timeout_s):

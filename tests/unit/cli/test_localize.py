@@ -43,11 +43,11 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[httpx.Response], lis
     def put(response: httpx.Response) -> list[dict[str, Any]]:
         posted: list[dict[str, Any]] = []
 
-        def post(url: str, **given: Any) -> httpx.Response:
+        def post(_client: httpx.Client, url: str, **given: Any) -> httpx.Response:
             posted.append({"url": url} | given)
             return response
 
-        monkeypatch.setattr(httpx, "post", post)
+        monkeypatch.setattr(httpx.Client, "post", post)
         return posted
 
     return put

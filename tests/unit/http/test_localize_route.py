@@ -172,7 +172,6 @@ def test_a_request_that_is_no_json_object_is_refused(client: httpx.Client, parts
     ("changed", "field"),
     [
         ({"prior": {"position": {"x": 0, "y": 0, "z": 0, "std_m": 20}}}, "prior"),
-        ({"options": {"refine": True}}, "options.refine"),
         ({"camera": CAMERA | {"distortion": [0.1, 0, 0, 0]}}, "camera.distortion"),
     ],
 )
