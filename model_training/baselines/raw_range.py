@@ -71,7 +71,7 @@ def raw_best_views(
     score = {name: np.full(len(usable), -np.inf, np.float32) for name in SETTINGS}
     settings = BuildSettings(
         name=bundle.name, spacing_m=bundle.manifest.spacing_m, headings=bundle.manifest.headings,
-        expected_lidar_height_m=bundle.manifest.lidar_height_m, remove_weather=bool(bundle.manifest.parameters["weather_removed"]),
+        expected_lidar_height_m=bundle.manifest.parameters["expected_lidar_height_m"], remove_weather=bool(bundle.manifest.parameters["weather_removed"]),
     )  # fmt: skip
     waiting: list[Ranges] = []
     first = 0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.preview import preview_webp
 from model_training.mapping.voxel_map import VoxelMap
-from service.errors import DatasetError
+from service.errors import BundleError, DatasetError
 from service.geometry.rigid import heading_of_body, transform_from, transform_points
 from service.imaging.pca import Level, level_scan, principal_heading
 from service.imaging.view_grid import (
@@ -78,6 +78,8 @@ def build_map(
         EncoderError: the encoder cannot be used.
         BundleError: ``out`` exists and ``overwrite`` is not given.
     """
+    if out.exists() and not overwrite:  # said before the work, not after it
+        raise BundleError(f"{out}: there is something of that name already; choose another, or overwrite it", field="out")
     data = encoder_file.read_bytes()
     encoder = Encoder.open(data, threads=threads or os.cpu_count() or 1)
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)

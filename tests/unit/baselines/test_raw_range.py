@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from model_training.baselines import raw_range
 from model_training.baselines.raw_range import GAP_PENALTY, SETTINGS, raw_best_views, similarities
 from model_training.mapping.build import BuildSettings, view_ranges
 from service.maps.reader import MapBundle
@@ -52,6 +53,11 @@ def test_views_that_share_too_few_cells_are_not_compared():
     assert similarities(one, other)["masked_l2"][0, 0] == -1e3
 
 
+def test_only_the_first_queries_are_asked_where_a_limit_says_so(small_map, small_dataset):
+    found = raw_best_views(MapBundle.open(small_map), small_dataset, ["drive1_precise"], limit=2)
+    assert {len(numbers) for numbers in found.values()} == {2}
+
+
 @pytest.fixture(scope="module")
 def best(small_map, small_dataset):
     return raw_best_views(MapBundle.open(small_map), small_dataset, ["drive1_precise"])
@@ -67,14 +73,12 @@ def test_every_query_gets_a_place_of_the_map_by_every_setting(best, small_map):
 
 def test_the_best_place_is_that_of_the_most_similar_view_of_all(best, small_map, small_dataset, monkeypatch):
     """Again with all views in one heap, and again in the smallest pieces."""
-    from model_training.baselines import raw_range
-
     bundle = MapBundle.open(small_map)
     settings = BuildSettings(
         name="small", spacing_m=5.0, headings=6, expected_lidar_height_m=bundle.manifest.lidar_height_m
     )
     stored = np.concatenate(list(view_ranges(small_dataset, settings, bundle.grid, bundle.rows_seen)))
-    queries, _ = raw_range._query_ranges(bundle, small_dataset, ["drive1_precise"])
+    queries, _ = raw_range._query_ranges(bundle, small_dataset, ["drive1_precise"], None)
     monkeypatch.setattr(raw_range, "CHUNK", 1)
     piece_by_piece = raw_best_views(bundle, small_dataset, ["drive1_precise"])
     for setting, similarity in similarities(queries, stored).items():

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from model_training.mapping.voxel_map import TILE_M, VoxelMap
 

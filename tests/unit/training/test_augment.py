@@ -1,0 +1,127 @@
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra `training`")
+
+from model_training.training.augment import Augmentation, Augmenter  # noqa: E402  # after the skip
+from service.imaging.view_grid import PLANES, ViewGrid  # noqa: E402
+
+GRID = ViewGrid()
+COUNT = 300
+#: Everything off.
+NOTHING = Augmentation(
+    disparity_noise_px=(1e-6, 1e-6), scale_error=0, invented_depth=0, short_range=0, no_colour=0, narrow_rows=0, narrow_columns=0,
+    blocked=0, small_blocks=0, unseen_top_rows=0, survey_noise_m=0, survey_dropout=0, height_error_m=0,
+)  # fmt: skip
+
+
+def augmenter(*, seed=0, **changed):
+    settings = Augmentation.model_validate(NOTHING.model_dump() | changed)
+    return Augmenter(settings, GRID, torch.Generator().manual_seed(seed), torch.device("cpu"))
+
+
+def clean(count=COUNT, range_m=15.0):
+    generator = torch.Generator().manual_seed(9)
+    ranges = torch.full((count, GRID.rows, GRID.columns), range_m)
+    rgb = torch.rand(count, 3, GRID.rows, GRID.columns, generator=generator) * 255
+    return ranges, rgb, torch.full((count,), 1.5), torch.ones(1, GRID.rows, 1, dtype=torch.bool)
+
+
+def query(augment, **options):
+    return augment.query(*clean(**options))
+
+
+def plane(planes, name):
+    return planes[:, PLANES.index(name)]
+
+
+def test_planes_of_both_sides_have_the_shape_of_a_view():
+    ranges, rgb, height, seen = clean(count=3)
+    augment = Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(0), torch.device("cpu"))
+    assert augment.survey(ranges, height, seen).shape == (3, 5, 32, 128)
+    assert augment.query(ranges, rgb, height, seen).shape == (3, 5, 32, 128)
+
+
+def test_one_generator_gives_one_batch():
+    ranges, rgb, height, seen = clean(count=4)
+    one, other = (
+        Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(5), torch.device("cpu")).query(ranges, rgb, height, seen)
+        for _ in range(2)
+    )
+    torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+def test_another_generator_gives_another_batch():
+    ranges, rgb, height, seen = clean(count=4)
+    one, other = (
+        Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(s), torch.device("cpu")).query(ranges, rgb, height, seen)
+        for s in (5, 6)
+    )
+    assert float((one - other).abs().max()) > 0.1
+
+
+def test_the_given_views_are_left_as_they_are():
+    ranges, rgb, height, seen = clean(count=4)
+    before = ranges.clone(), rgb.clone()
+    Augmenter(Augmentation(), GRID, torch.Generator(), torch.device("cpu")).query(ranges, rgb, height, seen)
+    torch.testing.assert_close((ranges, rgb), before, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_the_stated_share_of_views_has_no_colour(share):
+    found = query(augmenter(no_colour=share))
+    grey = (plane(found, "v1") == 0).flatten(1).all(dim=1) & (plane(found, "v2") == 0).flatten(1).all(dim=1)
+    assert float(grey.float().mean()) == pytest.approx(share, abs=0.08)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.35, 1.0])
+def test_the_stated_share_of_views_is_blocked(share):
+    ranges = plane(query(augmenter(blocked=share)), "range_m")
+    blocked = ((ranges > 0) & (ranges < 12)).flatten(1).any(dim=1)
+    assert float(blocked.float().mean()) == pytest.approx(share, abs=0.1)
+
+
+def test_blocks_are_no_wider_than_stated():
+    ranges = plane(query(augmenter(blocked=1.0, widest_block=0.45)), "range_m")
+    columns = ((ranges > 0) & (ranges < 12)).any(dim=1).float().mean(dim=1)
+    assert float(columns.max()) < 0.45 + 0.05
+
+
+def test_narrow_cameras_lose_columns_at_both_sides_only():
+    observed = plane(query(augmenter(narrow_columns=1.0)), "observed")
+    assert bool(observed[:, :, 40:88].all())
+    assert not bool(observed[:, :, 0].all())
+
+
+def test_what_is_not_observed_is_blank_in_every_plane():
+    found = query(augmenter(narrow_columns=1.0, narrow_rows=1.0))
+    outside = plane(found, "observed") == 0
+    assert float(found.abs().sum(dim=1)[outside].max()) == 0.0
+
+
+def test_short_ranges_are_cut():
+    far = plane(query(augmenter(short_range=1.0), range_m=30.0), "range_m")
+    assert bool((far == 0).flatten(1).all(dim=1).any())
+
+
+def test_a_survey_view_without_errors_keeps_its_ranges_and_heights():
+    ranges, _, height, seen = clean(count=2)
+    found = augmenter().survey(ranges, height, seen)
+    torch.testing.assert_close(plane(found, "range_m"), ranges)
+    sine = torch.sin(torch.tensor(GRID.elevations_rad, dtype=torch.float32))[:, None]
+    torch.testing.assert_close(plane(found, "height_m"), (ranges * sine + 1.5))
+    assert not bool(plane(found, "v1").any())
+
+
+def test_rows_that_the_survey_does_not_see_are_blank_on_both_sides():
+    ranges, rgb, height, _ = clean(count=2)
+    seen = (torch.arange(GRID.rows) >= 10).reshape(1, -1, 1)
+    augment = augmenter()
+    for found in (augment.survey(ranges, height, seen), augment.query(ranges, rgb, height, seen)):
+        assert not bool(found[:, :, :10].any())
+
+
+def test_top_rows_are_cut_in_the_stated_share_of_views():
+    rows = augmenter(unseen_top_rows=0.5).cut_rows(torch.ones(GRID.rows, dtype=torch.bool), COUNT)
+    cut = ~rows[:, 0, 0]
+    assert float(cut.float().mean()) == pytest.approx(0.5, abs=0.1)
+    assert bool(rows[:, 17:].all())

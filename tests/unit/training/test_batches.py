@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra `training`")
+
+from model_training.training.batches import PAIR_REACH_M, TURN_DEG, City  # noqa: E402  # after the skip
+from model_training.training.packs import Pack  # noqa: E402
+
+
+@pytest.fixture
+def city(pack_folder, grid):
+    return City(Pack.open(pack_folder), grid)
+
+
+def draw(city, pairs=24, seed=0):
+    return city.draw(pairs, np.random.default_rng(seed))
+
+
+def test_pairs_lie_within_reach(city):
+    for seed in range(5):
+        batch = draw(city, seed=seed)
+        assert float((batch.survey_xy - batch.query_xy).norm(dim=1).max()) <= PAIR_REACH_M
+
+
+def test_no_query_is_twice_in_a_batch(city):
+    xy = draw(city).query_xy.numpy()
+    assert len(np.unique(xy, axis=0)) == len(xy)
+
+
+def test_a_batch_has_up_to_the_pairs_wanted(city):
+    batch = draw(city, pairs=20)
+    assert 10 <= len(batch.query_xy) <= 20
+    assert batch.images == 2 * len(batch.query_xy)
+
+
+def test_half_of_a_batch_is_from_one_neighbourhood(city):
+    xy = draw(city, pairs=20).query_xy
+    near = (torch.cdist(xy, xy) < 140).float().mean()
+    assert float(near) > 0.35
+
+
+def test_views_are_turned_by_nine_degrees_at_most(city, grid):
+    """Each query sees just its place's panorama: how far the survey's view must be shifted says how far it is turned."""
+    step_deg = 360.0 / grid.around
+    for seed in range(3):
+        batch = draw(city, seed=seed)
+        for place_xy, survey_view, query_view in zip(batch.survey_xy, batch.survey_ranges, batch.query_ranges, strict=True):
+            places = torch.tensor(np.array(city.pack.places))
+            k = int((places[:, :2] - place_xy.double()).norm(dim=1).argmin())
+            panorama = np.asarray(city.pack.panoramas[k], np.float32)
+            starts = [offset_of(panorama, view.numpy(), grid) for view in (survey_view, query_view)]
+            turn = ((starts[0] - starts[1]) * step_deg + 180) % 360 - 180
+            assert abs(turn) <= TURN_DEG + step_deg
+
+
+def offset_of(panorama, view, grid):
+    """Column of the panorama at which a view begins: the one that fits best."""
+    columns = np.rint((grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int)
+    errors = [np.abs(panorama[:, (columns + k) % grid.around] - view).sum() for k in range(grid.around)]
+    best = np.flatnonzero(np.isclose(errors, min(errors)))
+    return float(best[len(best) // 2])
+
+
+def test_one_seed_gives_one_batch(city):
+    one, other = draw(city, seed=3), draw(city, seed=3)
+    torch.testing.assert_close(one.survey_ranges, other.survey_ranges, rtol=0, atol=0)
+    torch.testing.assert_close(one.query_xy, other.query_xy, rtol=0, atol=0)
+
+
+def test_queries_without_a_place_nearby_are_never_drawn(pack_of, grid, tmp_path):
+    folder = pack_of(tmp_path / "sparse")
+    queries = np.load(folder / "queries.npy")
+    queries[:30, :2] += 5000.0
+    np.save(folder / "queries.npy", queries)
+    city = City(Pack.open(folder), grid)
+    assert city.usable.tolist() == list(range(30, 60))
+    assert float(draw(city, pairs=12).query_xy.max()) < 1000

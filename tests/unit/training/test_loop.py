@@ -1,0 +1,97 @@
+import os
+import signal
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra `training`")
+
+from model_training.training.augment import Augmentation  # noqa: E402  # after the skip
+from model_training.training.loop import TrainingConfig, load_run, train  # noqa: E402
+from service.errors import DatasetError  # noqa: E402
+
+GENTLE = Augmentation(blocked=0, small_blocks=0, narrow_rows=0, narrow_columns=0, short_range=0, invented_depth=0, unseen_top_rows=0)
+
+
+@pytest.fixture
+def config(shape):
+    return TrainingConfig(steps=15, pairs=24, learning_rate=1e-2, warm_up_steps=2, encoder=shape, augmentation=GENTLE)
+
+
+def run_of(pack_folder, run, config, **options):
+    return train([pack_folder], run, config, device="cpu", **options)
+
+
+def assert_same_weights(one, other):
+    for name, weights in one.state_dict().items():
+        torch.testing.assert_close(weights, other.state_dict()[name], rtol=0, atol=0, msg=name)
+
+
+@pytest.mark.parametrize(("optimiser", "rate"), [("adamw", 1e-2), ("sgdm", 3e-2)])
+def test_the_loss_falls(pack_folder, tmp_path, config, optimiser, rate):
+    losses = []
+    changed = TrainingConfig.model_validate(config.model_dump() | {"optimiser": optimiser, "learning_rate": rate})
+    run_of(pack_folder, tmp_path / "run", changed, report=lambda progress: losses.append(progress.loss))
+    assert len(losses) == 15
+    assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])
+
+
+def test_one_seed_gives_one_encoder(pack_folder, tmp_path, config):
+    assert_same_weights(*(run_of(pack_folder, tmp_path / name, config) for name in ("one", "other")))
+
+
+def test_a_run_that_was_interrupted_goes_on_to_the_same_weights(pack_folder, tmp_path, config):
+    def interrupt(progress):
+        if progress.step == 6:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_of(pack_folder, tmp_path / "cut", config, report=interrupt)
+    steps = []
+    resumed = run_of(pack_folder, tmp_path / "cut", config, report=lambda progress: steps.append(progress.step))
+    assert steps[0] in (7, 8)
+    assert_same_weights(resumed, run_of(pack_folder, tmp_path / "whole", config))
+
+
+def test_a_finished_run_is_not_trained_again(pack_folder, tmp_path, config):
+    first = run_of(pack_folder, tmp_path / "run", config)
+    steps = []
+    again = run_of(pack_folder, tmp_path / "run", config, report=lambda progress: steps.append(progress.step))
+    assert steps == []
+    assert_same_weights(first, again)
+
+
+def test_a_folder_of_another_configuration_is_refused(pack_folder, tmp_path, config):
+    run_of(pack_folder, tmp_path / "run", config.model_copy(update={"steps": 1}))
+    before = (tmp_path / "run" / "config.json").read_bytes()
+    with pytest.raises(DatasetError, match="another configuration"):
+        run_of(pack_folder, tmp_path / "run", config)
+    assert (tmp_path / "run" / "config.json").read_bytes() == before
+
+
+def test_a_run_is_read_back_for_use(pack_folder, tmp_path, config):
+    net = run_of(pack_folder, tmp_path / "run", config.model_copy(update={"steps": 2}))
+    assert_same_weights(net, load_run(tmp_path / "run"))
+    assert not load_run(tmp_path / "run").training
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match="streetfix train"):
+        load_run(tmp_path)
+
+
+def test_a_run_may_start_from_anothers_weights(pack_folder, tmp_path, config):
+    before = run_of(pack_folder, tmp_path / "before", config.model_copy(update={"steps": 2}))
+    still = config.model_copy(update={"steps": 1, "learning_rate": 0.0, "weight_decay": 0.0})
+    after = run_of(pack_folder, tmp_path / "after", still, start_from=tmp_path / "before")
+    torch.testing.assert_close(after.full12.weight, before.full12.weight, rtol=0, atol=0)
+
+
+def test_a_run_is_logged_for_tensorboard(pack_folder, tmp_path, config):
+    run_of(pack_folder, tmp_path / "run", config)
+    assert [path.name.split(".")[0] for path in (tmp_path / "run" / "tensorboard").iterdir()] == ["events"]
+
+
+def test_unknown_settings_are_refused():
+    with pytest.raises(ValueError, match="stepps"):
+        TrainingConfig.model_validate({"stepps": 3})

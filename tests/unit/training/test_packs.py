@@ -1,0 +1,121 @@
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the extra `training`")
+
+from model_training.training import packs as module  # noqa: E402  # after the skip
+from model_training.training.packs import Pack, PackPlan, make_pack, make_packs, rows_seen_by  # noqa: E402
+from model_training.training.recipe import (  # noqa: E402
+    EVALUATION_SEEDS,
+    TRAINING_SEEDS,
+    WATCH_SEEDS,
+    paper_plans,
+    stock_plans,
+    watch_plans,
+)
+
+PLAN = PackPlan(seed=1001, places=6, queries_a_place=2, lidar="hdl_64", size_m=(60.0, 60.0))
+
+
+@pytest.fixture(scope="module")
+def pack(grid, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("packs") / PLAN.stem
+    make_pack(PLAN, folder, grid)
+    return Pack.open(folder)
+
+
+def test_a_pack_holds_what_its_plan_says(pack, grid):
+    assert pack.panoramas.shape == (6, grid.rows, grid.around)
+    assert pack.ranges.shape == (12, grid.rows, grid.columns)
+    assert pack.rgb.shape == (12, grid.rows, grid.columns, 3)
+    assert (pack.places.shape, pack.queries.shape) == ((6, 4), (12, 4))
+
+
+def test_every_query_has_a_place_within_reach(pack):
+    distances = np.linalg.norm(pack.queries[:, None, :2] - pack.places[None, :, :2], axis=2)
+    assert distances.min(axis=1).max() <= 2.0 + 1e-6
+
+
+def test_panoramas_and_queries_measure_something(pack):
+    assert (np.asarray(pack.panoramas) > 0).mean() > 0.2
+    assert (np.asarray(pack.ranges) > 0).mean() > 0.3
+    assert np.asarray(pack.rgb).std() > 10
+
+
+def test_rows_above_a_lidar_that_looks_down_are_not_seen(pack, grid):
+    elevations = np.rad2deg(grid.elevations_rad)
+    assert not pack.rows_seen[elevations > 5].any()
+    assert pack.rows_seen[elevations < 0].all()
+
+
+def test_heights_are_those_of_sensors(pack):
+    assert np.abs(pack.places[:, 3] - 1.8).max() < 0.4
+    assert ((pack.queries[:, 3] >= 1.2) & (pack.queries[:, 3] <= 1.9)).all()
+
+
+def test_one_seed_gives_one_pack(pack, grid, tmp_path):
+    make_pack(PLAN, tmp_path / "again", grid)
+    again = Pack.open(tmp_path / "again")
+    for name in Pack.__annotations__:
+        np.testing.assert_array_equal(getattr(pack, name), getattr(again, name))
+
+
+def test_a_pack_that_fails_half_way_is_not_there(grid, tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(module, "_queries", fail)
+    with pytest.raises(OSError, match="full"):
+        make_pack(PLAN, tmp_path / "half", grid)
+    assert not (tmp_path / "half").exists()
+
+
+def test_what_a_stopped_run_left_does_not_hinder(pack, grid, tmp_path):
+    (tmp_path / "new.part").mkdir()
+    (tmp_path / "new.part" / "places.npy").write_bytes(b"half")
+    make_pack(PLAN, tmp_path / "new", grid)
+    np.testing.assert_array_equal(Pack.open(tmp_path / "new").places, pack.places)
+
+
+def test_packs_that_are_there_are_not_made_again(grid, tmp_path):
+    plans = [PackPlan(seed=1000 + k) for k in range(3)]
+    for plan in plans:
+        (tmp_path / plan.stem).mkdir()
+    told = []
+    folders = make_packs(plans, tmp_path, grid, report=lambda *event: told.append(event))
+    assert folders == [tmp_path / plan.stem for plan in plans]
+    assert told == []
+
+
+def test_rows_with_hardly_a_measurement_are_not_seen():
+    panoramas = np.zeros((4, 3, 100), np.float16)
+    panoramas[:, 1, :1], panoramas[:, 2, :50] = 9.0, 9.0
+    assert rows_seen_by(panoramas).tolist() == [False, False, True]
+
+
+def test_seeds_of_training_watching_and_evaluation_are_disjoint():
+    training, watch, evaluation = (set(seeds) for seeds in (TRAINING_SEEDS, WATCH_SEEDS, EVALUATION_SEEDS))
+    assert not training & watch
+    assert not training & evaluation
+    assert not watch & evaluation
+
+
+def test_the_stock_encoder_meets_no_city_that_a_bar_is_measured_on():
+    plans = stock_plans(200)
+    assert {plan.name for plan in plans} == {"city"}
+    assert {plan.seed for plan in plans} <= set(TRAINING_SEEDS)
+    assert len({plan.seed for plan in plans}) == 200
+
+
+def test_training_is_watched_on_cities_of_its_own():
+    assert {plan.seed for plan in watch_plans()} <= set(WATCH_SEEDS)
+
+
+def test_the_papers_city_is_only_in_its_own_recipe():
+    assert {plan.name for plan in paper_plans()} == {"paper"}
+    assert {plan.name for plan in stock_plans(50) + watch_plans()} == {"city"}
+
+
+def test_plans_that_differ_have_packs_of_their_own():
+    plans = [PLAN, PackPlan(seed=1001), PackPlan(seed=1002), PackPlan(seed=1001, lidar="vlp_16"), PackPlan(seed=1001, name="paper")]
+    assert len({plan.stem for plan in plans}) == len(plans)
