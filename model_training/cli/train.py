@@ -39,7 +39,7 @@ def command(
     config = TrainingConfig.model_validate(
         {"steps": steps, "pairs": pairs, "optimiser": optimiser, "learning_rate": rate, "seed": seed}
     )
-    plans = stock_plans(cities) if recipe == "stock" else paper_plans()
+    plans = paper_plans() if recipe == "paper" else stock_plans(cities)
     grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
     with bars() as report:
         folders = make_packs(plans, packs, grid, workers=workers, report=report)

@@ -79,7 +79,9 @@ def build_map(
         BundleError: ``out`` exists and ``overwrite`` is not given.
     """
     if out.exists() and not overwrite:  # said before the work, not after it
-        raise BundleError(f"{out}: there is something of that name already; choose another, or overwrite it", field="out")
+        raise BundleError(
+            f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
+        )
     data = encoder_file.read_bytes()
     encoder = Encoder.open(data, threads=threads or os.cpu_count() or 1)
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)

@@ -76,8 +76,8 @@ def train(
     grid, place = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns), device_of(device)
     run.mkdir(parents=True, exist_ok=True)
     _keep_config(run, config)
-    before = [] if start_from is None else json.loads((start_from / "packs.json").read_text())
-    (run / "packs.json").write_text(json.dumps(before + [folder.name for folder in packs], indent=1) + "\n")
+    earlier = [] if start_from is None else json.loads((start_from / "packs.json").read_text())
+    (run / "packs.json").write_text(json.dumps(earlier + [folder.name for folder in packs], indent=1) + "\n")
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     generator = torch.Generator(device=place).manual_seed(config.seed)
@@ -88,7 +88,9 @@ def train(
     checkpoint = run / "checkpoint.pt"
     first = 0
     if start_from is not None:
-        net.load_state_dict(load_run(start_from, device=str(place)).state_dict())
+        before = torch.load(start_from / "checkpoint.pt", map_location=place, weights_only=True)
+        net.load_state_dict(before["net"])
+        log_scale.data.copy_(before["log_scale"])
     if resume and checkpoint.exists():
         state = torch.load(checkpoint, map_location=place, weights_only=True)
         net.load_state_dict(state["net"])

@@ -18,10 +18,8 @@ def slow_similarity(setting, query, view):
     a, b = query.reshape(-1).astype(float), view.reshape(-1).astype(float)
     both, cells = [(x, y) for x, y in zip(a, b, strict=True) if x > 0 and y > 0], len(a)
     if setting.startswith("masked"):
-        if len(both) < 0.1 * cells:
-            distance = 1e3
-        else:
-            distance = sum(np.log(x / y) ** 2 for x, y in both) / len(both)
+        squares = [np.log(x / y) ** 2 for x, y in both]
+        distance = 1e3 if len(both) < 0.1 * cells else sum(squares) / len(both)
         gaps = sum((x > 0) != (y > 0) for x, y in zip(a, b, strict=True)) / cells
         return -(distance + (GAP_PENALTY * gaps if setting.endswith("gaps") else 0.0))
     logs = []

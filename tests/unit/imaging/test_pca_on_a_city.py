@@ -1,5 +1,6 @@
 """Levelling and the principal heading against the truth of a simulated city with slopes."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,6 @@ from model_training.simulation.scene import Scene
 from model_training.simulation.traversal import lidar_pose, stations
 from service.geometry.rigid import heading_of_body, transform_from
 from service.imaging.pca import level_scan, principal_heading
-import itertools
 
 AWAY_M, EVERY = 15.0, 6
 

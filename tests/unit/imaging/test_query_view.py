@@ -138,7 +138,7 @@ def test_single_wrong_pixels_do_not_move_a_cell():
 
 @pytest.mark.parametrize("depth_m", [0.0, 0.2, 70.0])
 def test_a_picture_without_a_usable_depth_is_refused_with_the_limits(depth_m):
-    with pytest.raises(NoDepthError, match="0.5-40 m"):
+    with pytest.raises(NoDepthError, match=r"0\.5-40 m"):
         view_of(depth_m=np.full((240, 320), depth_m, np.float32))
 
 

@@ -28,12 +28,13 @@ def bundle(small_map):
     ("steps_m", "spacing_m", "kept"),
     [
         ([1.0] * 4, 1.0, [0, 1, 2, 3, 4]),
-        ([0.06] * 50, 1.0, [0, 17, 34]),
+        ([0.06] * 50, 1.0, [0, 15, 30, 45]),
         ([0.4] * 6, 1.0, [0, 3, 6]),
         ([5.0, 0.2, 5.0], 1.0, [0, 1, 3]),
     ],
 )
 def test_places_stand_the_spacing_apart_along_the_way(steps_m, spacing_m, kept):
+    """Less a tenth, so that noisy poses do not double the spacing."""
     assert thinned(track(steps_m), spacing_m).tolist() == kept
 
 

@@ -111,8 +111,8 @@ def stood(city, monkeypatch):
 
     def of(traversal, **options):
         people, vehicles = [], []
-        monkeypatch.setattr(module, "add_person", lambda _, base, *rest: people.append(base[:2]))
-        monkeypatch.setattr(module, "add_vehicle", lambda _, base, *rest: vehicles.append(base[:2]))
+        monkeypatch.setattr(module, "add_person", lambda _builder, base, *_rest: people.append(base[:2]))
+        monkeypatch.setattr(module, "add_vehicle", lambda _builder, base, *_rest: vehicles.append(base[:2]))
         city.occupants(traversal, **options)
         slots = cKDTree([slot[:2] for slot in city._parking])
         parked = [v for v in vehicles if slots.query(v)[0] < 1.0]

@@ -1,4 +1,5 @@
 import hashlib
+import itertools
 import json
 import shutil
 
@@ -14,7 +15,6 @@ from model_training.simulation.simulate import simulate
 from model_training.simulation.streets import TABLE_I, class_name, paper_streets, streets_geojson
 from service.errors import DatasetError
 from service.geometry.rigid import transform_points
-import itertools
 
 
 def hashes_of(folder):

@@ -1,14 +1,28 @@
-from collections.abc import Callable
+import importlib.util
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from model_training.training.encoder_net import EncoderShape
 from service.imaging.view_grid import ViewGrid
 
 GRID = ViewGrid(rows=16, columns=32)
-SHAPE = EncoderShape(rows=16, columns=32, widths=(4, 6, 6, 8), narrow=4, descriptor=16)
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    """Networks this small are slower on several threads, by far on a busy machine."""
+    if importlib.util.find_spec("torch") is None:
+        yield
+        return
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def write_pack(folder: Path, *, places: int = 60, seed: int = 0) -> Path:
@@ -46,8 +60,10 @@ def grid() -> ViewGrid:
 
 
 @pytest.fixture(scope="session")
-def shape() -> EncoderShape:
-    return SHAPE
+def shape() -> Any:
+    from model_training.training.encoder_net import EncoderShape
+
+    return EncoderShape(rows=16, columns=32, widths=(4, 6, 6, 8), narrow=4, descriptor=16)
 
 
 @pytest.fixture(scope="session")

@@ -44,7 +44,9 @@ def test_planes_of_both_sides_have_the_shape_of_a_view():
 def test_one_generator_gives_one_batch():
     ranges, rgb, height, seen = clean(count=4)
     one, other = (
-        Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(5), torch.device("cpu")).query(ranges, rgb, height, seen)
+        Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(5), torch.device("cpu")).query(
+            ranges, rgb, height, seen
+        )
         for _ in range(2)
     )
     torch.testing.assert_close(one, other, rtol=0, atol=0)
@@ -53,7 +55,9 @@ def test_one_generator_gives_one_batch():
 def test_another_generator_gives_another_batch():
     ranges, rgb, height, seen = clean(count=4)
     one, other = (
-        Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(s), torch.device("cpu")).query(ranges, rgb, height, seen)
+        Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(s), torch.device("cpu")).query(
+            ranges, rgb, height, seen
+        )
         for s in (5, 6)
     )
     assert float((one - other).abs().max()) > 0.1

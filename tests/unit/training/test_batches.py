@@ -42,9 +42,11 @@ def test_half_of_a_batch_is_from_one_neighbourhood(city):
 def test_views_are_turned_by_nine_degrees_at_most(city, grid):
     """Each query sees just its place's panorama: how far the survey's view must be shifted says how far it is turned."""
     step_deg = 360.0 / grid.around
-    for seed in range(3):
-        batch = draw(city, seed=seed)
-        for place_xy, survey_view, query_view in zip(batch.survey_xy, batch.survey_ranges, batch.query_ranges, strict=True):
+    for seed in range(2):
+        batch = draw(city, pairs=8, seed=seed)
+        for place_xy, survey_view, query_view in zip(
+            batch.survey_xy, batch.survey_ranges, batch.query_ranges, strict=True
+        ):
             places = torch.tensor(np.array(city.pack.places))
             k = int((places[:, :2] - place_xy.double()).norm(dim=1).argmin())
             panorama = np.asarray(city.pack.panoramas[k], np.float32)

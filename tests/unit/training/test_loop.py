@@ -10,7 +10,9 @@ from model_training.training.augment import Augmentation  # noqa: E402  # after 
 from model_training.training.loop import TrainingConfig, load_run, train  # noqa: E402
 from service.errors import DatasetError  # noqa: E402
 
-GENTLE = Augmentation(blocked=0, small_blocks=0, narrow_rows=0, narrow_columns=0, short_range=0, invented_depth=0, unseen_top_rows=0)
+GENTLE = Augmentation(
+    blocked=0, small_blocks=0, narrow_rows=0, narrow_columns=0, short_range=0, invented_depth=0, unseen_top_rows=0
+)
 
 
 @pytest.fixture

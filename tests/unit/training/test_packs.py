@@ -3,9 +3,9 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training import packs as module  # noqa: E402  # after the skip
-from model_training.training.packs import Pack, PackPlan, make_pack, make_packs, rows_seen_by  # noqa: E402
-from model_training.training.recipe import (  # noqa: E402
+from model_training.training import packs as module  # after the skip
+from model_training.training.packs import Pack, PackPlan, make_pack, make_packs, rows_seen_by
+from model_training.training.recipe import (
     EVALUATION_SEEDS,
     TRAINING_SEEDS,
     WATCH_SEEDS,
@@ -117,5 +117,11 @@ def test_the_papers_city_is_only_in_its_own_recipe():
 
 
 def test_plans_that_differ_have_packs_of_their_own():
-    plans = [PLAN, PackPlan(seed=1001), PackPlan(seed=1002), PackPlan(seed=1001, lidar="vlp_16"), PackPlan(seed=1001, name="paper")]
+    plans = [
+        PLAN,
+        PackPlan(seed=1001),
+        PackPlan(seed=1002),
+        PackPlan(seed=1001, lidar="vlp_16"),
+        PackPlan(seed=1001, name="paper"),
+    ]
     assert len({plan.stem for plan in plans}) == len(plans)

@@ -1,0 +1,131 @@
+"""``simulate``, ``import``, ``build-map``, ``train`` and ``export`` as a person calls them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from model_training.datasets.dataset import Dataset
+from service.cli.main import main
+from service.maps.reader import MapBundle
+
+SMALL = ("--size", "60x60", "--spacing", "20", "--camera", "96x72", "--workers", "1")
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    return int(end.value.code or 0)
+
+
+def plan_in(folder: Path) -> dict:
+    return json.loads((folder / "simulation.done.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("cli") / "little-town"
+    drives = ("--queries", "2", "--drives", "2", "--depth", "precise", "--depth", "stereo", "--on-track", "1")
+    assert run("simulate", "--out", out, "--seed", "3", *drives, *SMALL) == 0
+    return out
+
+
+def test_simulate_writes_the_drives_and_presets_asked_for(simulated: Path) -> None:
+    sets = [f"{drive}_{depth}" for drive in ("drive1", "drive2", "survey_drive") for depth in ("precise", "stereo")]
+    dataset = Dataset(simulated)
+    assert dataset.query_sets(with_truth=True) == sets
+    assert [len(list(dataset.queries(name))) for name in sets] == [2, 2, 2, 2, 1, 1]
+
+
+def test_simulate_names_the_dataset_after_its_folder(simulated: Path) -> None:
+    assert Dataset(simulated).name == "little-town"
+
+
+def test_simulate_drives_have_their_own_occupants_and_the_track_the_surveys(simulated: Path) -> None:
+    assert [query["traversal"] for query in plan_in(simulated)["queries"]] == [1, 2, 0]
+
+
+def test_simulate_passes_every_option_on(tmp_path: Path) -> None:
+    options = {
+        "--condition": ("fog", "condition"), "--parked-changed": (0.25, "parked_changed"), "--aside": (1.0, "aside_m"),
+        "--heading": (5.0, "heading_deg"), "--turn": (10.0, "turn_deg"), "--pitch": (2.0, "pitch_deg"),
+        "--blocked": (0.2, "blocked"), "--max-depth": (9.0, "max_depth_m"),
+    }  # fmt: skip
+    given = [str(part) for name, (value, _) in options.items() for part in (name, value)]
+    more = ("--lidar", "vlp_16", "--survey-condition", "rain", "--no-survey-error", "--hfov", "70", "--queries", "1")
+    assert run("simulate", "--out", tmp_path / "all", *given, *more, *SMALL) == 0
+    plan = plan_in(tmp_path / "all")
+    query = plan["queries"][0]
+    assert {field: query[field] for _, field in options.values()} == {field: value for value, field in options.values()}
+    assert (plan["lidar"], plan["survey_condition"], plan["survey_error"]) == ("vlp_16", "rain", False)
+    assert plan["camera"]["horizontal_deg"] == 70.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--city", "paris"), "'paris' is neither 'paper' nor 'city'"),
+        (("--size", "300"), "size: '300' is not two numbers"),
+        (("--camera", "axb"), "camera: 'axb' is not two numbers"),
+        (("--lidar", "none"), "lidar: 'none' is no preset"),
+        (("--table1",), "--city paper"),
+    ],
+)
+def test_simulate_says_what_is_wrong_and_writes_nothing(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("simulate", "--out", tmp_path / "no", *arguments) == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
+
+
+def test_build_map_makes_a_bundle_that_opens(simulated: Path, encoder_file: Path, tmp_path: Path) -> None:
+    arguments = (
+        "--encoder",
+        encoder_file,
+        "--spacing",
+        "20",
+        "--headings",
+        "4",
+        "--name",
+        "town",
+        "--licence",
+        "CC0-1.0",
+    )
+    assert run("build-map", simulated, "--out", tmp_path / "map", *arguments) == 0
+    manifest = MapBundle.open(tmp_path / "map").manifest
+    assert (manifest.name, manifest.headings, manifest.spacing_m, manifest.licence) == ("town", 4, 20.0, "CC0-1.0")
+
+
+def test_build_map_of_no_dataset_says_what_makes_one(
+    encoder_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("build-map", tmp_path, "--out", tmp_path / "map", "--encoder", encoder_file) == 1
+    assert "streetfix simulate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("ros", "x"), "kind: 'ros' is not known"),
+        (("kitti-object", "x", "--depth", "radar"), "depth: 'radar' is neither"),
+    ],
+)
+def test_import_says_what_there_is(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("import", *arguments, "--out", tmp_path / "out") == 1
+    assert message in capsys.readouterr().err
+
+
+def test_train_refuses_a_recipe_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("torch", reason="needs the extra `training`")
+    assert run("train", "--run", tmp_path / "run", "--recipe", "soup") == 1
+    assert "recipe: 'soup' is none of stock" in capsys.readouterr().err
+
+
+def test_export_of_no_run_says_what_makes_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("torch", reason="needs the extra `training`")
+    assert run("export", tmp_path, "--out", tmp_path / "encoder.onnx") == 1
+    assert "streetfix train" in capsys.readouterr().err
+    assert not (tmp_path / "encoder.onnx").exists()
