@@ -28,7 +28,7 @@ from service.localization.encoder import Encoder
 from service.maps.reader import MapBundle
 
 BOTH = ("precise", "stereo")
-RAW_QUERIES = 150  # of each city and preset: the raw image is slow, and so many tell 0.3 from 0.4
+RAW_EVERY = 3  # each third query of a set is asked of the raw image too: it is slow, and so many tell 0.3 from 0.4
 
 
 def paper_plan() -> SimulationPlan:
@@ -82,13 +82,13 @@ class Runs:
         return result.figures | {"predictions": result.predictions}
 
     def raw(self, bundle: MapBundle, dataset: Dataset, name: str) -> dict[str, tuple[int, int]]:
-        """The raw range image: right ones and number of queries by setting, over the first queries of a set."""
-        kept = self.work / "raw" / f"{dataset.name}-{name}.json"
+        """The raw range image: right ones and number of queries by setting, over each third query of a set."""
+        kept = self.work / "raw" / f"{dataset.name}-{name}-every{RAW_EVERY}.json"
         if not kept.exists():
             kept.parent.mkdir(parents=True, exist_ok=True)
             with bars() as report:
-                best = raw_best_views(bundle, dataset, [name], limit=RAW_QUERIES, report=report)
-            truth = [f.T_map_camera[:2, 3] for f in dataset.queries(name) if f.T_map_camera is not None][:RAW_QUERIES]
+                best = raw_best_views(bundle, dataset, [name], every=RAW_EVERY, report=report)
+            truth = [f.T_map_camera[:2, 3] for f in dataset.queries(name) if f.T_map_camera is not None][::RAW_EVERY]
             xy = bundle.T_map_place[:, :2, 3]
             counts = {}
             for setting, place in best.items():
@@ -100,8 +100,9 @@ class Runs:
 
 def pooled(parts: list[dict[str, Any]], key: str) -> tuple[float, int, list[float]]:
     """A share over several cities: value, count, Wilson interval."""
-    count = sum(part["queries"] for part in parts)
-    right = round(sum(part[key] * part["queries"] for part in parts))
+    of = "street_queries" if key == "street_accuracy" else "queries"
+    count = sum(part[of] for part in parts)
+    right = round(sum(part[key] * part[of] for part in parts))
     return right / count, count, list(wilson_interval(right, count))
 
 

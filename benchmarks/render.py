@@ -25,7 +25,8 @@ def main() -> None:
         made = report["made"]
         lines += [
             f"## {path.stem}", "",
-            f"`{made['command']}` on {made['date'][:10]} at commit `{made['commit'][:10]}`, {made['minutes']:g} minutes, {made['machine']}.", "",
+            f"`{made['command']}` on {made['date'][:10]} at commit `{made['commit'][:10]}`,",
+            f"{made['minutes']:g} minutes, {made['machine']}.", "",
             "| row | value | 95 % interval | n | bar | |", "|---|---|---|---|---|---|",
         ]  # fmt: skip
         lines += [_line(row) for row in report["rows"]]

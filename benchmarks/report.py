@@ -29,6 +29,11 @@ class Report:
     rows: list[dict[str, Any]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
     _began: float = field(default_factory=time.monotonic)
+    # What is measured is the code as it was loaded, not as it is when the report is written.
+    _commit: str = field(default_factory=lambda: _git("rev-parse", "HEAD"))
+    _dirty: bool = field(
+        default_factory=lambda: bool(_git("status", "--porcelain", "--", "service", "model_training", "benchmarks"))
+    )
 
     def row(
         self, row_id: str, value: float | None, unit: str, *, bar: float | None = None, better: Literal["higher", "lower"] = "higher",
@@ -53,7 +58,7 @@ class Report:
     def write(self) -> Path:
         """Write the file and say where."""
         made = {
-            "commit": _git("rev-parse", "HEAD"), "dirty": bool(_git("status", "--porcelain", "--", "service", "model_training", "benchmarks")),
+            "commit": self._commit, "dirty": self._dirty,
             "date": datetime.now(UTC).isoformat(timespec="seconds"), "machine": machine(), "command": self.command,
             "minutes": round((time.monotonic() - self._began) / 60, 2),
         }  # fmt: skip

@@ -50,7 +50,7 @@ def own_size(report: Report, packs: list[Path], work: Path, steps: int) -> None:
     minutes = PAPER_FRAMES * PAPER_EPOCHS / images / 60
     report.row("training.images_per_s", images, "1/s", n=last - first)
     report.row("training.minutes_for_paper_images", minutes, "min", bar=10, better="lower", n=last - first,
-               why=f"{PAPER_FRAMES} x {PAPER_EPOCHS} branches of pairs at 32 x 128; the paper: {PAPER_MINUTES} min at 224 x 224")  # fmt: skip
+               why=f"{PAPER_FRAMES} x {PAPER_EPOCHS} branches of pairs, 32 x 128; the paper: {PAPER_MINUTES} min, 224 x 224")  # fmt: skip
 
 
 def paper_size(report: Report, packs: list[Path], steps: int) -> None:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.build import BuildSettings, view_ranges
 from service.errors import NoDepthError
-from service.imaging.query_view import query_view
+from service.imaging.query_view import query_views
 from service.imaging.view_grid import ViewGrid
+from service.localization.localizer import TURNS_RAD
 from service.maps.reader import MapBundle
 
 Ranges = NDArray[np.float32]
@@ -59,19 +60,21 @@ def similarities(queries: Ranges, views: Ranges) -> dict[str, Ranges]:
 
 
 def raw_best_views(
-    bundle: MapBundle, dataset: Dataset, names: list[str], *, limit: int | None = None,
+    bundle: MapBundle, dataset: Dataset, names: list[str], *, every: int = 1,
     report: Callable[[str, int, int], None] = lambda *_: None,
 ) -> dict[str, NDArray[np.int64]]:  # fmt: skip
-    """Number of the best place of every query of the sets, by every setting; -1 where a query measures nothing.
+    """Number of the best place of queries of the sets, by every setting; -1 where a query measures nothing.
 
-    ``limit`` takes only the first queries of each set.
+    A query is asked at the same turns as the localizer asks it. ``every`` takes each n-th query of each set.
     """
-    queries, usable = _query_ranges(bundle, dataset, names, limit)
+    queries, usable = _query_ranges(bundle, dataset, names, every)
+    asked = queries[usable].reshape(-1, *queries.shape[2:])
     best = {name: np.full(len(usable), -1, np.int64) for name in SETTINGS}
     score = {name: np.full(len(usable), -np.inf, np.float32) for name in SETTINGS}
     settings = BuildSettings(
         name=bundle.name, spacing_m=bundle.manifest.spacing_m, headings=bundle.manifest.headings,
-        expected_lidar_height_m=bundle.manifest.parameters["expected_lidar_height_m"], remove_weather=bool(bundle.manifest.parameters["weather_removed"]),
+        expected_lidar_height_m=bundle.manifest.parameters["expected_lidar_height_m"],
+        remove_weather=bool(bundle.manifest.parameters["weather_removed"]),
     )  # fmt: skip
     waiting: list[Ranges] = []
     first = 0
@@ -81,7 +84,8 @@ def raw_best_views(
         report("raw range images", place, total)
         if len(waiting) * len(fan) >= CHUNK or place == total:
             views = np.concatenate(waiting)
-            for name, similarity in similarities(queries[usable], views).items():
+            for name, each_turn in similarities(asked, views).items():
+                similarity = each_turn.reshape(-1, queries.shape[1], len(views)).max(axis=1)
                 at = similarity.argmax(axis=1)
                 top = similarity[np.arange(len(at)), at]
                 better = top > score[name][usable]
@@ -93,19 +97,25 @@ def raw_best_views(
 
 
 def _query_ranges(
-    bundle: MapBundle, dataset: Dataset, names: list[str], limit: int | None
+    bundle: MapBundle, dataset: Dataset, names: list[str], every: int
 ) -> tuple[Ranges, NDArray[np.bool_]]:
+    """Ranges (N, turns, rows, columns) and which queries measure anything (N)."""
     grid: ViewGrid = bundle.grid
     rows, usable = [], []
     for name in names:
-        for frame in islice(dataset.queries(name), limit):
+        for frame in islice(dataset.queries(name), 0, None, every):
             try:
-                view = query_view(
-                    frame.rgb(), frame.depth_m(), frame.camera.pinhole(), grid=grid, rows_seen=bundle.rows_seen
+                views = query_views(
+                    frame.rgb(),
+                    frame.depth_m(),
+                    frame.camera.pinhole(),
+                    grid=grid,
+                    rows_seen=bundle.rows_seen,
+                    turns_rad=TURNS_RAD,
                 )
-                rows.append(view.planes[0])
+                rows.append(views.planes[:, 0])
                 usable.append(True)
             except NoDepthError:
-                rows.append(np.zeros((grid.rows, grid.columns), np.float32))
+                rows.append(np.zeros((len(TURNS_RAD), grid.rows, grid.columns), np.float32))
                 usable.append(False)
     return np.stack(rows), np.array(usable)

@@ -29,6 +29,7 @@ def command(
 ) -> None:
     """Build a map bundle of a dataset's survey.
 
+    \b
     Example:
       streetfix build-map data/paper --out maps/paper-city
     """

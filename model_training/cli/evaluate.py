@@ -48,18 +48,22 @@ def command(
 ) -> None:
     """Measure a map against queries whose truth is known.
 
+    \b
     Example:
       streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
     """
     opened, data = MapBundle.open(bundle), Dataset(dataset)
+    names = queries or data.query_sets(with_truth=True)
+    if trajectory is not None and len(names) != 1:
+        raise DatasetError(
+            f"trajectory: one query set is wanted, not {len(names)}: name it by --queries", field="queries"
+        )
+    for file in (json_file, trajectory):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
     with bars() as report:
-        result = evaluate(opened, data, queries, workers=workers, report=report)
+        result = evaluate(opened, data, names, workers=workers, report=report)
         figures = result.figures
-        if trajectory is not None and len(result.predictions) != 1:
-            raise DatasetError(
-                f"trajectory: one query set is wanted, not {len(result.predictions)}: name it by --queries",
-                field="queries",
-            )
         if raw_baseline:
             _add_raw(figures, opened, data, list(result.predictions), report)
     if trajectory is not None:

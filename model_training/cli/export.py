@@ -16,6 +16,7 @@ def command(
 ) -> None:
     """Export a trained encoder to ONNX and check it against torch.
 
+    \b
     Example:
       streetfix export runs/stock --out encoder.onnx
     """

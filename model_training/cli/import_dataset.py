@@ -6,6 +6,7 @@ from typing import Annotated, Literal, cast
 import typer
 from rich.console import Console
 
+from model_training.cli.progress import bars
 from model_training.datasets.kitti_object import import_kitti_object
 from service.errors import DatasetError
 
@@ -23,6 +24,7 @@ def command(
 ) -> None:
     """Turn somebody else's recording into a dataset folder.
 
+    \b
     Example:
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
     """
@@ -30,7 +32,13 @@ def command(
         raise DatasetError(f"kind: {kind!r} is not known; there is: {', '.join(KINDS)}", field="kind")
     if depth not in DEPTHS:
         raise DatasetError(f"depth: {depth!r} is neither 'stored' nor 'sgbm'", field="depth")
-    summary = import_kitti_object(source, out, depth=cast(Literal["stored", "sgbm"], depth))
+    with bars() as report:
+        summary = import_kitti_object(
+            source,
+            out,
+            depth=cast(Literal["stored", "sgbm"], depth),
+            progress=lambda done, total: report("frames", done, total),
+        )
     console = Console()
     console.print(f"{out}: {summary.places} places, query sets: frames {summary.frames}, elsewhere {summary.elsewhere}")
     if summary.skipped:

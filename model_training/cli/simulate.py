@@ -13,8 +13,8 @@ from service.errors import DatasetError
 
 EXAMPLE = """Simulate a city, its LiDAR survey and RGB-D query drives into a dataset folder.
 
+\b
 Examples:
-
   streetfix simulate --city paper --table1 --drives 5 --depth precise --depth stereo --out data/paper
 
   streetfix simulate --seed 9001 --queries 334 --out data/unseen1

@@ -30,8 +30,8 @@ def command(
 ) -> None:
     """Simulate training cities and train an encoder on them; Ctrl-C saves, the same command goes on.
 
+    \b
     Example, the stock encoder:
-
       streetfix train --run runs/stock && streetfix export runs/stock --out encoder.onnx
     """
     if recipe not in ("stock", "paper"):

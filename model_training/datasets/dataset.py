@@ -20,6 +20,7 @@ from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
 
 FORMAT = 1
 Transforms = NDArray[np.float64]  # (n, 4, 4)
+PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 
 
 class _Model(BaseModel):
@@ -183,7 +184,7 @@ class Dataset:
             raise DatasetError(f"{self.folder} has no query set {name!r}; it has: {known}", field="queries")
         poses_path = folder / "poses.txt"
         truth = read_tum(poses_path)[1] if poses_path.exists() else None
-        pictures = sorted((folder / "rgb").iterdir())
+        pictures = sorted(p for p in (folder / "rgb").iterdir() if p.suffix in PICTURES and p.stem.isdigit())
         names = _camera_names(folder, len(pictures))
         cameras = {camera.name: camera for camera in self.description.sensors.cameras}
         if not cameras:

@@ -168,10 +168,8 @@ class _Importer:
             raise damaged(self._training / "image_2" / f"{name}.png", "the left picture of this frame is missing")
         rgb = read_rgb(left)
         calibration = read_calibration(self._training / "calib" / f"{name}.txt")
-        if self._depth == "stored":
-            values = read_stored_depth(stored, rgb.shape[:2])
-        else:
-            values = _match(rgb, right, calibration)
+        is_stored = self._depth == "stored"
+        values = read_stored_depth(stored, rgb.shape[:2]) if is_stored else _match(rgb, right, calibration)
         queries_name = "elsewhere" if T_map_lidar is None else "frames"
         queries, folder = self._sets[queries_name], query_folder(self._out, queries_name)
         number = f"{len(queries.names):06d}"

@@ -50,7 +50,7 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
     in_street = p.street_true >= 0
     if in_street.any():
         shares["street_accuracy"] = (answered & (p.street_answer == p.street_true))[in_street]
-    result: dict[str, Any] = {"queries": count}
+    result: dict[str, Any] = {"queries": count, "street_queries": int(in_street.sum())}
     result |= {name: float(np.mean(flags)) for name, flags in shares.items()}
     result.setdefault("street_accuracy", None)
     result["error_rate"] = error_rate(shares["street_accuracy"]) if in_street.any() else None

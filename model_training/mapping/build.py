@@ -1,6 +1,7 @@
 """Dataset + encoder -> map bundle: level by PCA, cut the view fan, encode, gather the cloud, write the bundle."""
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -25,7 +26,7 @@ from service.imaging.view_grid import (
 from service.imaging.weather import remove_weather_noise
 from service.localization.encoder import Encoder
 from service.maps.content import BundleContent
-from service.maps.manifest import Manifest
+from service.maps.manifest import NAME, Manifest
 from service.maps.streets import Streets
 from service.maps.writer import write_bundle
 
@@ -82,8 +83,11 @@ def build_map(
         raise BundleError(
             f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
         )
-    data = encoder_file.read_bytes()
-    encoder = Encoder.open(data, threads=threads or os.cpu_count() or 1)
+    if not re.fullmatch(NAME, settings.name):
+        raise DatasetError(
+            f"name: {settings.name!r} cannot name a map; give --name of letters, digits, '.', '_' and '-'", field="name"
+        )
+    encoder = Encoder.open(encoder_file, threads=threads or os.cpu_count() or 1)
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
     poses = dataset.survey_poses()
     if not len(poses):
@@ -116,7 +120,7 @@ def build_map(
         name=settings.name, grid=grid, headings=settings.headings, spacing_m=settings.spacing_m, rows_seen=rows_seen,
         T_map_place=T_map_level, place_street=_streets_of(streets, T_map_level),
         view_place=np.repeat(np.arange(len(kept), dtype=np.int32), settings.headings), view_heading_rad=np.concatenate(headings),
-        descriptors=np.concatenate(descriptors), encoder=data, streets=streets, cloud=cloud.tiles(surfels),
+        descriptors=np.concatenate(descriptors), encoder=encoder_file.read_bytes(), streets=streets, cloud=cloud.tiles(surfels),
         preview_webp=preview_webp(surfels.positions, surfels.normals, T_map_level[:, :3, 3]),
         georeference=dataset.description.georeference,
         calibration={"calibrated": False, "why": "this release does not calibrate confidence yet; answers carry confidence null"},

@@ -44,16 +44,17 @@ def take(
     rays = rays_camera @ R.T
     hits = scene.hits(origin, rays)
     shape = (camera.height, camera.width)
+    material = scene.mesh.material[np.maximum(hits.primitive, 0)]
     lit = _lit(scene, origin, rays, hits, light, shape) if condition.sun_strength > 0 else None
     linear = shade(scene, ground, origin, rays, hits, light, condition, forward=T_map_camera[:3, 2], lit=lit)
     distance = hits.distance
     if blocker is not None:
         stopped, near, albedo = blocker.over(origin, rays, hits)
         distance = np.where(stopped, near, distance)
+        material = np.where(stopped, Material.METAL, material)
         linear = np.where(stopped[:, None], albedo * light.sky, linear)
     rgb = _expose(linear.reshape(*shape, 3), condition, rng)
     depth = (distance * z_of_ray).reshape(shape)
-    material = scene.mesh.material[np.maximum(hits.primitive, 0)]
     blank = ((material == Material.GLASS) | (material == Material.METAL) | (material == Material.MATTE)).reshape(shape)
     return Picture(rgb, depth, blank & (depth > 0))
 

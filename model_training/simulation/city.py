@@ -100,7 +100,7 @@ class City:
         builder = MeshBuilder()
         for k, (x, y, yaw, share) in enumerate(self._parking):
             keeper = np.random.default_rng([self.seed, 11, k])
-            stays = keeper.random() >= parked_changed
+            stays = keeper.random() >= parked_changed or traversal == 0
             rng = keeper if stays else np.random.default_rng([self.seed, 12, traversal, k])
             if rng.random() < share:
                 base = np.array([x, y, self.height(x, y)]) + [*rng.normal(0, 0.15, 2), 0.0]

@@ -27,7 +27,7 @@ class Condition:
     extinction_per_m: float = 0.0
     false_returns: float = 0.0
     false_reach_m: float = 4.0
-    wet: float = 0.0  # darkens surfaces and drops specular ones from the LiDAR
+    wet: float = 0.0  # darkens surfaces, for the LiDAR too
     snow_cover: float = 0.0
     sun_elevation_deg: float = 40.0
     sun_strength: float = 1.0
@@ -43,12 +43,13 @@ CONDITIONS = {
     c.name: c
     for c in (
         Condition("clear"),
-        Condition("rain", 1.076 * 25**0.67 * _PER_METRE, 0.012, 4.0, wet=0.8, sun_strength=0.0, ambient=0.8, streaks=0.5,
+        Condition("rain", 1.076 * 25**0.67 * _PER_METRE, 0.024, 4.0, wet=0.8, sun_strength=0.0, ambient=0.8, streaks=0.5,
                   disparity_noise=1.4, holes=0.25),
-        Condition("snow", 5.50 * 2**1.38 * _PER_METRE, 0.04, 6.0, snow_cover=0.7, sun_strength=0.0, ambient=0.9, streaks=1.0,
+        Condition("snow", 5.50 * 2**1.38 * _PER_METRE, 0.08, 6.0, snow_cover=0.7, sun_strength=0.0, ambient=0.9, streaks=1.0,
                   disparity_noise=1.5, holes=0.35),
-        Condition("fog", 3.912 / 50, 0.08, 5.0, sun_strength=0.0, ambient=0.9, disparity_noise=1.8, holes=0.3),
-        # 1 lux against some 10,000 of a cloudy day: the camera gains by 1000 and sees its own noise beyond the headlights.
+        Condition("fog", 3.912 / 50, 0.16, 5.0, sun_strength=0.0, ambient=0.9, disparity_noise=1.8, holes=0.3),
+        # 1 lux is 1/10,000 of a cloudy day; with a long exposure and the gain at its limit a picture is as dark and noisy
+        # as one of about 1/80 taken by day, which is what is drawn here.
         Condition("night", sun_strength=0.0, ambient=0.012, headlights=True, disparity_noise=1.8, holes=0.5),
         Condition("low_sun", sun_elevation_deg=6.0, sun_strength=1.3, ambient=0.7, glare=1.0, disparity_noise=1.2, holes=0.2),
     )

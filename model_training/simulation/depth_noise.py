@@ -6,6 +6,7 @@ Szeliski, IJCV 47, 2002; Menze and Geiger, CVPR 2015.
 """
 
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import cv2
 import numpy as np
@@ -25,11 +26,11 @@ class DepthModel:
     name: str
     focal_baseline_px_m: float = 80.0
     noise_px: float = 0.1
-    correlated: float = 0.5  # share of the noise's deviation common to patches of 16 and 60 px
+    correlated: float = 0.5  # share of the noise's variance common to patches of 16 and 60 px
     step_px: float = 1 / 16
     offset_px: float = 0.0  # one sigma, a frame
     scale_error: float = 0.003  # one sigma, a frame
-    bleeding: float = 0.4  # share of edges that take the foreground's depth
+    bleeding: float = 0.42  # share of edges that take the foreground's depth
     hole_level: float = 2.3  # patches of a unit normal field above this are missing
     invented_frames: float = 0.0  # share of frames with depth made up in sky, glass and blank walls
     min_range_m: float = 0.4
@@ -73,7 +74,8 @@ def measured_depth(
     zoom = shape[1] / 640.0
 
     def patch(pixels: float) -> int:
-        return max(1, int(round(pixels * zoom)))
+        whole: int = max(1, round(pixels * zoom))
+        return whole
 
     there = clean_m > 0
     z = np.where(there, clean_m, np.float32(BEYOND_M))
@@ -83,7 +85,7 @@ def measured_depth(
     near = cv2.erode(z, np.ones((size, size), np.uint8))
     edge = (z - near) > np.maximum(0.5, 0.08 * near)
     mixing = np.float32(0.3 * rng.random())
-    bleed = edge & (_field(rng, shape, patch(12), smooth=False) > 0.2) & (model.bleeding > 0)
+    bleed = edge & (_unit(_field(rng, shape, patch(12), smooth=False)) > _level_of(model.bleeding))
     z = np.where(bleed, near * (1 - mixing) + np.minimum(z, np.float32(60)) * mixing, z)
     measured = (there | bleed) & (z < 150)
     noise = np.zeros(shape, np.float32)
@@ -112,6 +114,11 @@ def measured_depth(
     seen = seen * np.float32(1 + model.scale_error * rng.standard_normal())
     measured &= (seen > model.min_range_m) & (seen < model.max_range_m)
     return np.where(measured, seen, np.float32(0)).astype(np.float32)
+
+
+def _level_of(share: float) -> float:
+    """The level that a unit normal field exceeds in this share of its pixels."""
+    return NormalDist().inv_cdf(1 - share) if share > 0 else float("inf")
 
 
 def _unit(field: Depth) -> Depth:

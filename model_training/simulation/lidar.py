@@ -75,7 +75,7 @@ def scan(
     met &= (distance > 0.3) & (distance < model.max_range_m) & (chance < keep_share)
     if condition.false_returns > 0:
         reach = rng.exponential(condition.false_reach_m, count).astype(np.float32) + np.float32(0.8)
-        false = (rng.random(count) < condition.false_returns * 2.0) & ((reach < distance) | ~met)
+        false = (rng.random(count) < condition.false_returns) & ((reach < distance) | ~met)
         distance = np.where(false, reach, distance)
         reflectance = np.where(false, np.float32(0.05), reflectance)
         met |= false

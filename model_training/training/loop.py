@@ -76,8 +76,7 @@ def train(
     grid, place = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns), device_of(device)
     run.mkdir(parents=True, exist_ok=True)
     _keep_config(run, config)
-    earlier = [] if start_from is None else json.loads((start_from / "packs.json").read_text())
-    (run / "packs.json").write_text(json.dumps(earlier + [folder.name for folder in packs], indent=1) + "\n")
+    _keep_packs(run, packs, start_from)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     generator = torch.Generator(device=place).manual_seed(config.seed)
@@ -176,6 +175,16 @@ def trained_on(run: Path) -> tuple[str, ...]:
     """Cities that a run was trained on, ``KIND-SEED``, those of the run that it started from included."""
     names: list[str] = json.loads((run / "packs.json").read_text())
     return tuple("-".join(name.split("-")[1:3]) for name in names)
+
+
+def _keep_packs(run: Path, packs: list[Path], start_from: Path | None) -> None:
+    """Write down what the run learns from, and what the run before it did; refuse to go on with other cities."""
+    path = run / "packs.json"
+    earlier: list[str] = [] if start_from is None else json.loads((start_from / "packs.json").read_text())
+    names = earlier + [folder.name for folder in packs]
+    if path.exists() and json.loads(path.read_text()) != names:
+        raise DatasetError(f"{path} names other cities; take another --run folder, or remove this one", field="run")
+    path.write_text(json.dumps(names, indent=1) + "\n")
 
 
 def _keep_config(run: Path, config: TrainingConfig) -> None:

@@ -8,6 +8,7 @@ from importlib.metadata import version as installed_version
 from typing import Annotated, Any
 
 import typer
+from pydantic import ValidationError
 
 from service.cli import localize, serve
 from service.errors import ExtraMissingError, StreetfixError
@@ -33,6 +34,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except StreetfixError as error:
         typer.echo(f"streetfix: {error.message}", err=True)
         sys.exit(1)
+    except ValidationError as error:  # of a command's own settings: name the option, not the model
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        typer.echo(f"streetfix: {where}: {first['msg']} (given: {first.get('input')!r})", err=True)
+        sys.exit(2)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)

@@ -82,7 +82,7 @@ def quaternion_xyzw_from(rotation: Rotation) -> Float64[NDArray[np.float64], "4"
     else:
         q = np.array([m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], s * s / 4, m[1, 0] - m[0, 1]]) / s
     q = q / np.linalg.norm(q)
-    unit: Float64[NDArray[np.float64], "4"] = -q if q[3] < 0 else q
+    unit: Float64[NDArray[np.float64], 4] = -q if q[3] < 0 else q
     return unit
 
 

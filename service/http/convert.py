@@ -54,7 +54,7 @@ def query_from_parts(parts: dict[str, bytes]) -> EncodedQuery:
         scale_m=request.depth.scale_m,
         baseline_m=request.depth.baseline_m,
         max_range_m=request.depth.max_range_m,
-        down_camera=None if request.gravity is None else _direction(request.gravity, "gravity"),
+        down_camera=None if request.gravity is None else _down(request.gravity),
         T_vehicle_camera=None if request.T_vehicle_camera is None else _transform(request.T_vehicle_camera),
         neighbours=request.options.neighbours,
     )
@@ -125,6 +125,17 @@ def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
             f"{field}: a vector of length {length:g} has no direction; send the accelerometer's", field=field
         )
     return direction / length
+
+
+def _down(gravity: schema.Vector) -> NDArray[np.float64]:
+    """Gravity's direction; along the optical axis it leaves no heading to localize."""
+    down = _direction(gravity, "gravity")
+    if abs(down[2]) > np.cos(np.deg2rad(20.0)):
+        raise RequestError(
+            f"gravity: ({down[0]:.2f}, {down[1]:.2f}, {down[2]:.2f}) says that the camera looks straight up or down; "
+            "send it in the camera frame: x right, y down, z forward", field="gravity",
+        )  # fmt: skip
+    return down
 
 
 def _transform(transform: schema.RigidTransform) -> NDArray[np.float64]:

@@ -69,7 +69,8 @@ def ray_lengths(camera: PinholeCamera) -> Float64[NDArray[np.float64], "H W"]:
     A distorted picture's rays are those of its pixels before rectification.
     """
     if not camera.distortion:
-        rays: NDArray[np.float64] = np.linalg.norm(camera.rays_of_pixels(), axis=-1)
+        x, y = (np.arange(camera.width) - camera.cx) / camera.fx, (np.arange(camera.height) - camera.cy) / camera.fy
+        rays: NDArray[np.float64] = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
         return rays
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
     xy = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera.matrix, np.array(camera.distortion))

@@ -15,7 +15,6 @@ from service.localization.search import distinct_places, search_views
 from service.localization.street_vote import vote
 from service.maps.reader import MapBundle
 
-
 #: A query is also asked turned a third of the fan's 15 degrees either way: some turn is then within 2.5 degrees of a view.
 TURNS_RAD = tuple(float(turn) for turn in np.deg2rad([-5.0, 0.0, 5.0]))
 

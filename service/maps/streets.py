@@ -74,7 +74,7 @@ def _street_from(feature: Any, number: int) -> Street:
         properties, geometry = feature["properties"], feature["geometry"]
         kind, coordinates = geometry["type"], geometry["coordinates"]
         identity, street, section = properties["id"], properties["street"], properties["section"]
-        name, class_index = properties["name"], properties["class_index"]
+        name, class_index = properties["name"], properties.get("class_index", number)
     except (KeyError, TypeError) as missing:
         raise _defect(f"feature {number} lacks {missing}") from missing
     if section not in ("beginning", "end", None):

@@ -14,8 +14,8 @@ class Admission:
     """Runs tasks on a few threads; refuses beyond a bounded queue."""
 
     def __init__(self, *, threads: int, queue: int, initializer: Callable[[], None] | None = None) -> None:
-        self._capacity = threads + queue
-        self._slots = threading.Semaphore(self._capacity)
+        self.capacity = threads + queue
+        self._slots = threading.Semaphore(self.capacity)
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="streetfix", initializer=initializer)
 
     def submit(self, task: Callable[[], T]) -> Future[T]:
@@ -25,7 +25,7 @@ class Admission:
             BusyError: all workers are at work and the queue is full.
         """
         if not self._slots.acquire(blocking=False):
-            raise BusyError(f"{self._capacity} requests are being worked on or wait already; try again in a second")
+            raise BusyError(f"{self.capacity} requests are being worked on or wait already; try again in a second")
         try:
             future = self._pool.submit(task)
         except RuntimeError as error:

@@ -8,7 +8,7 @@ from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.errors import DeadlineError
+from service.errors import BusyError, DeadlineError
 from service.http import schema
 from service.http.body import read_body, split_multipart
 from service.http.convert import answer_from, query_from_parts
@@ -54,6 +54,7 @@ def router_for(engine: Engine) -> APIRouter:
     """The route, bound to an engine."""
     router = APIRouter(tags=["localization"])
     settings = engine.settings
+    bodies = asyncio.Semaphore(engine.admission.capacity)  # bounds the memory of bodies that are still coming in
 
     @router.post(
         "/v1/localize",
@@ -69,8 +70,12 @@ def router_for(engine: Engine) -> APIRouter:
         The answer rests on retrieval: its position is the similarity-weighted mean of the best hypothesis' places.
         `prior` is a reserved name, refused until it means something; `options.refine` allows what a later release does.
         """
+        if bodies.locked():
+            raise BusyError(
+                f"{engine.admission.capacity} requests are coming in or wait already; try again in a second"
+            )
         try:
-            async with asyncio.timeout(settings.request_timeout_s):
+            async with asyncio.timeout(settings.request_timeout_s), bodies:
                 return await _answer(engine, request)
         except TimeoutError as error:
             raise DeadlineError(

@@ -5,7 +5,7 @@ import pytest
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import rotation_z
-from service.imaging.query_view import query_view
+from service.imaging.query_view import query_view, query_views
 from service.imaging.view_grid import PLANES, ViewGrid
 
 GRID = ViewGrid(rows=16, columns=32)
@@ -145,3 +145,10 @@ def test_a_picture_without_a_usable_depth_is_refused_with_the_limits(depth_m):
 def test_the_measured_share_is_that_of_the_cells():
     view = view_of()
     assert view.measured_share == pytest.approx(np.mean(plane(view, "range_m") > 0))
+
+
+def test_views_at_several_turns_are_those_at_each_of_them():
+    turns = (-0.1, 0.0, 0.2)
+    together = query_views(grey(), wall_depth(), CAMERA, grid=GRID, rows_seen=SEEN, turns_rad=turns)
+    for planes, turn in zip(together.planes, turns, strict=True):
+        np.testing.assert_array_equal(planes, view_of(turn_rad=turn).planes)
