@@ -37,9 +37,13 @@ def command(
         else:
             demo = recorded_demo(real, out or Path("out/demo-real"), encoder, report)
     with serving(demo.bundle, port) as service:
-        _show(demo, service.url, console, began, goes_on=not once)
-        if not once:
-            service.wait_for_ctrl_c()
+        try:
+            _show(demo, service.url, console, began, goes_on=not once)
+            if not once:
+                service.wait()
+        except KeyboardInterrupt:  # also one that comes while the last lines are printed
+            if once:
+                raise
             console.print("stopped")
 
 

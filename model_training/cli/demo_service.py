@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import IO
+from typing import IO, NoReturn
 
 import httpx
 
@@ -27,16 +27,13 @@ class RunningService:
     url: str
     process: "subprocess.Popen[str]"
 
-    def wait_for_ctrl_c(self) -> None:
-        """Stay until the user has enough.
+    def wait(self) -> NoReturn:
+        """Stay until the user has enough, which is a KeyboardInterrupt.
 
         Raises:
             UnreachableError: the service ended by itself.
         """
-        try:
-            status = self.process.wait()
-        except KeyboardInterrupt:
-            return
+        status = self.process.wait()
         raise UnreachableError(f"{self.url}: the service ended by itself (status {status}); why it says above")
 
 

@@ -89,7 +89,8 @@ def test_it_goes_on_serving_until_it_is_told_to_stop(
     assert is_listening(url)
     process.send_signal(number)
     out, err = process.communicate(timeout=60)
-    assert (process.returncode, out, "Traceback" in err) == (0, "stopped\n", False)
+    # The signal may come while the last lines are being printed, which then come again.
+    assert (process.returncode, out.endswith("stopped\n"), "Traceback" in err) == (0, True, False)
     assert not is_listening(url)
 
 
