@@ -58,8 +58,9 @@ def test_with_once_it_says_how_to_serve_again(once: str) -> None:
 def serving(arguments: list[str], once: str) -> Iterator[tuple["subprocess.Popen[str]", str, str]]:
     """A demo that goes on serving over what ``once`` made: process, address, and what it printed."""
     process = subprocess.Popen(
-        arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT
-    )
+        arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
+        preexec_fn=_mind_ctrl_c,
+    )  # fmt: skip
     assert process.stdout is not None
     printed = ""
     for line in process.stdout:
@@ -69,8 +70,13 @@ def serving(arguments: list[str], once: str) -> Iterator[tuple["subprocess.Popen
     else:
         raise AssertionError(process.communicate())
     yield process, found[1], printed
-    process.kill()
-    process.communicate()
+    process.terminate()  # not kill: it takes its service with it
+    process.communicate(timeout=30)
+
+
+def _mind_ctrl_c() -> None:
+    """A test run in the background is started with Ctrl-C ignored, and would hand that on."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def is_listening(url: str) -> bool:
