@@ -19,6 +19,7 @@ _COVER_ALBEDO[Cover.PAVING] = (0.34, 0.33, 0.31)
 _COVER_ALBEDO[Cover.MARKING] = (0.62, 0.62, 0.60)
 _COVER_ALBEDO[Cover.SOIL] = (0.22, 0.16, 0.11)
 
+CHUNK = 8192  # rays shaded at a time: what they need stays in the cache
 _ROUGHNESS = np.array([0.25, 0.12, 0.30, 0.05, 0.45, 0.04], np.float32)  # contrast of the texture, by material
 
 
@@ -123,21 +124,19 @@ def shade(
         forward: optical axis, for the headlights.
         lit: which hits see the sun; None casts shadow rays here.
     """
-    met, missed = np.flatnonzero(hits.primitive >= 0), np.flatnonzero(hits.primitive < 0)
     colour = np.empty((len(rays), 3), np.float32)
-    colour[missed] = _sky(rays.take(missed, axis=0), light, condition)
-    solid = Hits(hits.distance.take(met), hits.primitive.take(met), hits.normal.take(met, axis=0))
-    colour[met] = _surfaces(
-        scene,
-        ground,
-        origin,
-        rays.take(met, axis=0),
-        solid,
-        light,
-        condition,
-        forward,
-        None if lit is None else lit.take(met),
-    )
+    for start in range(0, len(rays), CHUNK):
+        part = slice(start, start + CHUNK)
+        some = Hits(hits.distance[part], hits.primitive[part], hits.normal[part])
+        met, missed = np.flatnonzero(some.primitive >= 0), np.flatnonzero(some.primitive < 0)
+        ahead, found = rays[part], np.empty((len(some.primitive), 3), np.float32)
+        found[missed] = _sky(ahead.take(missed, axis=0), light, condition)
+        found[met] = _surfaces(
+            scene, ground, origin, ahead.take(met, axis=0),
+            Hits(some.distance.take(met), some.primitive.take(met), some.normal.take(met, axis=0)),
+            light, condition, forward, None if lit is None else lit[part].take(met),
+        )  # fmt: skip
+        colour[part] = found
     return colour
 
 
