@@ -5,7 +5,7 @@ PYTHON ?= python3
 # The CPU build where pip is offered one; `make TORCH="torch==2.13.0 --index-url ..." test` takes another.
 TORCH ?= torch==2.13.0
 # Optimiser steps of the stock encoder.
-STEPS ?= 3200
+STEPS ?= 4600
 # Further steps on the paper's city, for the encoder that stands beside it in the report.
 PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.

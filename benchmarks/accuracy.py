@@ -5,30 +5,20 @@ finished is kept under ``--work`` and reused, so an interrupted run goes on.
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.kitti_retrieval import retrieve
 from benchmarks.report import ROOT, Report
-from model_training.baselines.raw_range import raw_best_views
-from model_training.cli.progress import bars
-from model_training.datasets.dataset import Dataset
+from benchmarks.runs import Runs, share
+from benchmarks.weather import weather_rows
 from model_training.evaluation.error_measures import wilson_interval
-from model_training.evaluation.evaluate import evaluate
-from model_training.evaluation.measures import recall_at
-from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.plan import QueryPlan, SimulationPlan
-from model_training.simulation.simulate import simulate
 from model_training.stock import ENCODER
 from model_training.training.recipe import EVALUATION_SEEDS
 from service.localization.encoder import Encoder
-from service.maps.reader import MapBundle
 
 BOTH = ("precise", "stereo")
-RAW_EVERY = 3  # each third query of a set is asked of the raw image too: it is slow, and so many tell 0.3 from 0.4
 
 
 def paper_plan() -> SimulationPlan:
@@ -48,76 +38,10 @@ def unseen_plan(index: int) -> SimulationPlan:
     return SimulationPlan(name=f"unseen-{index + 1}", seed=EVALUATION_SEEDS[index + 1], queries=queries)
 
 
-class Runs:
-    """Datasets, maps and figures under one folder, made once."""
-
-    def __init__(self, work: Path) -> None:
-        self.work = work
-
-    def dataset(self, plan: SimulationPlan) -> Dataset:
-        """Simulate a plan, or take it as it is."""
-        folder = self.work / plan.name
-        with bars() as report:
-            simulate(plan, folder, report=report)
-        return Dataset(folder)
-
-    def bundle(self, dataset: Dataset, encoder: Path) -> MapBundle:
-        """Build a map with an encoder, or take the one that this encoder made."""
-        folder = self.work / "maps" / f"{dataset.name}-{Encoder.open(encoder).sha256[:12]}"
-        if not folder.exists():
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            with bars() as report:
-                build_map(dataset, encoder, folder, BuildSettings(name=dataset.name), report=report)
-        return MapBundle.open(folder)
-
-    def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str]) -> dict[str, Any]:
-        """Evaluate query sets; the answers lie beside for later measures."""
-        with bars() as report:
-            result = evaluate(bundle, dataset, names, report=report)
-        folder = self.work / "predictions" / bundle.path.name
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, predictions in result.predictions.items():
-            predictions.save(folder / f"{name}.npz")
-        (folder / f"{'+'.join(names)[:80]}.json").write_text(json.dumps(result.figures, indent=1))
-        return result.figures | {"predictions": result.predictions}
-
-    def raw(self, bundle: MapBundle, dataset: Dataset, name: str) -> dict[str, tuple[int, int]]:
-        """The raw range image: right ones and number of queries by setting, over each third query of a set."""
-        kept = self.work / "raw" / f"{dataset.name}-{name}-every{RAW_EVERY}.json"
-        if not kept.exists():
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            with bars() as report:
-                best = raw_best_views(bundle, dataset, [name], every=RAW_EVERY, report=report)
-            truth = [f.T_map_camera[:2, 3] for f in dataset.queries(name) if f.T_map_camera is not None][::RAW_EVERY]
-            xy = bundle.T_map_place[:, :2, 3]
-            counts = {}
-            for setting, place in best.items():
-                right = recall_at(xy[place][:, None], np.array(truth), 1) & (place >= 0)
-                counts[setting] = (int(right.sum()), len(truth))
-            kept.write_text(json.dumps(counts))
-        return {setting: (right, count) for setting, (right, count) in json.loads(kept.read_text()).items()}
-
-
-def pooled(parts: list[dict[str, Any]], key: str) -> tuple[float, int, list[float]]:
-    """A share over several cities: value, count, Wilson interval."""
-    of = "street_queries" if key == "street_accuracy" else "queries"
-    count = sum(part[of] for part in parts)
-    right = round(sum(part[key] * part[of] for part in parts))
-    return right / count, count, list(wilson_interval(right, count))
-
-
-def share(
-    report: Report, row_id: str, figures: dict[str, Any] | list[dict[str, Any]], key: str, bar: float | None = None
-) -> None:
-    """A row of one share, over one or several evaluations."""
-    value, count, interval = pooled(figures if isinstance(figures, list) else [figures], key)
-    report.row(row_id, value, "share", bar=bar, n=count, ci95=interval)
-
-
-def paper_rows(report: Report, runs: Runs, encoder: Path, prefix: str, *, barred: bool) -> None:
+def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None:
     """The paper's city with one encoder."""
     dataset = runs.dataset(paper_plan())
-    bundle = runs.bundle(dataset, encoder)
+    bundle = runs.bundle(dataset)
     bars_of = {"precise": (0.9752, 0.98, 0.998), "stereo": (0.95, 0.95, None)}
     for preset in BOTH:
         figures = runs.figures(bundle, dataset, [f"drive{k}_{preset}" for k in range(1, 6)])
@@ -133,13 +57,13 @@ def paper_rows(report: Report, runs: Runs, encoder: Path, prefix: str, *, barred
     share(report, f"{prefix}.paper_city.same_drive.recall_at_1_5m", own, "recall_at_1_5m")
 
 
-def unseen_rows(report: Report, runs: Runs, encoder: Path) -> None:
+def unseen_rows(report: Report, runs: Runs) -> None:
     """Three unseen cities with the stock encoder, clear and blocked, and the raw image beside."""
     found: dict[str, list[dict[str, Any]]] = {"drive1_precise": [], "drive1_stereo": [], "blocked25_precise": []}
     raw: dict[str, list[dict[str, tuple[int, int]]]] = {name: [] for name in found}
     for index in range(3):
         dataset = runs.dataset(unseen_plan(index))
-        bundle = runs.bundle(dataset, encoder)
+        bundle = runs.bundle(dataset)
         for name, parts in found.items():
             parts.append(runs.figures(bundle, dataset, [name]))
             raw[name].append(runs.raw(bundle, dataset, name))
@@ -172,7 +96,7 @@ def raw_row(report: Report, row_id: str, parts: list[dict[str, tuple[int, int]]]
     )
 
 
-def kitti_rows(report: Report, runs: Runs, encoder: Path, data: Path) -> None:
+def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
     """Real stereo frames; the rows stay, with a reason, where the recordings are not there."""
     kitti, drive = data / "kitti_stereo", data / "kitti_drive"
     if not (kitti.exists() and drive.exists()):
@@ -185,7 +109,7 @@ def kitti_rows(report: Report, runs: Runs, encoder: Path, data: Path) -> None:
                 why=f"no recordings at {data.name}",
             )
         return
-    found = retrieve(Encoder.open(encoder), kitti, drive, runs.work)
+    found = retrieve(Encoder.open(runs.encoder), kitti, drive, runs.work)
     count = int(found["n"])
     for row_id, value, bar in (
         ("real.kitti_stereo.recall_at_1", found["recall_at_1"], 0.97), ("real.kitti_stereo.recall_at_5", found["recall_at_5"], None),
@@ -210,20 +134,21 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="real recordings")
     arguments = parser.parse_args()
-    report, runs = Report("accuracy", "make evaluate"), Runs(arguments.work)
-    kitti_rows(report, runs, arguments.encoder, arguments.data)
-    unseen_rows(report, runs, arguments.encoder)
-    paper_rows(report, runs, arguments.encoder, "retrieval", barred=True)
+    report, runs = Report("accuracy", "make evaluate"), Runs(arguments.work, arguments.encoder)
+    kitti_rows(report, runs, arguments.data)
+    unseen_rows(report, runs)
+    paper_rows(report, runs, "retrieval", barred=True)
+    weather_rows(report, runs)
     paper = runs.dataset(paper_plan())
     for preset in BOTH:
         raw_row(
             report,
             f"raw.paper_city.{preset}.recall_at_1_5m",
-            [runs.raw(runs.bundle(paper, arguments.encoder), paper, f"drive1_{preset}")],
+            [runs.raw(runs.bundle(paper), paper, f"drive1_{preset}")],
             None,
         )
     if arguments.paper_encoder.exists():
-        paper_rows(report, runs, arguments.paper_encoder, "trained_on_paper_city", barred=False)
+        paper_rows(report, Runs(arguments.work, arguments.paper_encoder), "trained_on_paper_city", barred=False)
     else:
         report.row(
             "trained_on_paper_city.paper_city.precise.street_accuracy",

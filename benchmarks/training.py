@@ -21,7 +21,7 @@ from model_training.training.augment import Augmenter
 from model_training.training.batches import City
 from model_training.training.encoder_net import EncoderNet, EncoderShape
 from model_training.training.loop import Progress, TrainingConfig, train
-from model_training.training.losses import paired_info_nce
+from model_training.training.losses import Side, paired_info_nce
 from model_training.training.packs import Pack, PackPlan, make_packs
 from service.imaging.view_grid import ViewGrid
 
@@ -73,9 +73,8 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
             memory_format=torch.channels_last
         )
         descriptors = net(large, torch.cat([torch.ones(count), torch.zeros(count)]))
-        loss = paired_info_nce(
-            descriptors[:count], descriptors[count:], batch.query_xy, batch.survey_xy, scale=torch.tensor(20.0)
-        )[0].mean()
+        sides = Side(descriptors[:count], batch.query_xy), Side(descriptors[count:], batch.survey_xy)
+        loss = paired_info_nce(*sides, scale=torch.tensor(20.0))[0].mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()

@@ -20,15 +20,15 @@ class Augmentation(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     disparity_noise_px: tuple[float, float] = (0.02, 0.7)
-    scale_error: float = 0.03
-    invented_depth: float = 0.15
-    short_range: float = 0.4
+    scale_error: float = 0.02
+    invented_depth: float = 0.2
+    short_range: float = 0.25
     shortest_range_m: float = 12.0
     no_colour: float = 0.4
     narrow_rows: float = 0.2
-    narrow_columns: float = 0.3
+    narrow_columns: float = 0.2
     blocked: float = 0.35
-    widest_block: float = 0.45
+    widest_block: float = 0.4
     small_blocks: float = 0.3
     unseen_top_rows: float = 0.15
     survey_noise_m: float = 0.02

@@ -1,4 +1,4 @@
-"""Batches of pairs: all of one city, half of them from one neighbourhood, so that negatives are hard."""
+"""Batches of pairs, all of one city; the caller may ask for some of them, so that negatives are hard."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,7 @@ from model_training.training.packs import Pack
 from service.imaging.view_grid import ViewGrid
 
 PAIR_REACH_M = 2.5
-NEIGHBOURHOOD_M = 70.0
-TURN_DEG = 9.0  # a fan of 24 headings is off by at most 7.5
+TURN_DEG = 4.5  # a fan of 24 headings asked at three turns 5 degrees apart is off by at most 2.5
 
 
 @dataclass(frozen=True)
@@ -28,6 +27,7 @@ class Batch:
     rows_seen: Tensor
     survey_xy: Tensor
     query_xy: Tensor
+    pairs: NDArray[np.int64]
 
     @property
     def images(self) -> int:
@@ -42,19 +42,14 @@ class City:
         self.pack, self._grid = pack, grid
         places = cKDTree(pack.places[:, :2])
         self._places_near = places.query_ball_point(pack.queries[:, :2], PAIR_REACH_M)
-        self._queries = cKDTree(pack.queries[:, :2])
         self.usable = np.array([k for k, near in enumerate(self._places_near) if near])
 
-    def draw(self, pairs: int, rng: np.random.Generator) -> Batch:
-        """Draw a batch of up to ``pairs`` pairs."""
+    def draw(self, pairs: int, rng: np.random.Generator, wanted: NDArray[np.int64] | None = None) -> Batch:
+        """Draw a batch of up to ``pairs`` pairs: ``wanted`` (queries that are usable) and others by chance."""
         pack, grid = self.pack, self._grid
-        middle = pack.queries[rng.integers(len(pack.queries)), :2]
-        near = np.array(self._queries.query_ball_point(middle, NEIGHBOURHOOD_M))
-        near = near[np.isin(near, self.usable)]
-        half = rng.choice(near, min(len(near), pairs // 2), replace=False) if len(near) else np.zeros(0, int)
-        chosen = np.unique(
-            np.concatenate([half, rng.choice(self.usable, pairs - len(half), replace=False)]).astype(int)
-        )
+        first = np.zeros(0, np.int64) if wanted is None else wanted[:pairs]
+        others = rng.choice(self.usable, pairs - len(first), replace=False)
+        chosen = np.unique(np.concatenate([first, others])).astype(np.int64)
         place = np.array([rng.choice(self._places_near[k]) for k in chosen])
         queries, places = pack.queries[chosen], pack.places[place]
         turn = np.deg2rad(rng.uniform(-TURN_DEG, TURN_DEG, len(chosen)))
@@ -73,4 +68,5 @@ class City:
         return Batch(
             tensor(views), tensor(places[:, 3]), tensor(pack.ranges[chosen]), tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)),
             tensor(queries[:, 3]), torch.from_numpy(np.array(pack.rows_seen)), tensor(places[:, :2]), tensor(queries[:, :2]),
+            chosen,
         )  # fmt: skip

@@ -17,7 +17,8 @@ from torch.utils.tensorboard import SummaryWriter
 from model_training.training.augment import Augmentation, Augmenter
 from model_training.training.batches import City
 from model_training.training.encoder_net import EncoderNet, EncoderShape
-from model_training.training.losses import paired_info_nce
+from model_training.training.losses import Side, paired_info_nce
+from model_training.training.memory import DescriptorMemory
 from model_training.training.packs import Pack
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
@@ -38,6 +39,10 @@ class TrainingConfig(BaseModel):
     gradient_norm: float = 2.0
     largest_scale: float = 60.0
     seed: int = 0
+    memory_after: int = 300  # steps before descriptors of earlier batches are used: at first they drift too fast
+    memory_steps: int = 400  # a descriptor older than this is no longer a negative
+    alike_seeds: int = 8  # pairs of a batch whose look-alikes are drawn with them
+    alike_each: int = 7
     encoder: EncoderShape = EncoderShape()
     augmentation: Augmentation = Augmentation()
 
@@ -86,6 +91,8 @@ def train(
     optimiser = _optimiser([*net.parameters(), log_scale], config)
     checkpoint = run / "checkpoint.pt"
     first = 0
+    cities = [City(Pack.open(folder), grid) for folder in packs]
+    memories = [DescriptorMemory(len(city.pack.queries), config.encoder.descriptor, place) for city in cities]
     if start_from is not None:
         before = torch.load(start_from / "checkpoint.pt", map_location=place, weights_only=True)
         net.load_state_dict(before["net"])
@@ -98,13 +105,15 @@ def train(
         generator.set_state(state["generator"].cpu())
         rng.bit_generator.state = json.loads(state["rng"])
         first = int(state["step"])
-    cities = [City(Pack.open(folder), grid) for folder in packs]
+        for memory, kept in zip(memories, state["memories"], strict=True):
+            memory.restore(kept)
     augment = Augmenter(config.augmentation, grid, generator, place)
 
     def save(step: int) -> None:
         part = checkpoint.with_suffix(".part")
         torch.save({"net": net.state_dict(), "optimiser": optimiser.state_dict(), "log_scale": log_scale.detach(), "step": step,
-                    "generator": generator.get_state(), "rng": json.dumps(rng.bit_generator.state)}, part)  # fmt: skip
+                    "generator": generator.get_state(), "rng": json.dumps(rng.bit_generator.state),
+                    "memories": [memory.state() for memory in memories]}, part)  # fmt: skip
         part.rename(checkpoint)
 
     net.train()
@@ -112,7 +121,13 @@ def train(
         began, images = time.perf_counter(), 0
         for step in range(first, config.steps):
             _set_rate(optimiser, config, step)
-            batch = cities[int(rng.integers(len(cities)))].draw(config.pairs, rng)
+            number = int(rng.integers(len(cities)))
+            memory, wanted = memories[number], None
+            known = memory.recent(step, config.memory_steps) if step >= config.memory_after else np.zeros(0, np.int64)
+            if len(known) > config.pairs:
+                seeds = rng.choice(known, config.alike_seeds, replace=False)
+                wanted = memory.alike(seeds, known, config.alike_each)
+            batch = cities[number].draw(config.pairs, rng, wanted)
             count = len(batch.query_xy)
             rows_seen = augment.cut_rows(batch.rows_seen.to(place), count)
             surveys = augment.survey(batch.survey_ranges.to(place), batch.survey_height_m.to(place), rows_seen)
@@ -123,13 +138,15 @@ def train(
             side = torch.cat([torch.ones(count, device=place), torch.zeros(count, device=place)])
             descriptors = net(planes, side)
             scale = log_scale.exp().clamp(max=config.largest_scale)
+            q = Side(descriptors[:count], batch.query_xy.to(place))
+            m = Side(descriptors[count:], batch.survey_xy.to(place))
+            earlier = torch.from_numpy(np.setdiff1d(known, batch.pairs)).to(place)
             losses, first_ones = paired_info_nce(
-                descriptors[:count],
-                descriptors[count:],
-                batch.query_xy.to(place),
-                batch.survey_xy.to(place),
-                scale=scale,
-            )
+                q, m, scale=scale,
+                more_queries=Side(memory.queries[earlier], memory.queries_xy[earlier]),
+                more_surveys=Side(memory.surveys[earlier], memory.surveys_xy[earlier]),
+            )  # fmt: skip
+            memory.keep(batch.pairs, q.descriptors, m.descriptors, q.xy, m.xy, step)
             loss = losses.mean()
             optimiser.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped

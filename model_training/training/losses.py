@@ -1,40 +1,53 @@
 """The contrastive loss of paired views."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+SAME_PLACE_M = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """Unit descriptors (N, D) of one side and where they were taken (N, 2), metres."""
+
+    descriptors: Tensor
+    xy: Tensor
+
 
 def paired_info_nce(
-    queries: Tensor,
-    surveys: Tensor,
-    positions_q: Tensor,
-    positions_s: Tensor,
-    *,
-    scale: Tensor,
-    same_place_m: float = 6.0,
+    queries: Side, surveys: Side, *, scale: Tensor, more_queries: Side | None = None, more_surveys: Side | None = None
 ) -> tuple[Tensor, Tensor]:
     """InfoNCE both ways over a batch of pairs (van den Oord et al., 2018), places too near to be told apart left out.
 
     Args:
-        queries: unit descriptors (B, D); row k belongs to row k of ``surveys``.
-        surveys: unit descriptors (B, D).
-        positions_q: metres (B, 2).
-        positions_s: metres (B, 2).
+        queries: row k belongs to row k of ``surveys`` (B).
+        surveys: (B).
         scale: inverse temperature, learned.
-        same_place_m: pairs of different rows nearer than this are neither positive nor negative.
+        more_queries: further negatives for the surveys, such as those of earlier batches.
+        more_surveys: further negatives for the queries.
 
     Returns:
         Loss of each pair (B) and whether its own survey view came first (B).
     """
-    similarity = queries @ surveys.T
-    logits = similarity * scale
-    near = torch.cdist(positions_q, positions_s) < same_place_m
-    near.fill_diagonal_(False)
-    logits = logits.masked_fill(near, -1e4)
-    own = torch.arange(len(queries), device=queries.device)
+    forward = _logits(queries, surveys, scale, more_surveys)
+    backward = _logits(surveys, queries, scale, more_queries)
+    own = torch.arange(len(queries.descriptors), device=queries.descriptors.device)
     loss = 0.5 * (
-        functional.cross_entropy(logits, own, reduction="none")
-        + functional.cross_entropy(logits.T, own, reduction="none")
+        functional.cross_entropy(forward, own, reduction="none")
+        + functional.cross_entropy(backward, own, reduction="none")
     )
-    return loss, logits.argmax(dim=1) == own
+    return loss, forward.argmax(dim=1) == own
+
+
+def _logits(asked: Side, answers: Side, scale: Tensor, more: Side | None) -> Tensor:
+    """Scaled similarities (B, B + N) of what is asked to its answers and to further negatives."""
+    near = torch.cdist(asked.xy, answers.xy) < SAME_PLACE_M
+    near.fill_diagonal_(False)
+    similarity = asked.descriptors @ answers.descriptors.T
+    if more is not None:
+        near = torch.cat([near, torch.cdist(asked.xy, more.xy) < SAME_PLACE_M], dim=1)
+        similarity = torch.cat([similarity, asked.descriptors @ more.descriptors.T], dim=1)
+    return (similarity * scale).masked_fill(near, -1e4)

@@ -33,13 +33,23 @@ def test_a_batch_has_up_to_the_pairs_wanted(city):
     assert batch.images == 2 * len(batch.query_xy)
 
 
-def test_half_of_a_batch_is_from_one_neighbourhood(city):
-    xy = draw(city, pairs=20).query_xy
-    near = (torch.cdist(xy, xy) < 140).float().mean()
-    assert float(near) > 0.35
+def test_wanted_pairs_are_in_the_batch(city):
+    wanted = np.array([3, 17, 42])
+    batch = city.draw(20, np.random.default_rng(0), wanted)
+    assert set(wanted) <= set(batch.pairs)
+    assert 10 <= len(batch.pairs) <= 20
 
 
-def test_views_are_turned_by_nine_degrees_at_most(city, grid):
+def test_more_pairs_wanted_than_fit_are_cut(city):
+    assert city.draw(6, np.random.default_rng(0), np.arange(30)).pairs.tolist() == list(range(6))
+
+
+def test_pairs_number_the_queries_drawn(city):
+    batch = draw(city)
+    np.testing.assert_allclose(batch.query_xy.numpy(), city.pack.queries[batch.pairs, :2], rtol=1e-6)
+
+
+def test_views_are_turned_no_further_than_the_map_and_its_three_turns_need(city, grid):
     """Each query sees just its place's panorama: how far the survey's view must be shifted says how far it is turned."""
     step_deg = 360.0 / grid.around
     for seed in range(2):

@@ -17,7 +17,10 @@ GENTLE = Augmentation(
 
 @pytest.fixture
 def config(shape):
-    return TrainingConfig(steps=15, pairs=24, learning_rate=1e-2, warm_up_steps=2, encoder=shape, augmentation=GENTLE)
+    return TrainingConfig(
+        steps=15, pairs=24, learning_rate=1e-2, warm_up_steps=2, encoder=shape, augmentation=GENTLE, memory_after=4,
+        alike_seeds=3, alike_each=3,
+    )  # fmt: skip
 
 
 def run_of(pack_folder, run, config, **options):
@@ -32,7 +35,9 @@ def assert_same_weights(one, other):
 @pytest.mark.parametrize(("optimiser", "rate"), [("adamw", 1e-2), ("sgdm", 3e-2)])
 def test_the_loss_falls(pack_folder, tmp_path, config, optimiser, rate):
     losses = []
-    changed = TrainingConfig.model_validate(config.model_dump() | {"optimiser": optimiser, "learning_rate": rate})
+    changed = TrainingConfig.model_validate(
+        config.model_dump() | {"optimiser": optimiser, "learning_rate": rate, "memory_after": 100}
+    )  # more negatives would raise the loss
     run_of(pack_folder, tmp_path / "run", changed, report=lambda progress: losses.append(progress.loss))
     assert len(losses) == 15
     assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])

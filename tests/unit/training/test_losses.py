@@ -3,7 +3,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training.losses import paired_info_nce  # noqa: E402  # after the skip
+from model_training.training.losses import Side, paired_info_nce  # noqa: E402  # after the skip
 
 
 def pairs(count=7, seed=0, spread_m=100.0):
@@ -14,25 +14,35 @@ def pairs(count=7, seed=0, spread_m=100.0):
     return descriptors[0], descriptors[1], positions, positions + rng.uniform(-1, 1, (count, 2))
 
 
-def slow_loss(queries, surveys, positions_q, positions_s, scale, same_place_m=6.0):
+def slow_loss(queries, surveys, positions_q, positions_s, scale, more=(), same_place_m=6.0):
     """Pair by pair: minus the log of the own one's share, both ways, those too near left out."""
     losses = []
     for k in range(len(queries)):
         both = 0.0
-        for turned in (False, True):
-            terms = []
-            for j in range(len(queries)):
-                q, s = (j, k) if turned else (k, j)
-                if j == k or np.linalg.norm(positions_q[q] - positions_s[s]) >= same_place_m:
-                    terms.append(np.exp(scale * queries[q] @ surveys[s]))
-            both -= 0.5 * np.log(np.exp(scale * queries[k] @ surveys[k]) / sum(terms))
+        for own, asked_at, answers, places in (
+            (queries, positions_q, surveys, positions_s), (surveys, positions_s, queries, positions_q),
+        ):  # fmt: skip
+            terms = [np.exp(scale * own[k] @ answers[k])]
+            others = [(d, at) for j, (d, at) in enumerate(zip(answers, places, strict=True)) if j != k]
+            if more:
+                others += list(zip(*(more[0] if answers is queries else more[1]), strict=True))
+            terms += [
+                np.exp(scale * own[k] @ d) for d, at in others if np.linalg.norm(asked_at[k] - at) >= same_place_m
+            ]
+            both -= 0.5 * np.log(terms[0] / sum(terms))
         losses.append(both)
     return losses
 
 
-def loss_of(queries, surveys, positions_q, positions_s, scale=10.0):
-    tensors = [torch.tensor(x, dtype=torch.float64) for x in (queries, surveys, positions_q, positions_s)]
-    losses, first = paired_info_nce(*tensors, scale=torch.tensor(scale, dtype=torch.float64))
+def side(descriptors, positions):
+    return Side(torch.tensor(descriptors, dtype=torch.float64), torch.tensor(positions, dtype=torch.float64))
+
+
+def loss_of(queries, surveys, positions_q, positions_s, scale=10.0, more=()):
+    given = dict(zip(("more_queries", "more_surveys"), (side(*m) for m in more), strict=False))
+    losses, first = paired_info_nce(
+        side(queries, positions_q), side(surveys, positions_s), scale=torch.tensor(scale, dtype=torch.float64), **given
+    )
     return losses.numpy(), first.numpy()
 
 
@@ -40,6 +50,21 @@ def loss_of(queries, surveys, positions_q, positions_s, scale=10.0):
 def test_the_loss_is_that_of_a_slow_loop(spread_m):
     given = pairs(spread_m=spread_m)
     np.testing.assert_allclose(loss_of(*given)[0], slow_loss(*given, 10.0), rtol=1e-9)
+
+
+def test_earlier_descriptors_are_negatives_unless_they_are_near():
+    given, others = pairs(spread_m=20.0), pairs(count=11, seed=1, spread_m=20.0)
+    more = ((others[0], others[2]), (others[1], others[3]))
+    found = loss_of(*given, more=more)[0]
+    np.testing.assert_allclose(found, slow_loss(*given, 10.0, more), rtol=1e-9)
+    assert (found > loss_of(*given)[0]).all()
+
+
+def test_an_earlier_look_alike_comes_first_before_the_own_one():
+    far = np.array([[0.0, 0.0], [50.0, 0.0]])
+    q, s = np.eye(2), np.array([[0.8, 0.6], [0.6, 0.8]])
+    alike = (np.array([[1.0, 0.0]]), np.array([[200.0, 0.0]]))
+    assert loss_of(q, s, far, far, more=(alike, alike))[1].tolist() == [False, True]
 
 
 def test_places_too_near_to_be_told_apart_do_not_repel():

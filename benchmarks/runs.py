@@ -1,0 +1,113 @@
+"""What benchmarks share: datasets and maps made once under one folder, and rows of shares.
+
+Everything kept is named after what it was made from - the plan, the encoder, and the code that simulates, builds and
+answers - so that a change of any of them is measured anew instead of read from an old run.
+"""
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.report import ROOT, Report
+from model_training.baselines.raw_range import raw_best_views
+from model_training.cli.progress import bars
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.error_measures import wilson_interval
+from model_training.evaluation.evaluate import evaluate
+from model_training.evaluation.measures import recall_at
+from model_training.mapping.build import BuildSettings, build_map
+from model_training.simulation.plan import SimulationPlan
+from model_training.simulation.simulate import simulate
+from service.localization.encoder import Encoder
+from service.maps.reader import MapBundle
+
+RAW_EVERY = 3  # each third query of a set is asked of the raw image too: it is slow, and so many tell 0.3 from 0.4
+
+
+@cache
+def code_hash(*folders: str) -> str:
+    """Short hash of the Python files of folders of the repository."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+SIMULATION = ("model_training/simulation", "service/geometry")
+MAPPING = ("model_training/mapping", "service/imaging", "service/geometry", "service/maps", "model_training/datasets")
+
+
+class Runs:
+    """Datasets, maps and figures under one folder, made once."""
+
+    def __init__(self, work: Path, encoder: Path) -> None:
+        self.work, self.encoder = work, encoder
+
+    def dataset(self, plan: SimulationPlan) -> Dataset:
+        """Simulate a plan, or take it as it is."""
+        folder = self.work / f"{plan.name}-{code_hash(*SIMULATION)}"
+        with bars() as report:
+            simulate(plan, folder, report=report)
+        return Dataset(folder)
+
+    def bundle(self, dataset: Dataset, settings: BuildSettings | None = None) -> MapBundle:
+        """Build a map, or take the one that this encoder and this code made of this dataset."""
+        settings = settings or BuildSettings(name=dataset.name)
+        made_of = (
+            f"{dataset.folder.name.rsplit('-', 1)[-1]}-{Encoder.open(self.encoder).sha256[:12]}-{code_hash(*MAPPING)}"
+        )
+        folder = self.work / "maps" / f"{settings.name}-{made_of}"
+        if not folder.exists():
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with bars() as report:
+                build_map(dataset, self.encoder, folder, settings, report=report)
+        return MapBundle.open(folder)
+
+    def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str]) -> dict[str, Any]:
+        """Evaluate query sets; the answers lie beside for later measures."""
+        with bars() as report:
+            result = evaluate(bundle, dataset, names, report=report)
+        folder = self.work / "predictions" / bundle.path.name
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, predictions in result.predictions.items():
+            predictions.save(folder / f"{name}.npz")
+        (folder / f"{'+'.join(names)[:80]}.json").write_text(json.dumps(result.figures, indent=1))
+        return result.figures | {"predictions": result.predictions}
+
+    def raw(self, bundle: MapBundle, dataset: Dataset, name: str) -> dict[str, tuple[int, int]]:
+        """The raw range image: right ones and number of queries by setting, over each third query of a set."""
+        code = code_hash(*MAPPING, "model_training/baselines")
+        kept = self.work / "raw" / f"{dataset.folder.name}-{code}-{name}-every{RAW_EVERY}.json"
+        if not kept.exists():
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            with bars() as report:
+                best = raw_best_views(bundle, dataset, [name], every=RAW_EVERY, report=report)
+            truth = [f.T_map_camera[:2, 3] for f in dataset.queries(name) if f.T_map_camera is not None][::RAW_EVERY]
+            xy = bundle.T_map_place[:, :2, 3]
+            counts = {}
+            for setting, place in best.items():
+                right = recall_at(xy[place][:, None], np.array(truth), 1) & (place >= 0)
+                counts[setting] = (int(right.sum()), len(truth))
+            kept.write_text(json.dumps(counts))
+        return {setting: (right, count) for setting, (right, count) in json.loads(kept.read_text()).items()}
+
+
+def pooled(parts: list[dict[str, Any]], key: str) -> tuple[float, int, list[float]]:
+    """A share over several cities: value, count, Wilson interval."""
+    of = "street_queries" if key == "street_accuracy" else "queries"
+    count = sum(part[of] for part in parts)
+    right = round(sum(part[key] * part[of] for part in parts))
+    return right / count, count, list(wilson_interval(right, count))
+
+
+def share(
+    report: Report, row_id: str, figures: dict[str, Any] | list[dict[str, Any]], key: str, bar: float | None = None
+) -> None:
+    """A row of one share, over one or several evaluations."""
+    value, count, interval = pooled(figures if isinstance(figures, list) else [figures], key)
+    report.row(row_id, value, "share", bar=bar, n=count, ci95=interval)
