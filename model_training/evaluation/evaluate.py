@@ -83,6 +83,6 @@ def split_of(dataset: Dataset, name: str, city_seen: bool | None) -> str:
 
 
 def write_trajectory(path: Path, predictions: Predictions) -> None:
-    """Write the answered poses, T_map_camera, in TUM format; a query's number is its time, as in the truth's file."""
+    """Write the answered poses, T_map_camera, in TUM format, each with the timestamp of its truth."""
     answered = np.isfinite(predictions.T_answer[:, 0, 3])
-    write_tum(path, np.flatnonzero(answered).astype(np.float64), predictions.T_answer[answered])
+    write_tum(path, predictions.stamp_s[answered], predictions.T_answer[answered])
