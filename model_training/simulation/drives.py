@@ -14,7 +14,7 @@ from model_training.simulation.traversal import (
     Station,
     lidar_pose,
     query_pose,
-    stations,
+    stations_along,
     survey_error,
 )
 from service.errors import DatasetError
@@ -44,11 +44,8 @@ def driven(city: City, plan: SimulationPlan, step_m: float) -> list[Station]:
             raise DatasetError(
                 f"streets: there is no street {wanted!r} here; there are: {', '.join(known)}", field="streets"
             )
-    if not plan.streets:
-        return stations(city, step_m)
-    part = City.__new__(City)
-    part.streets = [street for street in city.streets if street.street in plan.streets]
-    return stations(part, step_m)
+    wanted_streets = [street for street in city.streets if not plan.streets or street.street in plan.streets]
+    return stations_along(wanted_streets, step_m)
 
 
 def survey_of(city: City, plan: SimulationPlan) -> Survey:

@@ -3,7 +3,7 @@ import pytest
 
 from model_training.simulation.drives import driven, query_candidates, survey_of
 from model_training.simulation.plan import QueryPlan
-from model_training.simulation.traversal import stations, survey_error
+from model_training.simulation.traversal import stations, stations_along, survey_error
 from service.errors import DatasetError
 from service.geometry.rigid import heading_of_body, heading_of_camera, inverse
 
@@ -89,6 +89,20 @@ def test_only_the_wanted_streets_are_driven(city, plan):
     distances = [np.linalg.norm(line - [s.x, s.y], axis=1).min() for s in part]
     assert max(distances) < 2.5
     assert len(part) < len(driven(city, plan, 1.0))
+
+
+def test_stations_of_some_streets_are_those_of_the_whole_drive_counted_anew(city, plan):
+    part = driven(city, plan.model_copy(update={"streets": ("3", "2")}), 1.0)
+    whole = stations(city, 1.0)
+    expected, travelled = [], 0.0
+    for street in city.streets:
+        own = stations_along([street], 1.0)
+        if street.street in ("2", "3"):
+            first = next(k for k, s in enumerate(whole) if (s.x, s.y) == (own[0].x, own[0].y))
+            expected += [(s.x, s.y, s.heading, travelled + o.travelled)
+                         for s, o in zip(whole[first : first + len(own)], own, strict=True)]  # fmt: skip
+            travelled += sum(float(np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()[-1]) for line in street.lines)
+    assert [(s.x, s.y, s.heading, s.travelled) for s in part] == expected
 
 
 def test_the_lidar_stands_upright_on_the_slope_but_for_its_sway(city, plan):
