@@ -178,7 +178,7 @@ def _queries(
         z_of_ray=z_of_ray,
         candidates=candidates,
     )
-    chosen = _free_candidates(job, quota, workers)
+    chosen = _free_candidates(job, quota)
     for folder in sets.values():
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
@@ -191,15 +191,18 @@ def _queries(
         write_tum(folder / "poses.txt", stamps, job.candidates)
 
 
-def _free_candidates(job: _Job, quota: Quota, workers: int) -> NDArray[np.int64]:
-    """The first candidates, class by class, that do not stare at something right before them."""
+def _free_candidates(job: _Job, quota: Quota) -> NDArray[np.int64]:
+    """The first candidates, class by class, that do not stare at something right before them.
+
+    One worker does it all: a check casts some hundred rays, less work than starting other processes.
+    """
     left = list(quota.wanted)
     chosen: dict[int, list[int]] = {k: [] for k in range(len(left))}
     order = [k for k in range(len(quota.class_of)) if quota.class_of[k] >= 0]
     step = 256
     for start in range(0, len(order), step):
         part = [k for k in order[start : start + step] if left[quota.class_of[k]] > 0]
-        for k, free in zip(part, _run(job, _is_free, part, min(workers, 1)), strict=True):
+        for k, free in zip(part, _run(job, _is_free, part, workers=1), strict=True):
             index = int(quota.class_of[k])
             if free and left[index] > 0:
                 left[index] -= 1

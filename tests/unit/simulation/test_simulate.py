@@ -193,11 +193,25 @@ def test_table_i_is_met_class_by_class(monkeypatch):
     candidates[:, 0, 3], candidates[:, 1, 3] = rng.uniform(-130, 130, 9000), rng.uniform(-180, 180, 9000)
     quota = module.quota_of(city, QueryPlan(name="a", traversal=1, per_class=True), candidates)
     monkeypatch.setattr(module, "_is_free", lambda k: k % 3 > 0)
-    chosen = module._free_candidates(None, quota, workers=1)
+    chosen = module._free_candidates(None, quota)
     counts = np.bincount(quota.class_of[chosen], minlength=16)
     assert counts.tolist() == [count for _, _, count in TABLE_I]
     assert len(set(chosen.tolist())) == 626
     assert (chosen % 3 > 0).all()
+
+
+def test_room_is_looked_for_without_starting_processes(plan_of, tmp_path, monkeypatch):
+    asked = []
+    run = module._run
+
+    def noted(job, work, items, workers):
+        asked.append((work, workers))
+        return run(job, work, items, 1)
+
+    monkeypatch.setattr(module, "_run", noted)
+    simulate(plan_of(spacing_m=30.0), tmp_path / "out", workers=3)
+    assert {workers for work, workers in asked if work is module._is_free} == {1}
+    assert {workers for work, workers in asked if work is not module._is_free} == {3}
 
 
 def test_the_streets_of_the_dataset_are_those_of_its_city(tiny_dataset):
