@@ -40,19 +40,26 @@ def command(
         bool, typer.Option("--table1", help="as many queries of each class as the paper's Table I (626)")
     ] = False,
     on_track: Annotated[
-        int, typer.Option(help="queries at the survey's own poses too: the paper's split, which leaks")
+        int,
+        typer.Option(
+            help="queries at the survey's own poses and among its vehicles too: the paper's split, which leaks"
+        ),
     ] = 0,
     depth: Annotated[
         list[str] | None, typer.Option(help="ideal, precise or stereo; repeat for several [default: precise]")
     ] = None,
-    condition: Annotated[
-        str, typer.Option(help="of the query drives: clear, rain, snow, fog, night or low_sun")
-    ] = "clear",
+    condition: Annotated[str, typer.Option(help="of all queries: clear, rain, snow, fog, night or low_sun")] = "clear",
     survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
     survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
-    parked_changed: Annotated[float, typer.Option(help="share of parking slots that differ from drive to drive")] = 0.5,
-    aside: Annotated[float, typer.Option(help="how far queries may be beside the survey's lane, metres")] = 2.0,
-    heading: Annotated[float, typer.Option(help="how far queries may look off the street's axis, degrees")] = 15.0,
+    parked_changed: Annotated[
+        float, typer.Option(help="share of parking slots that differ from drive to drive (not --on-track)")
+    ] = 0.5,
+    aside: Annotated[
+        float, typer.Option(help="how far queries may be beside the survey's lane, metres (not --on-track)")
+    ] = 2.0,
+    heading: Annotated[
+        float, typer.Option(help="how far queries may look off the street's axis, degrees (not --on-track)")
+    ] = 15.0,
     turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees")] = 0.0,
     pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees")] = 0.0,
     blocked: Annotated[float, typer.Option(help="share of the columns that a lorry right ahead hides")] = 0.0,
@@ -62,19 +69,19 @@ def command(
     workers: Annotated[int | None, typer.Option(help="processes [default: one a core]")] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
-    depths = tuple(depth or ["precise"])
+    of_all: dict[str, object] = {
+        "depths": tuple(depth or ["precise"]), "condition": condition, "turn_deg": turn, "pitch_deg": pitch,
+        "blocked": blocked, "max_depth_m": max_depth,
+    }  # fmt: skip
+    of_drives: dict[str, object] = {"parked_changed": parked_changed, "aside_m": aside, "heading_deg": heading}
     plans = []
     if queries or table1:
-        plans = [
-            QueryPlan(
-                name=f"drive{k}", traversal=k, count=max(1, queries), per_class=table1, depths=depths, condition=condition,
-                parked_changed=parked_changed, aside_m=aside, heading_deg=heading, turn_deg=turn, pitch_deg=pitch,
-                blocked=blocked, max_depth_m=max_depth,
-            )
-            for k in range(1, drives + 1)
-        ]  # fmt: skip
+        given = of_all | of_drives | {"count": max(1, queries), "per_class": table1}
+        plans = [QueryPlan.model_validate(given | {"name": f"drive{k}", "traversal": k}) for k in range(1, drives + 1)]
     if on_track:
-        plans.append(QueryPlan(name="survey_drive", traversal=0, count=on_track, on_track=True, depths=depths))
+        own = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
+        # Without any drive nothing would take these three: the plan refuses them rather than pass them over.
+        plans.append(QueryPlan.model_validate(own if plans else own | of_drives))
     width, height = _pair(camera, "camera")
     plan = SimulationPlan(
         name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size"),

@@ -48,6 +48,22 @@ class QueryPlan(_Model):
     blocked: float = Field(0.0, ge=0, le=0.9)
     max_depth_m: float | None = Field(None, gt=1)
 
+    def refuse_what_does_nothing(self) -> None:
+        """Refuse a field that was changed and that this traversal would pass over in silence.
+
+        Raises:
+            DatasetError: naming the field, its value and why it does nothing here.
+        """
+        poses, vehicles = "stands at the survey's own poses", "meets the survey's own vehicles"
+        refused = [("aside_m", poses), ("heading_deg", poses)] if self.on_track else []
+        refused += [("parked_changed", vehicles)] if self.traversal == 0 else []
+        for field, why in refused:
+            value = getattr(self, field)
+            if value != type(self).model_fields[field].default:
+                raise DatasetError(
+                    f"{field}: {value:g} would do nothing, since {self.name!r} {why}; leave it out", field=field
+                )
+
 
 class SimulationPlan(_Model):
     """A city, its survey and its query traversals."""
@@ -67,10 +83,10 @@ class SimulationPlan(_Model):
     queries: tuple[QueryPlan, ...] = ()
 
     def checked(self) -> "SimulationPlan":
-        """Itself, if every preset it names exists.
+        """Itself, if every preset it names exists and every field does something.
 
         Raises:
-            DatasetError: naming the field, the value and what there is.
+            DatasetError: naming the field, the value and what there is or why it is refused.
         """
         named: list[tuple[str, str, Iterable[str]]] = [
             ("lidar", self.lidar, LIDARS),
@@ -82,6 +98,8 @@ class SimulationPlan(_Model):
         for field, value, known in named:
             if value not in set(known):
                 raise DatasetError(f"{field}: {value!r} is no preset; there are: {', '.join(known)}", field=field)
+        for query in self.queries:
+            query.refuse_what_does_nothing()
         names = [query.name for query in self.queries]
         if len(set(names)) != len(names):
             raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")

@@ -61,6 +61,19 @@ def test_simulate_passes_every_option_on(tmp_path: Path) -> None:
     assert plan["camera"]["horizontal_deg"] == 70.0
 
 
+def test_simulate_takes_weather_and_mounting_on_the_track_too(tmp_path: Path) -> None:
+    shared = {"condition": "night", "blocked": 0.2, "turn_deg": 10.0, "pitch_deg": 2.0, "max_depth_m": 9.0}
+    given = ("--condition", "night", "--blocked", "0.2", "--turn", "10", "--pitch", "2", "--max-depth", "9")
+    more = ("--queries", "1", "--on-track", "1", "--aside", "1", "--heading", "5", "--parked-changed", "0.2")
+    assert run("simulate", "--out", tmp_path / "both", *given, *more, *SMALL) == 0
+    drive, track = plan_in(tmp_path / "both")["queries"]
+    assert {field: track[field] for field in shared} == {field: drive[field] for field in shared} == shared
+    assert [(q["aside_m"], q["heading_deg"], q["parked_changed"]) for q in (drive, track)] == [
+        (1, 5, 0.2),
+        (2, 15, 0.5),
+    ]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -69,6 +82,7 @@ def test_simulate_passes_every_option_on(tmp_path: Path) -> None:
         (("--camera", "axb"), "camera: 'axb' is not two numbers"),
         (("--lidar", "none"), "lidar: 'none' is no preset"),
         (("--table1",), "--city paper"),
+        (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 would do nothing"),
     ],
 )
 def test_simulate_says_what_is_wrong_and_writes_nothing(

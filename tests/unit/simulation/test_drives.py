@@ -76,6 +76,18 @@ def test_queries_on_the_track_stand_below_the_surveys_lidar(city, plan):
         np.testing.assert_allclose(in_lidar[:3, 2], [1, 0, 0], atol=1e-9)
 
 
+def test_a_camera_on_the_track_is_mounted_as_the_plan_says(city, plan):
+    survey = survey_of(city, plan)
+    on_track = QueryPlan(name="a", traversal=0, count=9, on_track=True)
+    mounted = on_track.model_copy(update={"turn_deg": 30.0, "pitch_deg": 10.0})
+    straight, turned = (query_candidates(city, plan, query, survey) for query in (on_track, mounted))
+    np.testing.assert_array_equal(straight[:, :3, 3], turned[:, :3, 3])
+    axes = straight[:, :3, :3].transpose(0, 2, 1) @ turned[:, :3, 2:3]  # of the mounted camera, in the straight one
+    left, down, ahead = np.sin(np.deg2rad(30)), np.sin(np.deg2rad(10)), np.cos(np.deg2rad(30))
+    shrunk = np.cos(np.deg2rad(10))
+    np.testing.assert_allclose(axes[..., 0], np.tile([-left * shrunk, down, ahead * shrunk], (len(axes), 1)), atol=1e-9)
+
+
 def test_stations_stand_a_step_apart_in_each_street(city):
     track = stations(city, 2.0)
     steps = np.diff([s.travelled for s in track])

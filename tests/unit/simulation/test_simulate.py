@@ -177,6 +177,9 @@ def test_more_queries_than_room_are_refused_with_both_counts(plan_of, tmp_path, 
         ({"queries": (QueryPlan(name="a", traversal=1, condition="hail"),)}, "condition: 'hail'"),
         ({"queries": (QueryPlan(name="a", traversal=1), QueryPlan(name="a", traversal=2))}, "one name"),
         ({"queries": (QueryPlan(name="a", traversal=1, per_class=True),)}, "--city paper"),
+        ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, aside_m=1.0),)}, "aside_m: 1 would do nothing"),
+        ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, heading_deg=0),)}, "heading_deg: 0 would"),
+        ({"queries": (QueryPlan(name="a", traversal=0, parked_changed=1.0),)}, "parked_changed: 1 would do nothing"),
     ],
 )
 def test_a_plan_that_names_what_is_not_there_is_refused(plan_of, tmp_path, changed, message):
