@@ -46,7 +46,7 @@ def command(
     predictions: Annotated[
         Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")
     ] = None,
-    workers: Annotated[int, typer.Option(help="queries at a time")] = 2,
+    workers: Annotated[int, typer.Option(help="queries at a time", min=1)] = 2,
 ) -> None:
     """Measure a map against queries whose truth is known.
 

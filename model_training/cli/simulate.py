@@ -28,21 +28,21 @@ def command(
     city: Annotated[
         str, typer.Option(help="paper: the paper's nine streets; city: another city for each seed")
     ] = "city",
-    seed: Annotated[int, typer.Option(help="decides everything that is random")] = 0,
+    seed: Annotated[int, typer.Option(help="decides everything that is random", min=0)] = 0,
     name: Annotated[str, typer.Option(help="name of the dataset [default: that of the folder]")] = "",
-    size: Annotated[str, typer.Option(help="extent of a random city, metres")] = "300x400",
+    size: Annotated[str, typer.Option(help="extent of a random city, metres, 30 to 10000 each")] = "300x400",
     streets: Annotated[str, typer.Option(help="drive only these streets, e.g. 1,5,between")] = "",
     lidar: Annotated[str, typer.Option(help="paper_32, vlp_16, hdl_64 or os1_128")] = "paper_32",
-    spacing: Annotated[float, typer.Option(help="metres between scans")] = 1.0,
-    queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none")] = 200,
-    drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light")] = 1,
+    spacing: Annotated[float, typer.Option(help="metres between scans", min=0.02)] = 1.0,
+    queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none", min=0)] = 200,
+    drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light", min=1)] = 1,
     table1: Annotated[
         bool, typer.Option("--table1", help="as many queries of each class as the paper's Table I (626)")
     ] = False,
     on_track: Annotated[
         int,
         typer.Option(
-            help="queries at the survey's own poses and among its vehicles too: the paper's split, which leaks"
+            help="queries at the survey's own poses and among its vehicles too: the paper's split, which leaks", min=0
         ),
     ] = 0,
     depth: Annotated[
@@ -52,21 +52,26 @@ def command(
     survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
     survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
     parked_changed: Annotated[
-        float, typer.Option(help="share of parking slots that differ from drive to drive (not --on-track)")
+        float,
+        typer.Option(help="share of parking slots that differ from drive to drive (not --on-track)", min=0, max=1),
     ] = 0.5,
     aside: Annotated[
-        float, typer.Option(help="how far queries may be beside the survey's lane, metres (not --on-track)")
+        float,
+        typer.Option(help="how far queries may be beside the survey's lane, metres (not --on-track)", min=0, max=10),
     ] = 2.0,
     heading: Annotated[
-        float, typer.Option(help="how far queries may look off the street's axis, degrees (not --on-track)")
+        float,
+        typer.Option(help="how far queries may look off the street's axis, degrees (not --on-track)", min=0, max=180),
     ] = 15.0,
-    turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees")] = 0.0,
-    pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees")] = 0.0,
-    blocked: Annotated[float, typer.Option(help="share of the columns that a lorry right ahead hides")] = 0.0,
-    max_depth: Annotated[float | None, typer.Option(help="cut depth at this, metres")] = None,
-    camera: Annotated[str, typer.Option(help="picture size in pixels")] = "640x480",
-    hfov: Annotated[float, typer.Option(help="horizontal field of view, degrees")] = 90.0,
-    workers: Annotated[int | None, typer.Option(help="processes [default: one a core]")] = None,
+    turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees", min=-180, max=180)] = 0.0,
+    pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees", min=-45, max=45)] = 0.0,
+    blocked: Annotated[
+        float, typer.Option(help="share of the columns that a lorry right ahead hides", min=0, max=0.9)
+    ] = 0.0,
+    max_depth: Annotated[float | None, typer.Option(help="cut depth at this, metres", min=1)] = None,
+    camera: Annotated[str, typer.Option(help="picture size in pixels, up to 4096x4096")] = "640x480",
+    hfov: Annotated[float, typer.Option(help="horizontal field of view, degrees", min=20, max=150)] = 90.0,
+    workers: Annotated[int | None, typer.Option(help="processes [default: one a core]", min=1)] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
     of_all: dict[str, object] = {
@@ -82,11 +87,11 @@ def command(
         own = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
         # Without any drive nothing would take these three: the plan refuses them rather than pass them over.
         plans.append(QueryPlan.model_validate(own if plans else own | of_drives))
-    width, height = _pair(camera, "camera")
+    width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
-        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size"),
+        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
-        survey_error=survey_error, camera=CameraPlan(width=int(width), height=int(height), horizontal_deg=hfov),
+        survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
         queries=tuple(plans),
     )  # fmt: skip
     if city not in ("paper", "city"):
@@ -99,7 +104,7 @@ def command(
 command.__doc__ = EXAMPLE
 
 
-def _pair(text: str, field: str) -> tuple[float, float]:
+def _pair(text: str, field: str, *, least: float, most: float) -> tuple[float, float]:
     parts = text.lower().split("x")
     try:
         first, second = (float(part) for part in parts)
@@ -107,4 +112,7 @@ def _pair(text: str, field: str) -> tuple[float, float]:
         raise DatasetError(
             f"{field}: {text!r} is not two numbers with an x between, such as 640x480", field=field
         ) from error
+    for value in (first, second):
+        if not least <= value <= most:  # which NaN is not either
+            raise DatasetError(f"{field}: {value:g} in {text!r} is not between {least} and {most}", field=field)
     return first, second

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -12,9 +12,11 @@ from model_training.simulation.lidar import LIDARS
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
+CitySide = Annotated[float, Field(ge=30, le=10_000)]  # metres
+
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class CameraPlan(_Model):
@@ -22,7 +24,7 @@ class CameraPlan(_Model):
 
     width: int = Field(640, ge=64, le=4096)
     height: int = Field(480, ge=48, le=4096)
-    horizontal_deg: float = Field(90.0, gt=20, lt=150)
+    horizontal_deg: float = Field(90.0, ge=20, le=150)
 
     def pinhole(self) -> PinholeCamera:
         """Its intrinsics, the optical axis in the middle of the picture."""
@@ -43,10 +45,10 @@ class QueryPlan(_Model):
     parked_changed: float = Field(0.5, ge=0, le=1)
     aside_m: float = Field(2.0, ge=0, le=10)
     heading_deg: float = Field(15.0, ge=0, le=180)
-    turn_deg: float = 0.0
-    pitch_deg: float = 0.0
+    turn_deg: float = Field(0.0, ge=-180, le=180)
+    pitch_deg: float = Field(0.0, ge=-45, le=45)
     blocked: float = Field(0.0, ge=0, le=0.9)
-    max_depth_m: float | None = Field(None, gt=1)
+    max_depth_m: float | None = Field(None, ge=1)
 
     def refuse_what_does_nothing(self) -> None:
         """Refuse a field that was changed and that this traversal would pass over in silence.
@@ -71,15 +73,15 @@ class SimulationPlan(_Model):
     name: str
     city: Literal["paper", "city"] = "city"
     seed: int = Field(0, ge=0)
-    size_m: tuple[float, float] = (300.0, 400.0)
+    size_m: tuple[CitySide, CitySide] = (300.0, 400.0)
     streets: tuple[str, ...] = ()  # only these are driven; empty: all
     lidar: str = "paper_32"
-    lidar_height_m: float = 1.8
-    spacing_m: float = Field(1.0, gt=0.01)
+    lidar_height_m: float = Field(1.8, gt=0, le=20)
+    spacing_m: float = Field(1.0, ge=0.02)
     survey_condition: str = "clear"
     survey_error: bool = True
     camera: CameraPlan = CameraPlan()
-    camera_height_m: float = 1.5
+    camera_height_m: float = Field(1.5, gt=0, le=20)
     queries: tuple[QueryPlan, ...] = ()
 
     def checked(self) -> "SimulationPlan":

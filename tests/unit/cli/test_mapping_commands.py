@@ -80,6 +80,9 @@ def test_simulate_takes_weather_and_mounting_on_the_track_too(tmp_path: Path) ->
         (("--city", "paris"), "'paris' is neither 'paper' nor 'city'"),
         (("--size", "300"), "size: '300' is not two numbers"),
         (("--camera", "axb"), "camera: 'axb' is not two numbers"),
+        (("--camera", "nanx480"), "camera: nan in 'nanx480' is not between 48 and 4096"),
+        (("--size", "0x400"), "size: 0 in '0x400' is not between 30 and 10000"),
+        (("--size", "300xinf"), "size: inf in '300xinf' is not between"),
         (("--lidar", "none"), "lidar: 'none' is no preset"),
         (("--table1",), "--city paper"),
         (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 would do nothing"),
@@ -90,6 +93,58 @@ def test_simulate_says_what_is_wrong_and_writes_nothing(
 ) -> None:
     assert run("simulate", "--out", tmp_path / "no", *arguments) == 1
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
+
+
+OUT_OF_BOUNDS = {
+    "simulate": [
+        ("--seed", "-1"), ("--spacing", "0"), ("--queries", "-1"), ("--drives", "0"), ("--on-track", "-1"), ("--parked-changed", "2"),
+        ("--aside", "-1"), ("--heading", "181"), ("--turn", "200"), ("--pitch", "90"), ("--blocked", "1"), ("--max-depth", "0"),
+        ("--hfov", "5"), ("--workers", "-1"),
+    ],
+    "build-map": [("--spacing", "-1"), ("--headings", "0"), ("--voxel", "0"), ("--lidar-height", "0")],
+    "evaluate": [("--workers", "0")],
+    "train": [
+        ("--cities", "0"), ("--steps", "0"), ("--pairs", "1"), ("--rate", "0"), ("--seed", "-1"), ("--workers", "0"),
+    ],
+    "demo": [("--queries", "0"), ("--seed", "-1"), ("--port", "70000")],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value"),
+    [(command, *given) for command, options in OUT_OF_BOUNDS.items() for given in options],
+)
+def test_a_number_out_of_bounds_is_refused_by_its_option(
+    command: str, option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if command == "train":
+        pytest.importorskip("torch", reason="needs the extra `training`")
+    wanted = {
+        "simulate": ("--out", tmp_path / "out"), "build-map": (tmp_path / "in", "--out", tmp_path / "out"),
+        "evaluate": (tmp_path / "map", tmp_path / "in"), "train": ("--run", tmp_path / "out"),
+        "demo": ("--out", tmp_path / "out"),
+    }[command]  # fmt: skip
+    assert run(command, *wanted, option, value) == 2
+    assert f"Invalid value for '{option}'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("--max-depth", "inf"), "max_depth_m: "),
+        (("--camera", "640.5x480"), "width: "),
+        (("--camera", "50x480"), "width: "),
+    ],
+)
+def test_what_is_no_number_to_simulate_with_is_one_line(
+    given: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("simulate", "--out", tmp_path / "no", *given) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"streetfix: {message}")
+    assert err.count("\n") == 1
     assert not (tmp_path / "no").exists()
 
 

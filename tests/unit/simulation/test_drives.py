@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from model_training.simulation.drives import driven, query_candidates, survey_of
 from model_training.simulation.plan import QueryPlan
@@ -86,6 +87,13 @@ def test_a_camera_on_the_track_is_mounted_as_the_plan_says(city, plan):
     left, down, ahead = np.sin(np.deg2rad(30)), np.sin(np.deg2rad(10)), np.cos(np.deg2rad(30))
     shrunk = np.cos(np.deg2rad(10))
     np.testing.assert_allclose(axes[..., 0], np.tile([-left * shrunk, down, ahead * shrunk], (len(axes), 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("field", ["spacing_m", "lidar_height_m", "camera_height_m"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_lengths_that_are_none_are_refused(plan_of, field, value):
+    with pytest.raises(ValidationError, match=field):
+        plan_of(**{field: value})
 
 
 def test_stations_stand_a_step_apart_in_each_street(city):
