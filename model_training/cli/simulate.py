@@ -7,7 +7,9 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
+from model_training.cli.sensor_options import sensor_parameters
 from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
+from model_training.simulation.sensor_parameters import DepthParameters
 from model_training.simulation.simulate import simulate
 from service.errors import DatasetError
 
@@ -18,6 +20,9 @@ Examples:
   streetfix simulate --city paper --table1 --drives 5 --depth precise --depth stereo --out data/paper
 
   streetfix simulate --seed 9001 --queries 334 --out data/unseen1
+
+\b
+  streetfix simulate --lidar os1_128 --set lidar.channels=64 --set depth.noise_px=0.3 --out data/others
 
 An interrupted run goes on where it stopped. Same seed, same bytes, for any number of workers.
 """
@@ -69,14 +74,21 @@ def command(
         float, typer.Option(help="share of the columns that a lorry right ahead hides", min=0, max=0.9)
     ] = 0.0,
     max_depth: Annotated[float | None, typer.Option(help="cut depth at this, metres", min=1)] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="SENSOR.NUMBER=VALUE", help="a number of lidar or depth in place of its preset's; repeat"
+        ),
+    ] = None,
     camera: Annotated[str, typer.Option(help="picture size in pixels, up to 4096x4096")] = "640x480",
     hfov: Annotated[float, typer.Option(help="horizontal field of view, degrees", min=20, max=150)] = 90.0,
     workers: Annotated[int | None, typer.Option(help="processes [default: one a core]", min=1)] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
+    lidar_parameters, depth_parameters = sensor_parameters(settings or [])
     of_all: dict[str, object] = {
         "depths": tuple(depth or ["precise"]), "condition": condition, "turn_deg": turn, "pitch_deg": pitch,
-        "blocked": blocked, "max_depth_m": max_depth,
+        "blocked": blocked, "max_depth_m": max_depth, "depth_parameters": depth_parameters,
     }  # fmt: skip
     of_drives: dict[str, object] = {"parked_changed": parked_changed, "aside_m": aside, "heading_deg": heading}
     plans = []
@@ -87,12 +99,16 @@ def command(
         own = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
         # Without any drive nothing would take these three: the plan refuses them rather than pass them over.
         plans.append(QueryPlan.model_validate(own if plans else own | of_drives))
+    if depth_parameters != DepthParameters() and not plans:
+        raise DatasetError(
+            "set: without queries nothing measures depth; ask for some, or set numbers of lidar only", field="set"
+        )
     width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
         name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
         survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
-        queries=tuple(plans),
+        queries=tuple(plans), lidar_parameters=lidar_parameters,
     )  # fmt: skip
     if city not in ("paper", "city"):
         raise DatasetError(f"city: {city!r} is neither 'paper' nor 'city'", field="city")

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import DEPTHS
 from model_training.simulation.lidar import LIDARS
+from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
@@ -17,6 +18,14 @@ CitySide = Annotated[float, Field(ge=30, le=10_000)]  # metres
 
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_serializer(mode="wrap")
+    def without_empty_parameters(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """All fields, but parameters of sensors only where some are given.
+
+        A finished dataset is recognised by its plan's text, which must not change for plans that say nothing new.
+        """
+        return {name: value for name, value in handler(self).items() if value != {}}
 
 
 class CameraPlan(_Model):
@@ -49,6 +58,7 @@ class QueryPlan(_Model):
     pitch_deg: float = Field(0.0, ge=-45, le=45)
     blocked: float = Field(0.0, ge=0, le=0.9)
     max_depth_m: float | None = Field(None, ge=1)
+    depth_parameters: DepthParameters = DepthParameters()  # in place of those of each of ``depths``
 
     def refuse_what_does_nothing(self) -> None:
         """Refuse a field that was changed and that this traversal would pass over in silence.
@@ -83,6 +93,7 @@ class SimulationPlan(_Model):
     camera: CameraPlan = CameraPlan()
     camera_height_m: float = Field(1.5, gt=0, le=20)
     queries: tuple[QueryPlan, ...] = ()
+    lidar_parameters: LidarParameters = LidarParameters()  # in place of those of ``lidar``
 
     def checked(self) -> "SimulationPlan":
         """Itself, if every preset it names exists and every field does something.
@@ -100,8 +111,11 @@ class SimulationPlan(_Model):
         for field, value, known in named:
             if value not in set(known):
                 raise DatasetError(f"{field}: {value!r} is no preset; there are: {', '.join(known)}", field=field)
+        self.lidar_parameters.on(self.lidar)
         for query in self.queries:
             query.refuse_what_does_nothing()
+            for depth in query.depths:
+                query.depth_parameters.on(depth)
         names = [query.name for query in self.queries]
         if len(set(names)) != len(names):
             raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")

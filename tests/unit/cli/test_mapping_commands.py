@@ -74,6 +74,38 @@ def test_simulate_takes_weather_and_mounting_on_the_track_too(tmp_path: Path) ->
     ]
 
 
+def test_simulate_replaces_single_numbers_of_the_sensors(tmp_path: Path) -> None:
+    given = ("--set", "lidar.channels=16", "--set", "lidar.max_range_m=25", "--set", "depth.noise_px=0.3")
+    assert run("simulate", "--out", tmp_path / "set", *given, "--queries", "1", "--on-track", "1", *SMALL) == 0
+    plan = plan_in(tmp_path / "set")
+    assert plan["lidar_parameters"] == {"channels": 16, "max_range_m": 25.0}
+    assert [query["depth_parameters"] for query in plan["queries"]] == [{"noise_px": 0.3}] * 2
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["radar.power=1"], "radar.power: there is no sensor 'radar'; there are: lidar, depth"),
+        (["lidar.beams=64"], "lidar.beams: lidar has no number 'beams'; it has: channels, columns"),
+        (["depth.noise_px"], "set: 'depth.noise_px' is not SENSOR.NUMBER=VALUE"),
+        (["channels=64"], "set: 'channels=64' is not SENSOR.NUMBER=VALUE"),
+        (["lidar.channels=8"], "lidar.channels: Input should be greater than or equal to 16 (given: '8')"),
+        (["depth.noise_px=much"], "depth.noise_px: Input should be a valid number"),
+        (["depth.bleeding=nan"], "depth.bleeding: "),
+        (["lidar.channels=16", "lidar.channels=32"], "lidar.channels: it is set twice"),
+        (["lidar.top_deg=-20"], "lidar.top_deg: -20 is not above lidar.bottom_deg, -15"),
+        (["depth.min_range_m=5", "depth.max_range_m=4"], "depth.max_range_m: 4 is not beyond depth.min_range_m, 5"),
+    ],
+)
+def test_simulate_refuses_a_number_that_no_sensor_can_take(
+    texts: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [part for text in texts for part in ("--set", text)]
+    assert run("simulate", "--out", tmp_path / "no", *given) == 1
+    assert capsys.readouterr().err.lstrip().startswith(f"streetfix: {message}")
+    assert not (tmp_path / "no").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -86,6 +118,7 @@ def test_simulate_takes_weather_and_mounting_on_the_track_too(tmp_path: Path) ->
         (("--lidar", "none"), "lidar: 'none' is no preset"),
         (("--table1",), "--city paper"),
         (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 would do nothing"),
+        (("--queries", "0", "--set", "depth.noise_px=1"), "without queries nothing measures depth"),
     ],
 )
 def test_simulate_says_what_is_wrong_and_writes_nothing(
