@@ -19,10 +19,12 @@ def command(
         Path, typer.Option(help="ONNX file of `streetfix export` [default: the stock encoder]")
     ] = ENCODER,
     name: Annotated[str, typer.Option(help="how requests address the map [default: the dataset's name]")] = "",
-    spacing: Annotated[float, typer.Option(help="travelled metres between places")] = 1.0,
-    headings: Annotated[int, typer.Option(help="views of each place; the stock encoder was trained for 24")] = 24,
-    voxel: Annotated[float, typer.Option(help="edge of the cloud's voxels, metres")] = 0.3,
-    lidar_height: Annotated[float, typer.Option(help="of the LiDAR above the ground, roughly, metres")] = 1.8,
+    spacing: Annotated[float, typer.Option(help="travelled metres between places; 0 takes every scan", min=0)] = 1.0,
+    headings: Annotated[
+        int, typer.Option(help="views of each place; the stock encoder was trained for 24", min=1, max=360)
+    ] = 24,
+    voxel: Annotated[float, typer.Option(help="edge of the cloud's voxels, metres", min=0.01)] = 0.3,
+    lidar_height: Annotated[float, typer.Option(help="of the LiDAR above the ground, roughly, metres", min=0.1)] = 1.8,
     remove_weather: Annotated[bool, typer.Option(help="drop lone points such as rain and snow by local PCA")] = False,
     licence: Annotated[str, typer.Option(help="licence text kept in the manifest")] = "",
     overwrite: Annotated[bool, typer.Option(help="replace a bundle that is there")] = False,

@@ -21,7 +21,7 @@ def command(
     streets: Annotated[str, typer.Option(help="streets of the paper's city to map")] = "1,5,7",
     queries: Annotated[int, typer.Option(help="picture pairs to ask", min=1)] = 12,
     depth: Annotated[str, typer.Option(help="depth camera: ideal, precise or stereo")] = "precise",
-    seed: Annotated[int, typer.Option(help="of the city and its drives")] = 0,
+    seed: Annotated[int, typer.Option(help="of the city and its drives", min=0)] = 0,
     port: Annotated[int, typer.Option(help="of the service; 0 lets the system choose", min=0, max=65535)] = 0,
     once: Annotated[bool, typer.Option("--once", help="end after the answers instead of serving on")] = False,
 ) -> None:

@@ -2,8 +2,9 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,8 @@ def city_demo(plan: CityDemo, folder: Path, encoder: Path, report: Report) -> De
     new = not (folder / "dataset" / "dataset.json").exists()
     simulate(simulation, folder / "dataset", report=report)
     dataset = Dataset(folder / "dataset")
-    _build(dataset, encoder, folder / "map", "paper-city", report, new=new)
+    made_from = simulation.model_dump(mode="json")
+    _build(dataset, encoder, folder / "map", "paper-city", report, made_from=made_from, new=new)
     streets = Streets.from_geojson(dataset.streets())
     return DemoMap(folder, folder / "map", tuple(_city_questions(dataset, streets, folder)))
 
@@ -87,7 +89,8 @@ def recorded_demo(source: Path, folder: Path, encoder: Path, report: Report) -> 
     if new:
         import_kitti_object(source, folder / "dataset", depth="sgbm", progress=lambda *done: report("frames", *done))
     dataset = Dataset(folder / "dataset")
-    _build(dataset, encoder, folder / "map", "recorded-frames", report, new=new)
+    made_from = {"source": str(source.resolve())}
+    _build(dataset, encoder, folder / "map", "recorded-frames", report, made_from=made_from, new=new)
     names = tuple(dataset.description.source["places"])
     return DemoMap(folder, folder / "map", tuple(_recorded_questions(dataset, folder)), names)
 
@@ -112,14 +115,27 @@ def _is_new(dataset: Path, source: Path) -> bool:
     return True
 
 
-def _build(dataset: Dataset, encoder: Path, bundle: Path, name: str, report: Report, *, new: bool) -> None:
-    """Build the map, unless it is there and made by this encoder of this dataset."""
+def _build(
+    dataset: Dataset, encoder: Path, bundle: Path, name: str, report: Report, *, made_from: dict[str, Any], new: bool
+) -> None:
+    """Build the map, unless it is there and made of the same, by the same encoder, in the same way.
+
+    What a map was made from is noted beside it when it is whole: a run that ends between the dataset and its map must
+    not leave the map of another plan to the next one.
+    """
+    settings, note = BuildSettings(name=name), bundle.with_name("map.made_from.json")
+    wanted = {"made_from": made_from, "encoder_sha256": sha256_of(encoder), "settings": asdict(settings)}
+    if new or not _is_noted(note, wanted, bundle):
+        version = build_map(dataset, encoder, bundle, settings, overwrite=True, report=report).version
+        note.write_text(json.dumps(wanted | {"map_version": version}, indent=1) + "\n")
+
+
+def _is_noted(note: Path, wanted: dict[str, Any], bundle: Path) -> bool:
     try:
-        made_by = None if new else read_manifest(bundle).encoder_sha256
-    except BundleError:
-        made_by = None
-    if made_by != sha256_of(encoder):
-        build_map(dataset, encoder, bundle, BuildSettings(name=name), overwrite=True, report=report)
+        noted: object = json.loads(note.read_text())
+        return noted == wanted | {"map_version": read_manifest(bundle).version}
+    except (OSError, ValueError, BundleError):
+        return False
 
 
 def _city_questions(dataset: Dataset, streets: Streets, folder: Path) -> Iterator[Question]:

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -13,7 +14,8 @@ from model_training.baselines.raw_range import raw_best_views
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.evaluate import evaluate, write_trajectory
-from model_training.evaluation.measures import RIGHT_PLACE_M
+from model_training.evaluation.measures import recall_at
+from model_training.evaluation.predict import Predictions
 from service.errors import DatasetError
 from service.maps.reader import MapBundle
 
@@ -44,7 +46,7 @@ def command(
     predictions: Annotated[
         Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")
     ] = None,
-    workers: Annotated[int, typer.Option(help="queries at a time")] = 2,
+    workers: Annotated[int, typer.Option(help="queries at a time", min=1)] = 2,
 ) -> None:
     """Measure a map against queries whose truth is known.
 
@@ -65,7 +67,8 @@ def command(
         result = evaluate(opened, data, names, workers=workers, report=report)
         figures = result.figures
         if raw_baseline:
-            _add_raw(figures, opened, data, list(result.predictions), report)
+            places = raw_best_views(opened, data, list(result.predictions), report=report)
+            _add_raw(figures, opened, places, result.predictions)
     if trajectory is not None:
         write_trajectory(trajectory, next(iter(result.predictions.values())))
     if predictions is not None:
@@ -79,19 +82,28 @@ def command(
     Console().print(_table(figures))
 
 
-def _add_raw(figures: dict[str, Any], bundle: MapBundle, dataset: Dataset, names: list[str], report: Any) -> None:
-    """The raw range image's R@1 at its best setting, which is named."""
-    truth = np.concatenate(
-        [np.array([f.T_map_camera[:2, 3] for f in dataset.queries(n) if f.T_map_camera is not None]) for n in names]
-    )
+def _add_raw(
+    figures: dict[str, Any], bundle: MapBundle, places: dict[str, NDArray[np.int64]], predictions: dict[str, Predictions]
+) -> None:  # fmt: skip
+    """Add the raw range image's R@1 over all queries and of each set, each at its own best setting, which is named.
+
+    ``places`` holds each query's first place by every setting, the sets one after the other; -1 for none.
+    """
+    truth = np.concatenate([p.T_true[:, :2, 3] for p in predictions.values()])
     xy = bundle.T_map_place[:, :2, 3]
-    recalls = {}
-    for setting, place in raw_best_views(bundle, dataset, names, report=report).items():
-        right = (place >= 0) & (np.linalg.norm(xy[np.maximum(place, 0)] - truth, axis=1) <= RIGHT_PLACE_M)
-        recalls[setting] = float(right.mean())
-    best = max(recalls, key=lambda name: recalls[name])
-    figures["raw_recall_at_1_5m"] = recalls[best]
-    figures["raw"] = {"best_setting": best, "recall_at_1_5m": recalls}
+    right = {setting: recall_at(xy[place][:, None], truth, 1) & (place >= 0) for setting, place in places.items()}
+    figures |= _raw_figures(right, slice(None))
+    first = 0
+    for name, answers in predictions.items():
+        count = len(answers.T_true)
+        figures["sets"][name] |= _raw_figures(right, slice(first, first + count))
+        first += count
+
+
+def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[str, Any]:
+    recalls = {setting: float(flags[queries].mean()) for setting, flags in right.items()}
+    best = max(recalls, key=lambda setting: recalls[setting])
+    return {"raw_recall_at_1_5m": recalls[best], "raw": {"best_setting": best, "recall_at_1_5m": recalls}}
 
 
 def _table(figures: dict[str, Any]) -> Table:
@@ -100,12 +112,10 @@ def _table(figures: dict[str, Any]) -> Table:
     table.add_column("")
     for name, values in columns:
         table.add_column(f"{name}\n{values['split'].replace('_', ' ')}", justify="right")
-    merged = [
-        values | {k: v for k, v in figures.items() if k.startswith("raw") and len(columns) == 1}
-        for _, values in columns
-    ]
     for key, label, form in SHOWN:
-        cells = [form.format(v[key]) if v.get(key) is not None else "-" for v in merged]
+        cells = [form.format(v[key]) if v.get(key) is not None else "-" for _, v in columns]
         if any(cell != "-" for cell in cells):
             table.add_row(label, *cells)
+    if "raw" in figures:
+        table.add_row("raw range image's setting", *(v["raw"]["best_setting"] for _, v in columns))
     return table

@@ -7,7 +7,9 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
+from model_training.cli.sensor_options import sensor_parameters
 from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
+from model_training.simulation.sensor_parameters import DepthParameters
 from model_training.simulation.simulate import simulate
 from service.errors import DatasetError
 
@@ -19,6 +21,9 @@ Examples:
 
   streetfix simulate --seed 9001 --queries 334 --out data/unseen1
 
+\b
+  streetfix simulate --lidar os1_128 --set lidar.channels=64 --set depth.noise_px=0.3 --out data/others
+
 An interrupted run goes on where it stopped. Same seed, same bytes, for any number of workers.
 """
 
@@ -28,59 +33,82 @@ def command(
     city: Annotated[
         str, typer.Option(help="paper: the paper's nine streets; city: another city for each seed")
     ] = "city",
-    seed: Annotated[int, typer.Option(help="decides everything that is random")] = 0,
+    seed: Annotated[int, typer.Option(help="decides everything that is random", min=0)] = 0,
     name: Annotated[str, typer.Option(help="name of the dataset [default: that of the folder]")] = "",
-    size: Annotated[str, typer.Option(help="extent of a random city, metres")] = "300x400",
+    size: Annotated[str, typer.Option(help="extent of a random city, metres, 30 to 10000 each")] = "300x400",
     streets: Annotated[str, typer.Option(help="drive only these streets, e.g. 1,5,between")] = "",
     lidar: Annotated[str, typer.Option(help="paper_32, vlp_16, hdl_64 or os1_128")] = "paper_32",
-    spacing: Annotated[float, typer.Option(help="metres between scans")] = 1.0,
-    queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none")] = 200,
-    drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light")] = 1,
+    spacing: Annotated[float, typer.Option(help="metres between scans", min=0.02)] = 1.0,
+    queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none", min=0)] = 200,
+    drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light", min=1)] = 1,
     table1: Annotated[
         bool, typer.Option("--table1", help="as many queries of each class as the paper's Table I (626)")
     ] = False,
     on_track: Annotated[
-        int, typer.Option(help="queries at the survey's own poses too: the paper's split, which leaks")
+        int,
+        typer.Option(
+            help="queries at the survey's own poses and among its vehicles too: the paper's split, which leaks", min=0
+        ),
     ] = 0,
     depth: Annotated[
         list[str] | None, typer.Option(help="ideal, precise or stereo; repeat for several [default: precise]")
     ] = None,
-    condition: Annotated[
-        str, typer.Option(help="of the query drives: clear, rain, snow, fog, night or low_sun")
-    ] = "clear",
+    condition: Annotated[str, typer.Option(help="of all queries: clear, rain, snow, fog, night or low_sun")] = "clear",
     survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
     survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
-    parked_changed: Annotated[float, typer.Option(help="share of parking slots that differ from drive to drive")] = 0.5,
-    aside: Annotated[float, typer.Option(help="how far queries may be beside the survey's lane, metres")] = 2.0,
-    heading: Annotated[float, typer.Option(help="how far queries may look off the street's axis, degrees")] = 15.0,
-    turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees")] = 0.0,
-    pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees")] = 0.0,
-    blocked: Annotated[float, typer.Option(help="share of the columns that a lorry right ahead hides")] = 0.0,
-    max_depth: Annotated[float | None, typer.Option(help="cut depth at this, metres")] = None,
-    camera: Annotated[str, typer.Option(help="picture size in pixels")] = "640x480",
-    hfov: Annotated[float, typer.Option(help="horizontal field of view, degrees")] = 90.0,
-    workers: Annotated[int | None, typer.Option(help="processes [default: one a core]")] = None,
+    parked_changed: Annotated[
+        float,
+        typer.Option(help="share of parking slots that differ from drive to drive (not --on-track)", min=0, max=1),
+    ] = 0.5,
+    aside: Annotated[
+        float,
+        typer.Option(help="how far queries may be beside the survey's lane, metres (not --on-track)", min=0, max=10),
+    ] = 2.0,
+    heading: Annotated[
+        float,
+        typer.Option(help="how far queries may look off the street's axis, degrees (not --on-track)", min=0, max=180),
+    ] = 15.0,
+    turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees", min=-180, max=180)] = 0.0,
+    pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees", min=-45, max=45)] = 0.0,
+    blocked: Annotated[
+        float, typer.Option(help="share of the columns that a lorry right ahead hides", min=0, max=0.9)
+    ] = 0.0,
+    max_depth: Annotated[float | None, typer.Option(help="cut depth at this, metres", min=1)] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="SENSOR.NUMBER=VALUE", help="a number of lidar or depth in place of its preset's; repeat"
+        ),
+    ] = None,
+    camera: Annotated[str, typer.Option(help="picture size in pixels, up to 4096x4096")] = "640x480",
+    hfov: Annotated[float, typer.Option(help="horizontal field of view, degrees", min=20, max=150)] = 90.0,
+    workers: Annotated[int | None, typer.Option(help="processes [default: one a core]", min=1)] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
-    depths = tuple(depth or ["precise"])
+    lidar_parameters, depth_parameters = sensor_parameters(settings or [])
+    of_all: dict[str, object] = {
+        "depths": tuple(depth or ["precise"]), "condition": condition, "turn_deg": turn, "pitch_deg": pitch,
+        "blocked": blocked, "max_depth_m": max_depth, "depth_parameters": depth_parameters,
+    }  # fmt: skip
+    of_drives: dict[str, object] = {"parked_changed": parked_changed, "aside_m": aside, "heading_deg": heading}
     plans = []
     if queries or table1:
-        plans = [
-            QueryPlan(
-                name=f"drive{k}", traversal=k, count=max(1, queries), per_class=table1, depths=depths, condition=condition,
-                parked_changed=parked_changed, aside_m=aside, heading_deg=heading, turn_deg=turn, pitch_deg=pitch,
-                blocked=blocked, max_depth_m=max_depth,
-            )
-            for k in range(1, drives + 1)
-        ]  # fmt: skip
+        given = of_all | of_drives | {"count": max(1, queries), "per_class": table1}
+        plans = [QueryPlan.model_validate(given | {"name": f"drive{k}", "traversal": k}) for k in range(1, drives + 1)]
     if on_track:
-        plans.append(QueryPlan(name="survey_drive", traversal=0, count=on_track, on_track=True, depths=depths))
-    width, height = _pair(camera, "camera")
+        own = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
+        # Without any drive nothing would take these three: the plan refuses them rather than pass them over.
+        plans.append(QueryPlan.model_validate(own if plans else own | of_drives))
+    if depth_parameters != DepthParameters() and not plans:
+        raise DatasetError(
+            "set: without queries nothing measures depth; ask for some, or set numbers of lidar only", field="set"
+        )
+    width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
-        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size"),
+        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
-        survey_error=survey_error, camera=CameraPlan(width=int(width), height=int(height), horizontal_deg=hfov),
-        queries=tuple(plans),
+        survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
+        queries=tuple(plans), lidar_parameters=lidar_parameters,
     )  # fmt: skip
     if city not in ("paper", "city"):
         raise DatasetError(f"city: {city!r} is neither 'paper' nor 'city'", field="city")
@@ -92,7 +120,7 @@ def command(
 command.__doc__ = EXAMPLE
 
 
-def _pair(text: str, field: str) -> tuple[float, float]:
+def _pair(text: str, field: str, *, least: float, most: float) -> tuple[float, float]:
     parts = text.lower().split("x")
     try:
         first, second = (float(part) for part in parts)
@@ -100,4 +128,7 @@ def _pair(text: str, field: str) -> tuple[float, float]:
         raise DatasetError(
             f"{field}: {text!r} is not two numbers with an x between, such as 640x480", field=field
         ) from error
+    for value in (first, second):
+        if not least <= value <= most:  # which NaN is not either
+            raise DatasetError(f"{field}: {value:g} in {text!r} is not between {least} and {most}", field=field)
     return first, second

@@ -17,16 +17,16 @@ from service.imaging.view_grid import ViewGrid
 def command(
     run: Annotated[Path, typer.Option(help="folder of the run: configuration, checkpoint, TensorBoard log")],
     recipe: Annotated[str, typer.Option(help="stock: many cities; paper: the paper's city itself")] = "stock",
-    cities: Annotated[int, typer.Option(help="cities of the stock recipe")] = 24,
+    cities: Annotated[int, typer.Option(help="cities of the stock recipe", min=1, max=1000)] = 24,
     packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
-    steps: Annotated[int, typer.Option(help="optimiser steps")] = 4000,
-    pairs: Annotated[int, typer.Option(help="pairs of views a step")] = 128,
+    steps: Annotated[int, typer.Option(help="optimiser steps", min=1)] = 4000,
+    pairs: Annotated[int, typer.Option(help="pairs of views a step", min=2, max=2048)] = 128,
     optimiser: Annotated[str, typer.Option(help="adamw, or sgdm (the paper's)")] = "adamw",
-    rate: Annotated[float, typer.Option(help="highest learning rate")] = 2e-3,
-    seed: Annotated[int, typer.Option(help="of everything that is drawn")] = 0,
+    rate: Annotated[float, typer.Option(help="highest learning rate", min=1e-8, max=1)] = 2e-3,
+    seed: Annotated[int, typer.Option(help="of everything that is drawn", min=0)] = 0,
     start_from: Annotated[Path | None, typer.Option(help="run whose weights to start from")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
-    workers: Annotated[int | None, typer.Option(help="processes that simulate [default: one a core]")] = None,
+    workers: Annotated[int | None, typer.Option(help="processes that simulate [default: one a core]", min=1)] = None,
 ) -> None:
     """Simulate training cities and train an encoder on them; Ctrl-C saves, the same command goes on.
 

@@ -86,13 +86,14 @@ class DatasetDescription(_Model):
 
 @dataclass(frozen=True, slots=True)
 class QueryFrame:
-    """One query of a set: its number, picture pair and truth (None where unknown)."""
+    """One query of a set: its number, picture pair and truth with its timestamp in seconds (None where unknown)."""
 
     number: int
     rgb_path: Path
     depth_path: Path
     camera: CameraSensor
     T_map_camera: NDArray[np.float64] | None
+    stamp_s: float | None
 
     def rgb(self) -> NDArray[np.uint8]:
         """The colour picture (H, W, 3)."""
@@ -183,7 +184,7 @@ class Dataset:
             known = ", ".join(self.query_sets()) or "none"
             raise DatasetError(f"{self.folder} has no query set {name!r}; it has: {known}", field="queries")
         poses_path = folder / "poses.txt"
-        truth = read_tum(poses_path)[1] if poses_path.exists() else None
+        stamps, truth = read_tum(poses_path) if poses_path.exists() else (None, None)
         pictures = sorted(p for p in (folder / "rgb").iterdir() if p.suffix in PICTURES and p.stem.isdigit())
         names = _camera_names(folder, len(pictures))
         cameras = {camera.name: camera for camera in self.description.sensors.cameras}
@@ -203,8 +204,9 @@ class Dataset:
                     f"{folder}/cameras.txt names {camera_name!r}, which dataset.json does not", field="cameras.txt"
                 )
             yield QueryFrame(
-                number, rgb_path, depth_path, cameras[camera_name], None if truth is None else truth[number]
-            )
+                number, rgb_path, depth_path, cameras[camera_name],
+                T_map_camera=None if truth is None else truth[number], stamp_s=None if stamps is None else float(stamps[number]),
+            )  # fmt: skip
 
 
 def _camera_names(folder: Path, count: int) -> list[str] | None:

@@ -74,15 +74,26 @@ def city_seen_in_training(dataset: Dataset, trained_on: tuple[str, ...]) -> bool
 
 
 def split_of(dataset: Dataset, name: str, city_seen: bool | None) -> str:
-    """``same_drive`` (the paper's way; it leaks), ``other_drive`` (honest), or ``unseen_city`` (and new to the encoder)."""
-    plan = dataset.description.source.get("plan") or {}
-    for query in plan.get("queries", []):
-        if query.get("on_track") and name.startswith(f"{query.get('name')}_"):
-            return "same_drive"
+    """``same_drive`` (the paper's way; it leaks), ``other_drive`` (honest), or ``unseen_city`` (and new to the encoder).
+
+    A recording whose ``source`` does not list the set among its ``other_drives`` is taken for the survey's own drive:
+    that a query and the map are of two moments must be said, not guessed.
+    """
+    if _is_of_the_survey(dataset.description.source, name):
+        return "same_drive"
     return "unseen_city" if city_seen is False else "other_drive"
 
 
+def _is_of_the_survey(source: dict[str, Any], name: str) -> bool:
+    if source.get("kind") != "simulation":
+        return name not in source.get("other_drives", ())
+    for query in (source.get("plan") or {}).get("queries", []):
+        if name in {f"{query.get('name')}_{depth}" for depth in query.get("depths", [])}:
+            return bool(query.get("on_track") or query.get("traversal") == 0)
+    return True  # a set that the plan does not have was put there by somebody
+
+
 def write_trajectory(path: Path, predictions: Predictions) -> None:
-    """Write the answered poses, T_map_camera, in TUM format; a query's number is its time, as in the truth's file."""
+    """Write the answered poses, T_map_camera, in TUM format, each with the timestamp of its truth."""
     answered = np.isfinite(predictions.T_answer[:, 0, 3])
-    write_tum(path, np.flatnonzero(answered).astype(np.float64), predictions.T_answer[answered])
+    write_tum(path, predictions.stamp_s[answered], predictions.T_answer[answered])

@@ -30,7 +30,8 @@ class Predictions:
 
     ``T_true`` and ``T_answer`` (n, 4, 4) are T_map_camera, NaN where nothing was answered; ``street_true`` and
     ``street_answer`` (n) are features of the map's streets, -1 for none; ``ranked_xy`` (n, RANKED, 2) are the most similar
-    distinct places, the best first, NaN where there are fewer; ``localized`` (n); ``ms`` (n) of decoding and localizing.
+    distinct places, the best first, NaN where there are fewer; ``localized`` (n); ``ms`` (n) of decoding and localizing;
+    ``stamp_s`` (n) are the truth's own timestamps, seconds.
     """
 
     T_true: NDArray[np.float64]
@@ -41,6 +42,7 @@ class Predictions:
     ranked_place: NDArray[np.int64]
     localized: NDArray[np.bool_]
     ms: NDArray[np.float64]
+    stamp_s: NDArray[np.float64]
 
     def save(self, path: Path) -> None:
         """Keep them as NPZ, without pickle."""
@@ -123,6 +125,7 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
         ranked_place,
         localized,
         np.array([ms for _, ms in answers]),
+        np.array([frame.stamp_s for frame in frames], np.float64),
     )
 
 

@@ -1,5 +1,6 @@
 """Dataset + encoder -> map bundle: level by PCA, cut the view fan, encode, gather the cloud, write the bundle."""
 
+import math
 import os
 import re
 from collections.abc import Callable, Iterator
@@ -38,7 +39,11 @@ CLOUD_REACH_M = 40.0
 
 @dataclass(frozen=True, slots=True)
 class BuildSettings:
-    """How a map is built; all of it is in the manifest."""
+    """How a map is built; all of it is in the manifest.
+
+    Raises:
+        DatasetError: a number makes no sense, naming the field.
+    """
 
     name: str
     spacing_m: float = 1.0
@@ -47,6 +52,14 @@ class BuildSettings:
     expected_lidar_height_m: float = 1.8
     remove_weather: bool = False
     licence: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what would end in an empty fan or a cloud without voxels."""
+        lowest = {"spacing_m": 0.0, "headings": 1, "voxel_m": 0.01, "expected_lidar_height_m": 0.1}
+        for field, least in lowest.items():
+            value = getattr(self, field)
+            if not least <= value < math.inf:
+                raise DatasetError(f"{field}: {value:g} is not {least:g} or more; give a number that is", field=field)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,11 +14,11 @@ from model_training.simulation.traversal import (
     Station,
     lidar_pose,
     query_pose,
-    stations,
+    stations_along,
     survey_error,
 )
 from service.errors import DatasetError
-from service.geometry.rigid import R_BODY_OPTICAL, transform_from
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
 
 Transforms = NDArray[np.float64]
 
@@ -44,11 +44,8 @@ def driven(city: City, plan: SimulationPlan, step_m: float) -> list[Station]:
             raise DatasetError(
                 f"streets: there is no street {wanted!r} here; there are: {', '.join(known)}", field="streets"
             )
-    if not plan.streets:
-        return stations(city, step_m)
-    part = City.__new__(City)
-    part.streets = [street for street in city.streets if street.street in plan.streets]
-    return stations(part, step_m)
+    wanted_streets = [street for street in city.streets if not plan.streets or street.street in plan.streets]
+    return stations_along(wanted_streets, step_m)
 
 
 def survey_of(city: City, plan: SimulationPlan) -> Survey:
@@ -75,15 +72,16 @@ def query_candidates(city: City, plan: SimulationPlan, query: QueryPlan, survey:
     )  # fmt: skip
     if query.on_track:
         order = rng.permutation(len(survey.T_map_lidar))
-        return np.array([_camera_on(survey.T_map_lidar[k], plan) for k in order])
+        return np.array([_camera_on(survey.T_map_lidar[k], plan, query) for k in order])
     track = [survey.stations[k] for k in rng.permutation(len(survey.stations))]
     rounds = 1 + 3 * query.count // max(1, len(track))
     return np.array([query_pose(city, station, drive, rng) for _ in range(rounds) for station in track])
 
 
-def _camera_on(T_map_lidar: NDArray[np.float64], plan: SimulationPlan) -> NDArray[np.float64]:
-    """A camera that rides below the LiDAR and looks ahead."""
-    T_lidar_camera = transform_from(R_BODY_OPTICAL, np.array([0.0, 0.0, plan.camera_height_m - plan.lidar_height_m]))
+def _camera_on(T_map_lidar: NDArray[np.float64], plan: SimulationPlan, query: QueryPlan) -> NDArray[np.float64]:
+    """A camera that rides below the LiDAR and looks ahead, but for its turn and pitch against the vehicle."""
+    R = rotation_z(np.deg2rad(query.turn_deg)) @ rotation_y(np.deg2rad(query.pitch_deg)) @ R_BODY_OPTICAL
+    T_lidar_camera = transform_from(R, np.array([0.0, 0.0, plan.camera_height_m - plan.lidar_height_m]))
     T: NDArray[np.float64] = T_map_lidar @ T_lidar_camera
     return T
 

@@ -2,19 +2,30 @@
 
 import math
 from collections.abc import Iterable
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import DEPTHS
 from model_training.simulation.lidar import LIDARS
+from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
+CitySide = Annotated[float, Field(ge=30, le=10_000)]  # metres
+
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_serializer(mode="wrap")
+    def without_empty_parameters(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """All fields, but parameters of sensors only where some are given.
+
+        A finished dataset is recognised by its plan's text, which must not change for plans that say nothing new.
+        """
+        return {name: value for name, value in handler(self).items() if value != {}}
 
 
 class CameraPlan(_Model):
@@ -22,7 +33,7 @@ class CameraPlan(_Model):
 
     width: int = Field(640, ge=64, le=4096)
     height: int = Field(480, ge=48, le=4096)
-    horizontal_deg: float = Field(90.0, gt=20, lt=150)
+    horizontal_deg: float = Field(90.0, ge=20, le=150)
 
     def pinhole(self) -> PinholeCamera:
         """Its intrinsics, the optical axis in the middle of the picture."""
@@ -43,10 +54,27 @@ class QueryPlan(_Model):
     parked_changed: float = Field(0.5, ge=0, le=1)
     aside_m: float = Field(2.0, ge=0, le=10)
     heading_deg: float = Field(15.0, ge=0, le=180)
-    turn_deg: float = 0.0
-    pitch_deg: float = 0.0
+    turn_deg: float = Field(0.0, ge=-180, le=180)
+    pitch_deg: float = Field(0.0, ge=-45, le=45)
     blocked: float = Field(0.0, ge=0, le=0.9)
-    max_depth_m: float | None = Field(None, gt=1)
+    max_depth_m: float | None = Field(None, ge=1)
+    depth_parameters: DepthParameters = DepthParameters()  # in place of those of each of ``depths``
+
+    def refuse_what_does_nothing(self) -> None:
+        """Refuse a field that was changed and that this traversal would pass over in silence.
+
+        Raises:
+            DatasetError: naming the field, its value and why it does nothing here.
+        """
+        poses, vehicles = "stands at the survey's own poses", "meets the survey's own vehicles"
+        refused = [("aside_m", poses), ("heading_deg", poses)] if self.on_track else []
+        refused += [("parked_changed", vehicles)] if self.traversal == 0 else []
+        for field, why in refused:
+            value = getattr(self, field)
+            if value != type(self).model_fields[field].default:
+                raise DatasetError(
+                    f"{field}: {value:g} would do nothing, since {self.name!r} {why}; leave it out", field=field
+                )
 
 
 class SimulationPlan(_Model):
@@ -55,22 +83,23 @@ class SimulationPlan(_Model):
     name: str
     city: Literal["paper", "city"] = "city"
     seed: int = Field(0, ge=0)
-    size_m: tuple[float, float] = (300.0, 400.0)
+    size_m: tuple[CitySide, CitySide] = (300.0, 400.0)
     streets: tuple[str, ...] = ()  # only these are driven; empty: all
     lidar: str = "paper_32"
-    lidar_height_m: float = 1.8
-    spacing_m: float = Field(1.0, gt=0.01)
+    lidar_height_m: float = Field(1.8, gt=0, le=20)
+    spacing_m: float = Field(1.0, ge=0.02)
     survey_condition: str = "clear"
     survey_error: bool = True
     camera: CameraPlan = CameraPlan()
-    camera_height_m: float = 1.5
+    camera_height_m: float = Field(1.5, gt=0, le=20)
     queries: tuple[QueryPlan, ...] = ()
+    lidar_parameters: LidarParameters = LidarParameters()  # in place of those of ``lidar``
 
     def checked(self) -> "SimulationPlan":
-        """Itself, if every preset it names exists.
+        """Itself, if every preset it names exists and every field does something.
 
         Raises:
-            DatasetError: naming the field, the value and what there is.
+            DatasetError: naming the field, the value and what there is or why it is refused.
         """
         named: list[tuple[str, str, Iterable[str]]] = [
             ("lidar", self.lidar, LIDARS),
@@ -82,6 +111,11 @@ class SimulationPlan(_Model):
         for field, value, known in named:
             if value not in set(known):
                 raise DatasetError(f"{field}: {value!r} is no preset; there are: {', '.join(known)}", field=field)
+        self.lidar_parameters.on(self.lidar)
+        for query in self.queries:
+            query.refuse_what_does_nothing()
+            for depth in query.depths:
+                query.depth_parameters.on(depth)
         names = [query.name for query in self.queries]
         if len(set(names)) != len(names):
             raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")

@@ -32,9 +32,9 @@ from model_training.simulation.blocker import Blocker
 from model_training.simulation.camera import take, unit_rays
 from model_training.simulation.city import City
 from model_training.simulation.conditions import CONDITIONS
-from model_training.simulation.depth_noise import DEPTHS, measured_depth
+from model_training.simulation.depth_noise import measured_depth
 from model_training.simulation.drives import Quota, Survey, query_candidates, quota_of, survey_of
-from model_training.simulation.lidar import LIDARS, scan
+from model_training.simulation.lidar import scan
 from model_training.simulation.meshes import joined
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.scene import Scene
@@ -131,7 +131,7 @@ def _survey(city: City, plan: SimulationPlan, survey: Survey, out: Path, workers
     todo = [k for k in range(count) if not scan_path(out, k).exists()]
     if todo:
         scene = Scene(joined([city.static, city.occupants(0)]))
-        job = _Job(plan, city, scene, out, survey=survey, rays=LIDARS[plan.lidar].rays())
+        job = _Job(plan, city, scene, out, survey=survey, rays=plan.lidar_parameters.on(plan.lidar).rays())
         for done, _ in enumerate(_run(job, _one_scan, todo, workers), count - len(todo) + 1):
             report("survey", done, count)
     write_tum(out / "survey" / "poses.txt", np.arange(count, dtype=np.float64) * 0.1, survey.T_map_lidar_written)
@@ -144,7 +144,7 @@ def _one_scan(number: int) -> int:
     rng = np.random.default_rng([job.plan.seed, 31, number])
     points = scan(
         job.scene,
-        LIDARS[job.plan.lidar],
+        job.plan.lidar_parameters.on(job.plan.lidar),
         job.rays,
         job.survey.T_map_lidar[number],
         CONDITIONS[job.plan.survey_condition],
@@ -178,7 +178,7 @@ def _queries(
         z_of_ray=z_of_ray,
         candidates=candidates,
     )
-    chosen = _free_candidates(job, quota, workers)
+    chosen = _free_candidates(job, quota)
     for folder in sets.values():
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
@@ -191,15 +191,18 @@ def _queries(
         write_tum(folder / "poses.txt", stamps, job.candidates)
 
 
-def _free_candidates(job: _Job, quota: Quota, workers: int) -> NDArray[np.int64]:
-    """The first candidates, class by class, that do not stare at something right before them."""
+def _free_candidates(job: _Job, quota: Quota) -> NDArray[np.int64]:
+    """The first candidates, class by class, that do not stare at something right before them.
+
+    One worker does it all: a check casts some hundred rays, less work than starting other processes.
+    """
     left = list(quota.wanted)
     chosen: dict[int, list[int]] = {k: [] for k in range(len(left))}
     order = [k for k in range(len(quota.class_of)) if quota.class_of[k] >= 0]
     step = 256
     for start in range(0, len(order), step):
         part = [k for k in order[start : start + step] if left[quota.class_of[k]] > 0]
-        for k, free in zip(part, _run(job, _is_free, part, min(workers, 1)), strict=True):
+        for k, free in zip(part, _run(job, _is_free, part, workers=1), strict=True):
             index = int(quota.class_of[k])
             if free and left[index] > 0:
                 left[index] -= 1
@@ -254,9 +257,8 @@ def _one_pair(number: int) -> int:
     for index, name in enumerate(query.depths):
         folder = query_folder(job.out, f"{query.name}_{name}")
         rgb_path, depth_path = _pair(folder, number)
-        depth = measured_depth(
-            picture.depth_m, picture.blank, DEPTHS[name], condition, np.random.default_rng([*key, index])
-        )
+        model = query.depth_parameters.on(name)
+        depth = measured_depth(picture.depth_m, picture.blank, model, condition, np.random.default_rng([*key, index]))
         if query.max_depth_m is not None:
             depth[depth > query.max_depth_m] = 0
         steps = np.rint(depth / DEPTH_SCALE_M).clip(0, 65535).astype(np.uint16)
@@ -277,7 +279,7 @@ def _streets(city: City, out: Path) -> None:
 
 
 def _description(plan: SimulationPlan) -> DatasetDescription:
-    lidar, camera = LIDARS[plan.lidar], plan.camera.pinhole()
+    lidar, camera = plan.lidar_parameters.on(plan.lidar), plan.camera.pinhole()
     return DatasetDescription(
         name=plan.name,
         source={"kind": "simulation", "plan": plan.model_dump(mode="json")},

@@ -1,11 +1,13 @@
 """Drives: where the survey's LiDAR stood, and where queries are asked."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model_training.simulation.city import City
+from model_training.simulation.streets import Street
 from service.geometry.rigid import (
     R_BODY_OPTICAL,
     rotation_taking,
@@ -29,10 +31,15 @@ class Station:
 
 
 def stations(city: City, step_m: float, *, lane_m: float = SURVEY_LANE_M) -> list[Station]:
-    """Every street once, in its own direction, a station each ``step_m``."""
+    """The stations along all streets of a city, as ``stations_along`` says."""
+    return stations_along(city.streets, step_m, lane_m=lane_m)
+
+
+def stations_along(streets: Iterable[Street], step_m: float, *, lane_m: float = SURVEY_LANE_M) -> list[Station]:
+    """Every street once, in its own direction, a station each ``step_m``, ``lane_m`` right of its centre line (m)."""
     found: list[Station] = []
     travelled = 0.0
-    for street in city.streets:
+    for street in streets:
         for line in street.lines:
             along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
 

@@ -90,4 +90,4 @@ def _say_where(registry: "MapRegistry", listener: socket.socket) -> None:
             f"map {manifest.name} {manifest.version}: {manifest.counts.places} places, {manifest.counts.views} views"
         )
     shown = f"[{host}]" if ":" in host else host
-    typer.echo(f"serving at http://{shown}:{port} (what it can do: /docs; stop: Ctrl-C)")
+    typer.echo(f"serving at http://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")

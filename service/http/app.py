@@ -21,7 +21,10 @@ x right, y down, z forward. Headings are counter-clockwise from map x, in (-180,
 def create_app(engine: Engine) -> FastAPI:
     """The application; it neither opens nor closes the engine."""
     version = installed_version("streetfix")
-    app = FastAPI(title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False)
+    # FastAPI's pages about the contract load scripts and styles from other hosts, which a service must not make a browser do.
+    app = FastAPI(
+        title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False, docs_url=None, redoc_url=None
+    )  # fmt: skip
     app.include_router(localize.router_for(engine))
     app.include_router(maps.router_for(engine))
     app.include_router(health.router_for(engine, version))

@@ -61,14 +61,64 @@ def test_simulate_passes_every_option_on(tmp_path: Path) -> None:
     assert plan["camera"]["horizontal_deg"] == 70.0
 
 
+def test_simulate_takes_weather_and_mounting_on_the_track_too(tmp_path: Path) -> None:
+    shared = {"condition": "night", "blocked": 0.2, "turn_deg": 10.0, "pitch_deg": 2.0, "max_depth_m": 9.0}
+    given = ("--condition", "night", "--blocked", "0.2", "--turn", "10", "--pitch", "2", "--max-depth", "9")
+    more = ("--queries", "1", "--on-track", "1", "--aside", "1", "--heading", "5", "--parked-changed", "0.2")
+    assert run("simulate", "--out", tmp_path / "both", *given, *more, *SMALL) == 0
+    drive, track = plan_in(tmp_path / "both")["queries"]
+    assert {field: track[field] for field in shared} == {field: drive[field] for field in shared} == shared
+    assert [(q["aside_m"], q["heading_deg"], q["parked_changed"]) for q in (drive, track)] == [
+        (1, 5, 0.2),
+        (2, 15, 0.5),
+    ]
+
+
+def test_simulate_replaces_single_numbers_of_the_sensors(tmp_path: Path) -> None:
+    given = ("--set", "lidar.channels=16", "--set", "lidar.max_range_m=25", "--set", "depth.noise_px=0.3")
+    assert run("simulate", "--out", tmp_path / "set", *given, "--queries", "1", "--on-track", "1", *SMALL) == 0
+    plan = plan_in(tmp_path / "set")
+    assert plan["lidar_parameters"] == {"channels": 16, "max_range_m": 25.0}
+    assert [query["depth_parameters"] for query in plan["queries"]] == [{"noise_px": 0.3}] * 2
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["radar.power=1"], "radar.power: there is no sensor 'radar'; there are: lidar, depth"),
+        (["lidar.beams=64"], "lidar.beams: lidar has no number 'beams'; it has: channels, columns"),
+        (["depth.noise_px"], "set: 'depth.noise_px' is not SENSOR.NUMBER=VALUE"),
+        (["channels=64"], "set: 'channels=64' is not SENSOR.NUMBER=VALUE"),
+        (["lidar.channels=8"], "lidar.channels: Input should be greater than or equal to 16 (given: '8')"),
+        (["depth.noise_px=much"], "depth.noise_px: Input should be a valid number"),
+        (["depth.bleeding=nan"], "depth.bleeding: "),
+        (["lidar.channels=16", "lidar.channels=32"], "lidar.channels: it is set twice"),
+        (["lidar.top_deg=-20"], "lidar.top_deg: -20 is not above lidar.bottom_deg, -15"),
+        (["depth.min_range_m=5", "depth.max_range_m=4"], "depth.max_range_m: 4 is not beyond depth.min_range_m, 5"),
+    ],
+)
+def test_simulate_refuses_a_number_that_no_sensor_can_take(
+    texts: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [part for text in texts for part in ("--set", text)]
+    assert run("simulate", "--out", tmp_path / "no", *given) == 1
+    assert capsys.readouterr().err.lstrip().startswith(f"streetfix: {message}")
+    assert not (tmp_path / "no").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--city", "paris"), "'paris' is neither 'paper' nor 'city'"),
         (("--size", "300"), "size: '300' is not two numbers"),
         (("--camera", "axb"), "camera: 'axb' is not two numbers"),
+        (("--camera", "nanx480"), "camera: nan in 'nanx480' is not between 48 and 4096"),
+        (("--size", "0x400"), "size: 0 in '0x400' is not between 30 and 10000"),
+        (("--size", "300xinf"), "size: inf in '300xinf' is not between"),
         (("--lidar", "none"), "lidar: 'none' is no preset"),
         (("--table1",), "--city paper"),
+        (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 would do nothing"),
+        (("--queries", "0", "--set", "depth.noise_px=1"), "without queries nothing measures depth"),
     ],
 )
 def test_simulate_says_what_is_wrong_and_writes_nothing(
@@ -76,6 +126,58 @@ def test_simulate_says_what_is_wrong_and_writes_nothing(
 ) -> None:
     assert run("simulate", "--out", tmp_path / "no", *arguments) == 1
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
+
+
+OUT_OF_BOUNDS = {
+    "simulate": [
+        ("--seed", "-1"), ("--spacing", "0"), ("--queries", "-1"), ("--drives", "0"), ("--on-track", "-1"), ("--parked-changed", "2"),
+        ("--aside", "-1"), ("--heading", "181"), ("--turn", "200"), ("--pitch", "90"), ("--blocked", "1"), ("--max-depth", "0"),
+        ("--hfov", "5"), ("--workers", "-1"),
+    ],
+    "build-map": [("--spacing", "-1"), ("--headings", "0"), ("--voxel", "0"), ("--lidar-height", "0")],
+    "evaluate": [("--workers", "0")],
+    "train": [
+        ("--cities", "0"), ("--steps", "0"), ("--pairs", "1"), ("--rate", "0"), ("--seed", "-1"), ("--workers", "0"),
+    ],
+    "demo": [("--queries", "0"), ("--seed", "-1"), ("--port", "70000")],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value"),
+    [(command, *given) for command, options in OUT_OF_BOUNDS.items() for given in options],
+)
+def test_a_number_out_of_bounds_is_refused_by_its_option(
+    command: str, option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if command == "train":
+        pytest.importorskip("torch", reason="needs the extra `training`")
+    wanted = {
+        "simulate": ("--out", tmp_path / "out"), "build-map": (tmp_path / "in", "--out", tmp_path / "out"),
+        "evaluate": (tmp_path / "map", tmp_path / "in"), "train": ("--run", tmp_path / "out"),
+        "demo": ("--out", tmp_path / "out"),
+    }[command]  # fmt: skip
+    assert run(command, *wanted, option, value) == 2
+    assert f"Invalid value for '{option}'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("--max-depth", "inf"), "max_depth_m: "),
+        (("--camera", "640.5x480"), "width: "),
+        (("--camera", "50x480"), "width: "),
+    ],
+)
+def test_what_is_no_number_to_simulate_with_is_one_line(
+    given: tuple[str, ...], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("simulate", "--out", tmp_path / "no", *given) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"streetfix: {message}")
+    assert err.count("\n") == 1
     assert not (tmp_path / "no").exists()
 
 

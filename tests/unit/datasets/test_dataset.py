@@ -117,7 +117,14 @@ def test_sets_without_truth_have_frames_without_pose(folder):
     (folder / "queries" / "drive" / "poses.txt").unlink()
     dataset = Dataset(folder)
     assert dataset.query_sets(with_truth=True) == []
-    assert [frame.T_map_camera for frame in dataset.queries("drive")] == [None, None]
+    assert [(frame.T_map_camera, frame.stamp_s) for frame in dataset.queries("drive")] == [(None, None)] * 2
+
+
+def test_frames_carry_the_timestamps_of_their_poses(folder):
+    path = folder / "queries" / "drive" / "poses.txt"
+    poses = read_tum(path)[1]
+    write_tum(path, np.array([1403636579.763555, 1403636580.25]), poses)
+    assert [frame.stamp_s for frame in Dataset(folder).queries("drive")] == [1403636579.763555, 1403636580.25]
 
 
 def test_poses_survive_a_file(tmp_path):

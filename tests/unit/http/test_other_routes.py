@@ -1,3 +1,4 @@
+import re
 from collections.abc import Callable
 
 import httpx
@@ -44,6 +45,19 @@ def test_a_service_without_a_map_lives_and_is_not_ready(client_of: Callable[[Eng
     response = client.get("/readyz")
     assert (response.status_code, response.json()["code"]) == (503, "bundle")
     engine.close()
+
+
+def test_the_contract_is_served(client: httpx.Client) -> None:
+    contract = client.get("/openapi.json")
+    assert (contract.headers["content-type"], contract.json()["info"]["title"]) == ("application/json", "Streetfix")
+
+
+def test_no_page_mentions_another_host(client: httpx.Client) -> None:
+    known = [path.replace("{name}", "tiny") for path in client.get("/openapi.json").json()["paths"]]
+    usual = ["/", "/docs", "/docs/oauth2-redirect", "/redoc", "/console", "/index.html", "/nowhere"]
+    pages = {path: client.get(path) for path in [*known, *usual]}
+    html = {path: page.text for path, page in pages.items() if "html" in page.headers.get("content-type", "")}
+    assert {path: hosts for path, text in html.items() if (hosts := re.findall(r"//[\w.-]+", text))} == {}
 
 
 @pytest.mark.parametrize(

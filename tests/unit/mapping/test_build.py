@@ -13,6 +13,17 @@ from service.maps.reader import MapBundle
 SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "least"),
+    [("spacing_m", -1.0, "0"), ("headings", 0, "1"), ("voxel_m", 0.0, "0.01"), ("voxel_m", np.nan, "0.01"),
+     ("expected_lidar_height_m", np.inf, "0.1")],
+)  # fmt: skip
+def test_settings_that_make_no_map_are_refused_by_name(field, value, least):
+    with pytest.raises(DatasetError, match=f"{field}: {value:g} is not {least} or more") as refused:
+        BuildSettings(name="none", **{field: value})
+    assert refused.value.field == field
+
+
 def track(steps_m):
     poses = np.tile(np.eye(4), (len(steps_m) + 1, 1, 1))
     poses[1:, 0, 3] = np.cumsum(steps_m)

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from model_training.simulation.drives import driven, query_candidates, survey_of
 from model_training.simulation.plan import QueryPlan
-from model_training.simulation.traversal import stations, survey_error
+from model_training.simulation.traversal import stations, stations_along, survey_error
 from service.errors import DatasetError
 from service.geometry.rigid import heading_of_body, heading_of_camera, inverse
 
@@ -76,6 +77,25 @@ def test_queries_on_the_track_stand_below_the_surveys_lidar(city, plan):
         np.testing.assert_allclose(in_lidar[:3, 2], [1, 0, 0], atol=1e-9)
 
 
+def test_a_camera_on_the_track_is_mounted_as_the_plan_says(city, plan):
+    survey = survey_of(city, plan)
+    on_track = QueryPlan(name="a", traversal=0, count=9, on_track=True)
+    mounted = on_track.model_copy(update={"turn_deg": 30.0, "pitch_deg": 10.0})
+    straight, turned = (query_candidates(city, plan, query, survey) for query in (on_track, mounted))
+    np.testing.assert_array_equal(straight[:, :3, 3], turned[:, :3, 3])
+    axes = straight[:, :3, :3].transpose(0, 2, 1) @ turned[:, :3, 2:3]  # of the mounted camera, in the straight one
+    left, down, ahead = np.sin(np.deg2rad(30)), np.sin(np.deg2rad(10)), np.cos(np.deg2rad(30))
+    shrunk = np.cos(np.deg2rad(10))
+    np.testing.assert_allclose(axes[..., 0], np.tile([-left * shrunk, down, ahead * shrunk], (len(axes), 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("field", ["spacing_m", "lidar_height_m", "camera_height_m"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_lengths_that_are_none_are_refused(plan_of, field, value):
+    with pytest.raises(ValidationError, match=field):
+        plan_of(**{field: value})
+
+
 def test_stations_stand_a_step_apart_in_each_street(city):
     track = stations(city, 2.0)
     steps = np.diff([s.travelled for s in track])
@@ -89,6 +109,20 @@ def test_only_the_wanted_streets_are_driven(city, plan):
     distances = [np.linalg.norm(line - [s.x, s.y], axis=1).min() for s in part]
     assert max(distances) < 2.5
     assert len(part) < len(driven(city, plan, 1.0))
+
+
+def test_stations_of_some_streets_are_those_of_the_whole_drive_counted_anew(city, plan):
+    part = driven(city, plan.model_copy(update={"streets": ("3", "2")}), 1.0)
+    whole = stations(city, 1.0)
+    expected, travelled = [], 0.0
+    for street in city.streets:
+        own = stations_along([street], 1.0)
+        if street.street in ("2", "3"):
+            first = next(k for k, s in enumerate(whole) if (s.x, s.y) == (own[0].x, own[0].y))
+            expected += [(s.x, s.y, s.heading, travelled + o.travelled)
+                         for s, o in zip(whole[first : first + len(own)], own, strict=True)]  # fmt: skip
+            travelled += sum(float(np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()[-1]) for line in street.lines)
+    assert [(s.x, s.y, s.heading, s.travelled) for s in part] == expected
 
 
 def test_the_lidar_stands_upright_on_the_slope_but_for_its_sway(city, plan):

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from model_training.datasets.dataset import Dataset
 from model_training.simulation import simulate as module
-from model_training.simulation.plan import QueryPlan
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
 from model_training.simulation.simulate import simulate
 from model_training.simulation.streets import TABLE_I, class_name, paper_streets, streets_geojson
 from service.errors import DatasetError
@@ -161,6 +162,46 @@ def test_depth_is_cut_where_the_plan_says(plan_of, tmp_path, max_depth_m):
     assert 4.0 < max(float(depth.max()) for depth in depths) <= max_depth_m
 
 
+def test_sensors_have_the_numbers_that_the_plan_puts_in_place_of_their_presets(plan_of, tmp_path):
+    query = QueryPlan(
+        name="a", traversal=1, count=2, depths=("ideal",), depth_parameters=DepthParameters(max_range_m=7)
+    )
+    plan = plan_of(spacing_m=30.0, queries=(query,), lidar_parameters=LidarParameters(channels=16, max_range_m=20))
+    simulate(plan, tmp_path / "set", workers=1)
+    dataset = Dataset(tmp_path / "set")
+    lidar = dataset.description.sensors.lidars[0]
+    assert (lidar.channels, lidar.top_deg, lidar.max_range_m) == (16, 15.0, 20.0)
+    points = np.concatenate([dataset.scan(k)[:, :3] for k in range(len(dataset.survey_poses()))])
+    ranges = np.linalg.norm(points, axis=1)
+    elevations = np.rad2deg(np.arcsin(points[:, 2] / ranges))
+    assert 15 < ranges.max() <= 20
+    assert set(np.rint((elevations + 15) / 2).tolist()) <= set(range(16))  # beams 2 degrees apart
+    np.testing.assert_allclose(elevations, np.rint((elevations + 15) / 2) * 2 - 15, atol=1e-3)
+    assert 5 < max(float(frame.depth_m().max()) for frame in dataset.queries("a_ideal")) <= 7
+
+
+def test_a_plan_that_sets_no_number_has_the_text_it_always_had():
+    text = (
+        '{"name":"x","city":"city","seed":0,"size_m":[300.0,400.0],"streets":[],"lidar":"paper_32","lidar_height_m":1.8,'
+        '"spacing_m":1.0,"survey_condition":"clear","survey_error":true,'
+        '"camera":{"width":640,"height":480,"horizontal_deg":90.0},"camera_height_m":1.5,'
+        '"queries":[{"name":"a","traversal":1,"count":200,"per_class":false,"on_track":false,"depths":["precise"],'
+        '"condition":"clear","parked_changed":0.5,"aside_m":2.0,"heading_deg":15.0,"turn_deg":0.0,"pitch_deg":0.0,'
+        '"blocked":0.0,"max_depth_m":null}]}'
+    )
+    plan = SimulationPlan(name="x", queries=(QueryPlan(name="a", traversal=1),))
+    assert plan.model_dump_json() == text
+    assert SimulationPlan.model_validate_json(text) == plan
+
+
+def test_a_plan_with_other_numbers_is_another_plan(plan_of, tiny_dataset, tmp_path):
+    folder = shutil.copytree(tiny_dataset, tmp_path / "other")
+    with pytest.raises(DatasetError, match="another plan"):
+        simulate(plan_of(lidar_parameters=LidarParameters(dropout=0.5)), folder)
+    plan = plan_of(lidar_parameters=LidarParameters(dropout=0.5))
+    assert SimulationPlan.model_validate_json(plan.model_dump_json()) == plan
+
+
 def test_more_queries_than_room_are_refused_with_both_counts(plan_of, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_is_free", lambda _: False)
     with pytest.raises(DatasetError, match="only 0 of 6 queries"):
@@ -177,6 +218,9 @@ def test_more_queries_than_room_are_refused_with_both_counts(plan_of, tmp_path, 
         ({"queries": (QueryPlan(name="a", traversal=1, condition="hail"),)}, "condition: 'hail'"),
         ({"queries": (QueryPlan(name="a", traversal=1), QueryPlan(name="a", traversal=2))}, "one name"),
         ({"queries": (QueryPlan(name="a", traversal=1, per_class=True),)}, "--city paper"),
+        ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, aside_m=1.0),)}, "aside_m: 1 would do nothing"),
+        ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, heading_deg=0),)}, "heading_deg: 0 would"),
+        ({"queries": (QueryPlan(name="a", traversal=0, parked_changed=1.0),)}, "parked_changed: 1 would do nothing"),
     ],
 )
 def test_a_plan_that_names_what_is_not_there_is_refused(plan_of, tmp_path, changed, message):
@@ -193,11 +237,25 @@ def test_table_i_is_met_class_by_class(monkeypatch):
     candidates[:, 0, 3], candidates[:, 1, 3] = rng.uniform(-130, 130, 9000), rng.uniform(-180, 180, 9000)
     quota = module.quota_of(city, QueryPlan(name="a", traversal=1, per_class=True), candidates)
     monkeypatch.setattr(module, "_is_free", lambda k: k % 3 > 0)
-    chosen = module._free_candidates(None, quota, workers=1)
+    chosen = module._free_candidates(None, quota)
     counts = np.bincount(quota.class_of[chosen], minlength=16)
     assert counts.tolist() == [count for _, _, count in TABLE_I]
     assert len(set(chosen.tolist())) == 626
     assert (chosen % 3 > 0).all()
+
+
+def test_room_is_looked_for_without_starting_processes(plan_of, tmp_path, monkeypatch):
+    asked = []
+    run = module._run
+
+    def noted(job, work, items, workers):
+        asked.append((work, workers))
+        return run(job, work, items, 1)
+
+    monkeypatch.setattr(module, "_run", noted)
+    simulate(plan_of(spacing_m=30.0), tmp_path / "out", workers=3)
+    assert {workers for work, workers in asked if work is module._is_free} == {1}
+    assert {workers for work, workers in asked if work is not module._is_free} == {3}
 
 
 def test_the_streets_of_the_dataset_are_those_of_its_city(tiny_dataset):

@@ -1,0 +1,40 @@
+"""``--set SENSOR.NUMBER=VALUE``: numbers of sensors that replace those of their presets."""
+
+from pydantic import BaseModel, ValidationError
+
+from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
+from service.errors import DatasetError
+
+_MODELS: dict[str, type[BaseModel]] = {"lidar": LidarParameters, "depth": DepthParameters}
+
+
+def sensor_parameters(settings: list[str]) -> tuple[LidarParameters, DepthParameters]:
+    """What the settings say of the LiDAR and of the depth camera.
+
+    Args:
+        settings: texts such as ``lidar.channels=64``.
+
+    Raises:
+        DatasetError: a text of another form, a name that is unknown or there twice, or a value out of bounds.
+    """
+    given: dict[str, dict[str, str]] = {sensor: {} for sensor in _MODELS}
+    for text in settings:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        sensor, _, field = name.partition(".")
+        if not equals or not field:
+            raise DatasetError(f"set: {text!r} is not SENSOR.NUMBER=VALUE, such as lidar.channels=64", field="set")
+        if sensor not in _MODELS:
+            raise DatasetError(f"{name}: there is no sensor {sensor!r}; there are: {', '.join(_MODELS)}", field=name)
+        known = _MODELS[sensor].model_fields
+        if field not in known:
+            raise DatasetError(f"{name}: {sensor} has no number {field!r}; it has: {', '.join(known)}", field=name)
+        if field in given[sensor]:
+            raise DatasetError(f"{name}: it is set twice; give it once", field=name)
+        given[sensor][field] = value
+    try:
+        return LidarParameters.model_validate(given["lidar"]), DepthParameters.model_validate(given["depth"])
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        sensor = "lidar" if error.title == LidarParameters.__name__ else "depth"
+        name = f"{sensor}.{first['loc'][0]}"
+        raise DatasetError(f"{name}: {first['msg']} (given: {first['input']!r})", field=name) from error

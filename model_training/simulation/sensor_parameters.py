@@ -1,0 +1,75 @@
+"""Numbers of a simulated sensor that replace those of its preset; what is not given stays the preset's."""
+
+from dataclasses import replace
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+
+from model_training.simulation.depth_noise import DEPTHS, DepthModel
+from model_training.simulation.lidar import LIDARS, LidarModel
+from service.errors import DatasetError
+
+
+class _Parameters(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @model_serializer(mode="wrap")
+    def given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Only what replaces a preset's number: a plan that replaces nothing is written as it was before this existed."""
+        return {name: value for name, value in handler(self).items() if value is not None}
+
+
+class LidarParameters(_Parameters):
+    """Of the survey's LiDAR; metres, degrees above the horizon, shares, as in ``LidarModel``."""
+
+    channels: int | None = Field(None, ge=16, le=128)
+    columns: int | None = Field(None, ge=64, le=4096)
+    top_deg: float | None = Field(None, ge=-90, le=90)
+    bottom_deg: float | None = Field(None, ge=-90, le=90)
+    range_noise_m: float | None = Field(None, ge=0, le=1)
+    dropout: float | None = Field(None, ge=0, le=0.99)
+    max_range_m: float | None = Field(None, ge=1, le=500)
+
+    def on(self, preset: str) -> LidarModel:
+        """The preset with these numbers.
+
+        Raises:
+            DatasetError: the vertical field is empty.
+        """
+        model = replace(LIDARS[preset], **self.model_dump())
+        if model.top_deg <= model.bottom_deg:
+            raise DatasetError(
+                f"lidar.top_deg: {model.top_deg:g} is not above lidar.bottom_deg, {model.bottom_deg:g}; change one of them",
+                field="lidar.top_deg",
+            )
+        return model
+
+
+class DepthParameters(_Parameters):
+    """Of the depth camera; metres, pixels of a 640 wide picture, shares, as in ``DepthModel``."""
+
+    focal_baseline_px_m: float | None = Field(None, ge=1, le=10_000)
+    noise_px: float | None = Field(None, ge=0, le=50)
+    correlated: float | None = Field(None, ge=0, le=1)
+    step_px: float | None = Field(None, ge=0, le=10)
+    offset_px: float | None = Field(None, ge=0, le=10)
+    scale_error: float | None = Field(None, ge=0, le=0.5)
+    bleeding: float | None = Field(None, ge=0, le=0.99)
+    hole_level: float | None = Field(None, ge=0, le=99)
+    invented_frames: float | None = Field(None, ge=0, le=1)
+    min_range_m: float | None = Field(None, ge=0.05, le=10)
+    max_range_m: float | None = Field(None, ge=1, le=65)  # 16 bits of millimetres end at 65.535 m
+
+    def on(self, preset: str) -> DepthModel:
+        """The preset with these numbers.
+
+        Raises:
+            DatasetError: no range is left.
+        """
+        model = replace(DEPTHS[preset], **self.model_dump())
+        if model.max_range_m <= model.min_range_m:
+            raise DatasetError(
+                f"depth.max_range_m: {model.max_range_m:g} is not beyond depth.min_range_m, {model.min_range_m:g}; "
+                "change one of them", field="depth.max_range_m",
+            )  # fmt: skip
+        return model

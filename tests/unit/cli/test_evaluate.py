@@ -1,0 +1,64 @@
+"""``streetfix evaluate`` as a person calls it."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from model_training.cli import evaluate as module
+from model_training.datasets.dataset import Dataset
+from service.cli.main import main
+from service.maps.reader import MapBundle
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    return int(end.value.code or 0)
+
+
+@pytest.fixture
+def two_sets(small_dataset: Dataset, tmp_path: Path) -> Path:
+    """The small dataset with its five queries twice, as ``drive1_precise`` and ``drive2_precise``."""
+    folder = shutil.copytree(small_dataset.folder, tmp_path / "two")
+    shutil.copytree(folder / "queries" / "drive1_precise", folder / "queries" / "drive2_precise")
+    return folder
+
+
+@pytest.fixture
+def raw_is(monkeypatch: pytest.MonkeyPatch, small_map: Path, two_sets: Path) -> Callable[..., None]:
+    """Let the raw range image be right for those queries of both sets that are marked with a 1, by setting."""
+
+    def put(**right: str) -> None:
+        xy = MapBundle.open(small_map).T_map_place[:, :2, 3]
+        truth = [f.T_map_camera[:2, 3] for name in ("drive1_precise", "drive2_precise")
+                 for f in Dataset(two_sets).queries(name) if f.T_map_camera is not None]  # fmt: skip
+        distance = np.linalg.norm(xy[None] - np.array(truth)[:, None], axis=2)
+        assert distance.min(axis=1).max() < 5.0 < distance.max(axis=1).min()
+        places = {
+            setting: np.where([mark == "1" for mark in marks], distance.argmin(axis=1), distance.argmax(axis=1))
+            for setting, marks in right.items()
+        }
+        monkeypatch.setattr(module, "raw_best_views", lambda *_, **__: places)
+
+    return put
+
+
+def test_the_raw_range_image_has_its_recall_over_all_and_in_each_set(
+    raw_is: Callable[..., None], two_sets: Path, small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setenv("COLUMNS", "120")
+    raw_is(cosine="1110010000", masked_l2="1000011100")
+    assert run("evaluate", small_map, two_sets, "--raw-baseline", "--json", tmp_path / "found.json") == 0
+    figures: dict[str, Any] = json.loads((tmp_path / "found.json").read_text())
+    found = [figures, figures["sets"]["drive1_precise"], figures["sets"]["drive2_precise"]]
+    assert [each["raw_recall_at_1_5m"] for each in found] == [0.4, 0.6, 0.6]
+    assert [each["raw"]["best_setting"] for each in found][1:] == ["cosine", "masked_l2"]
+    assert figures["sets"]["drive2_precise"]["raw"]["recall_at_1_5m"] == {"cosine": 0.2, "masked_l2": 0.6}
+    row = next(line for line in capsys.readouterr().out.splitlines() if "raw range image R@1" in line)
+    assert [cell.strip() for cell in row.strip("│").split("│")] == ["raw range image R@1", "40.00%", "60.00%", "60.00%"]
