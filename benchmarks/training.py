@@ -57,7 +57,7 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
     """The same network and loss at the paper's 224 x 224: views are enlarged after augmentation."""
     shape = EncoderShape(rows=224, columns=224)
     net, grid, device = EncoderNet(shape).to(memory_format=torch.channels_last), ViewGrid(), torch.device("cpu")
-    rng, city = np.random.default_rng(0), City(Pack.open(packs[0]), grid)
+    rng, city = np.random.default_rng(0), City(Pack.open(packs[0]), grid, turn_deg=TrainingConfig().turn_deg)
     augment = Augmenter(TrainingConfig().augmentation, grid, torch.Generator().manual_seed(0), device)
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3)
     images, began = 0, 0.0

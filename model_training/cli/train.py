@@ -23,6 +23,9 @@ def command(
     pairs: Annotated[int, typer.Option(help="pairs of views a step", min=2, max=2048)] = 128,
     optimiser: Annotated[str, typer.Option(help="adamw, or sgdm (the paper's)")] = "adamw",
     rate: Annotated[float, typer.Option(help="highest learning rate", min=1e-8, max=1)] = 2e-3,
+    turn: Annotated[
+        float, typer.Option(min=0, max=180, help="largest turn between a query and its map view, degrees")
+    ] = 9.0,
     seed: Annotated[int, typer.Option(help="of everything that is drawn", min=0)] = 0,
     start_from: Annotated[Path | None, typer.Option(help="run whose weights to start from")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
@@ -37,7 +40,8 @@ def command(
     if recipe not in ("stock", "paper"):
         raise DatasetError(f"recipe: {recipe!r} is neither 'stock' nor 'paper'", field="recipe")
     config = TrainingConfig.model_validate(
-        {"steps": steps, "pairs": pairs, "optimiser": optimiser, "learning_rate": rate, "seed": seed}
+        {"steps": steps, "pairs": pairs, "optimiser": optimiser, "learning_rate": rate, "seed": seed, "turn_deg": turn}
+        | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network no longer drift fast
     )
     plans = paper_plans() if recipe == "paper" else stock_plans(cities)
     grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)

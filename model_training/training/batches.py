@@ -12,7 +12,6 @@ from model_training.training.packs import Pack
 from service.imaging.view_grid import ViewGrid
 
 PAIR_REACH_M = 2.5
-TURN_DEG = 4.5  # a fan of 24 headings asked at three turns 5 degrees apart is off by at most 2.5
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,10 @@ class Batch:
 
 
 class City:
-    """One pack with what sampling needs: which places lie near each query, and which queries near each other."""
+    """One pack with what sampling needs: which places lie near each query; views are turned by up to ``turn_deg``."""
 
-    def __init__(self, pack: Pack, grid: ViewGrid) -> None:
-        self.pack, self._grid = pack, grid
+    def __init__(self, pack: Pack, grid: ViewGrid, *, turn_deg: float) -> None:
+        self.pack, self._grid, self._turn_rad = pack, grid, np.deg2rad(turn_deg)
         places = cKDTree(pack.places[:, :2])
         self._places_near = places.query_ball_point(pack.queries[:, :2], PAIR_REACH_M)
         self.usable = np.array([k for k, near in enumerate(self._places_near) if near])
@@ -52,7 +51,7 @@ class City:
         chosen = np.unique(np.concatenate([first, others])).astype(np.int64)
         place = np.array([rng.choice(self._places_near[k]) for k in chosen])
         queries, places = pack.queries[chosen], pack.places[place]
-        turn = np.deg2rad(rng.uniform(-TURN_DEG, TURN_DEG, len(chosen)))
+        turn = rng.uniform(-self._turn_rad, self._turn_rad, len(chosen))
         heading = queries[:, 2] + turn - places[:, 2]
         columns = (
             np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int)

@@ -39,6 +39,7 @@ class TrainingConfig(BaseModel):
     gradient_norm: float = 2.0
     largest_scale: float = 60.0
     seed: int = 0
+    turn_deg: float = 9.0  # between a query and its map view, at most: a fan of 24 headings is off by up to 7.5
     memory_after: int = 300  # steps before descriptors of earlier batches are used: at first they drift too fast
     memory_steps: int = 400  # a descriptor older than this is no longer a negative
     alike_seeds: int = 8  # pairs of a batch whose look-alikes are drawn with them
@@ -91,7 +92,7 @@ def train(
     optimiser = _optimiser([*net.parameters(), log_scale], config)
     checkpoint = run / "checkpoint.pt"
     first = 0
-    cities = [City(Pack.open(folder), grid) for folder in packs]
+    cities = [City(Pack.open(folder), grid, turn_deg=config.turn_deg) for folder in packs]
     memories = [DescriptorMemory(len(city.pack.queries), config.encoder.descriptor, place) for city in cities]
     if start_from is not None:
         before = torch.load(start_from / "checkpoint.pt", map_location=place, weights_only=True)
