@@ -133,6 +133,7 @@ def main() -> None:
         help="one trained on the paper's city",
     )
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="real recordings")
+    parser.add_argument("--note", help="what a reader of the report must know about this run")
     arguments = parser.parse_args()
     report, runs = Report("accuracy", "make evaluate"), Runs(arguments.work, arguments.encoder)
     kitti_rows(report, runs, arguments.data)
@@ -156,6 +157,8 @@ def main() -> None:
             "share",
             why="no encoder at --paper-encoder: make paper-encoder",
         )
+    if arguments.note:
+        report.notes["run"] = arguments.note
     print(f"written: {report.write()}")
 
 
