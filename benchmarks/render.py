@@ -27,6 +27,7 @@ def main() -> None:
             f"## {path.stem}", "",
             f"`{made['command']}` on {made['date'][:10]} at commit `{made['commit'][:10]}`,",
             f"{made['minutes']:g} minutes, {made['machine']}.", "",
+            *(f"{text}\n" for text in report.get("notes", {}).values()),
             "| row | value | 95 % interval | n | bar | |", "|---|---|---|---|---|---|",
         ]  # fmt: skip
         lines += [_line(row) for row in report["rows"]]
