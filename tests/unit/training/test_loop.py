@@ -36,8 +36,8 @@ def assert_same_weights(one, other):
 def test_the_loss_falls(pack_folder, tmp_path, config, optimiser, rate):
     losses = []
     changed = TrainingConfig.model_validate(
-        config.model_dump() | {"optimiser": optimiser, "learning_rate": rate, "memory_after": 100}
-    )  # more negatives would raise the loss
+        config.model_dump() | {"optimiser": optimiser, "learning_rate": rate, "memory_after": 100, "turn_deg": 2.0}
+    )  # more negatives would raise the loss, and so few steps learn no turns
     run_of(pack_folder, tmp_path / "run", changed, report=lambda progress: losses.append(progress.loss))
     assert len(losses) == 15
     assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])
