@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from model_training.datasets.dataset import (
     CameraSensor,
@@ -117,12 +118,14 @@ def _run(job: _Job, work: Callable[[int], Any], items: Iterable[int], workers: i
     global _job
     _job = job
     cv2.setNumThreads(1)
-    if workers == 1:
-        yield from map(work, items)
-        return
     pool: Pool
-    with multiprocessing.get_context("fork").Pool(workers) as pool:
-        yield from pool.imap(work, items, chunksize=4)
+    # A worker a core: BLAS's own threads would only spin and take the core from the other workers.
+    with threadpool_limits(1, user_api="blas"):
+        if workers == 1:
+            yield from map(work, items)
+            return
+        with multiprocessing.get_context("fork").Pool(workers) as pool:
+            yield from pool.imap(work, items, chunksize=4)
 
 
 def _survey(city: City, plan: SimulationPlan, survey: Survey, out: Path, workers: int, report: Report) -> None:
