@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from model_training.simulation.conditions import Condition
 from model_training.simulation.meshes import Material
+from model_training.simulation.reflectance import reflectance_of
 from model_training.simulation.scene import Scene
+from model_training.simulation.terrain import GroundPicture
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,25 +46,29 @@ LIDARS = {
     )
 }
 
-#: Reflectance that the LiDAR sees is near the albedo's mean; glass mostly lets the beam through or mirrors it away.
+INTENSITY_NOISE = np.float32(0.08)  # of the logarithm: speckle and the pulse's own scatter
+#: Glass mostly lets the beam through or mirrors it away.
 _RETURNS = np.ones(len(Material), np.float32)
 _RETURNS[Material.GLASS] = 0.75
 
 
 def scan(
-    scene: Scene, model: LidarModel, rays: NDArray[np.float32], T_map_lidar: NDArray[np.float64], condition: Condition,
-    rng: np.random.Generator,
+    scene: Scene, ground: GroundPicture, model: LidarModel, rays: NDArray[np.float32], T_map_lidar: NDArray[np.float64],
+    condition: Condition, rng: np.random.Generator,
 ) -> NDArray[np.float32]:  # fmt: skip
     """One revolution from a standing sensor.
 
     Returns:
-        Points (n, 4): x, y, z in the LiDAR frame (m) and intensity (0..1), as KITTI lays them out.
+        Points (n, 4): x, y, z in the LiDAR frame (m) and intensity (0..1), as KITTI lays them out. The intensity is made up
+        for the distance, as sensors report it, but not for the angle of incidence, which a sensor cannot know.
     """
     R = T_map_lidar[:3, :3].astype(np.float32)
-    hits = scene.hits(T_map_lidar[:3, 3], rays @ R.T)
+    rays_map = rays @ R.T
+    hits = scene.hits(T_map_lidar[:3, 3], rays_map)
     met = hits.primitive >= 0
     primitive = np.maximum(hits.primitive, 0)
-    reflectance = scene.mesh.albedo[primitive].mean(axis=1) * (1.0 - 0.5 * condition.wet)
+    reflectance = np.zeros(len(rays), np.float32)
+    reflectance[met] = reflectance_of(scene, ground, T_map_lidar[:3, 3], rays_map[met], hits.of(met), condition)
     distance = hits.distance.copy()
     count = len(distance)
     chance = rng.random(count, dtype=np.float32)
@@ -79,6 +85,8 @@ def scan(
         distance = np.where(false, reach, distance)
         reflectance = np.where(false, np.float32(0.05), reflectance)
         met |= false
+    reflectance *= np.exp(INTENSITY_NOISE * rng.standard_normal(count, dtype=np.float32))
+    np.minimum(reflectance, np.float32(1), out=reflectance)
     points = np.concatenate([rays * distance[:, None], reflectance[:, None]], axis=1, dtype=np.float32)
     result: NDArray[np.float32] = points[met]
     return result

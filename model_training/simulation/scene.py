@@ -20,6 +20,10 @@ class Hits:
     primitive: NDArray[np.int32]
     normal: NDArray[np.float32]
 
+    def of(self, rays: NDArray[np.bool_] | NDArray[np.int64]) -> "Hits":
+        """Hits of some of the rays."""
+        return Hits(self.distance[rays], self.primitive[rays], self.normal[rays])
+
 
 class Scene:
     """A mesh ready for rays."""

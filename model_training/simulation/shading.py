@@ -55,7 +55,7 @@ class Light:
         )  # fmt: skip
 
 
-def _noise(cells: NDArray[np.int32]) -> NDArray[np.float32]:
+def hashed(cells: NDArray[np.int32]) -> NDArray[np.float32]:
     """A number in -1..1 for each whole-numbered cell (n, 3): an integer hash."""
     h = cells[:, 0].astype(np.uint32) * np.uint32(73856093)
     h ^= cells[:, 1].astype(np.uint32) * np.uint32(19349663)
@@ -91,8 +91,8 @@ def albedo_of(
     albedo = scene.mesh.albedo[primitive]
     on_ground = material == Material.GROUND
     albedo[on_ground] = _COVER_ALBEDO[ground.at(points[on_ground, :2])]
-    fine = _noise(np.floor(points * np.array([9, 9, 14], np.float32)).astype(np.int32))
-    coarse = _noise(np.floor(points * np.float32(1.1)).astype(np.int32))
+    fine = hashed(np.floor(points * np.array([9, 9, 14], np.float32)).astype(np.int32))
+    coarse = hashed(np.floor(points * np.float32(1.1)).astype(np.int32))
     albedo = albedo * (1 + _ROUGHNESS[material] * (0.65 * fine + 0.5 * coarse))[:, None]
     brick = material == Material.BRICK
     course = np.modf(np.abs(points[brick, 2]) * np.float32(1 / 0.24))[0] < 0.18

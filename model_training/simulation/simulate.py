@@ -147,6 +147,7 @@ def _one_scan(number: int) -> int:
     rng = np.random.default_rng([job.plan.seed, 31, number])
     points = scan(
         job.scene,
+        job.city.ground,
         job.plan.lidar_parameters.on(job.plan.lidar),
         job.rays,
         job.survey.T_map_lidar[number],

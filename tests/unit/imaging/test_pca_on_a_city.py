@@ -41,7 +41,9 @@ def crossings(city):
 
 def measured_at(city, scene, station, rng):
     T_map_lidar = lidar_pose(city, station, rng)
-    points = scan(scene, LIDARS["paper_32"], LIDARS["paper_32"].rays(), T_map_lidar, CONDITIONS["clear"], rng)[:, :3]
+    points = scan(
+        scene, city.ground, LIDARS["paper_32"], LIDARS["paper_32"].rays(), T_map_lidar, CONDITIONS["clear"], rng
+    )[:, :3]
     level = level_scan(points)
     normal = city.terrain.normal(np.array([station.x, station.y]))
     up = level.R_level_sensor @ T_map_lidar[:3, :3].T @ normal

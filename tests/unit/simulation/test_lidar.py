@@ -14,7 +14,7 @@ EXACT = replace(MODEL, range_noise_m=0.0, dropout=0.0)
 def scan_of(wall, model=MODEL, condition=CLEAR, *, seed=0, at_x_m=0.0):
     T_map_lidar = np.eye(4)
     T_map_lidar[0, 3] = at_x_m
-    return scan(wall.scene, model, model.rays(), T_map_lidar, condition, np.random.default_rng(seed))
+    return scan(wall.scene, wall.ground, model, model.rays(), T_map_lidar, condition, np.random.default_rng(seed))
 
 
 def along(points, wall, at_x_m=0.0):

@@ -1,0 +1,42 @@
+"""What a LiDAR's infrared sees of a surface: related to its colour, and far from the same.
+
+Paints of one colour differ in the near infrared, leaves and grass are dark to the eye and bright at 905 nm, glass answers
+hardly at all, lane markings hold retroreflective beads (reflectances by kind: ECOSTRESS spectral library, Meerdink et al.,
+Remote Sensing of Environment 230, 2019). A surface is Lambert's, so its return falls with the cosine of the angle of incidence.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.simulation.conditions import Condition
+from model_training.simulation.meshes import Material
+from model_training.simulation.scene import Hits, Scene
+from model_training.simulation.shading import albedo_of, hashed
+from model_training.simulation.terrain import Cover, GroundPicture
+
+PIGMENTS = np.float32(0.5)  # half the range of the logarithm by which paints of one brightness differ
+LEAVES, LEAVES_OF_GREY = np.float32(0.5), np.float32(0.14)  # reflectance at 905 nm of leaves as dark as this to the eye
+BEADS = np.float32(1.6)
+PANE = np.float32(0.05)
+
+
+def reflectance_of(
+    scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, condition: Condition
+) -> NDArray[np.float32]:  # fmt: skip
+    """Share of the pulse (n) that comes back from what rays (n, 3, unit, map frame) met; every ray has met something."""
+    points = origin.astype(np.float32) + rays * hits.distance[:, None]
+    grey = albedo_of(scene, ground, points, hits, condition).mean(axis=1)
+    material = scene.mesh.material[hits.primitive]
+    base = np.floor(scene.mesh.albedo[hits.primitive] * np.float32(1000)).astype(np.int32)
+    infrared = grey * np.exp(PIGMENTS * hashed(base))
+    on_ground = np.flatnonzero(material == Material.GROUND)
+    cover = ground.at(points[on_ground, :2])
+    infrared[on_ground] = grey[on_ground] * np.where(cover == Cover.MARKING, BEADS, np.float32(1))
+    green = material == Material.FOLIAGE
+    green[on_ground] = cover == Cover.GRASS
+    infrared[green] = LEAVES * np.sqrt(grey[green] / LEAVES_OF_GREY)
+    infrared[material == Material.GLASS] = PANE
+    length = np.sqrt(np.einsum("ij,ij->i", hits.normal, hits.normal))
+    cosine = np.abs(np.einsum("ij,ij->i", hits.normal, rays)) / np.maximum(length, 1e-12)
+    clipped: NDArray[np.float32] = np.clip(infrared * cosine, 0.0, 1.0)
+    return clipped
