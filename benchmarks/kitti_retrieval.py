@@ -17,7 +17,7 @@ from model_training.datasets.kitti_object import import_kitti_object
 from model_training.mapping.build import BuildSettings, fan, levelled_scans
 from service.geometry.camera import PinholeCamera
 from service.imaging.query_view import query_view
-from service.imaging.view_grid import Planes, ViewGrid, panorama_from_points, ranges_from_panorama, survey_planes
+from service.imaging.view_grid import Planes, ViewGrid, panorama_from_points, survey_planes, view_from_panorama
 from service.localization.encoder import Encoder
 
 HIGHEST_DEG = 2.5
@@ -76,7 +76,7 @@ def _gallery(dataset: Dataset, drive: Path, grid: ViewGrid, rows: NDArray[np.boo
         panorama = panorama_from_points(scan.points, grid)
         for turn in fan(HEADINGS):
             view = survey_planes(
-                ranges_from_panorama(panorama, scan.start_rad + float(turn), grid), sensor_height_m=scan.level.height_m,
+                view_from_panorama(panorama, scan.start_rad + float(turn), grid), sensor_height_m=scan.level.height_m,
                 rows_seen=rows, grid=grid,
             )  # fmt: skip
             if view[0].any():

@@ -68,7 +68,7 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
         count = len(batch.query_xy)
         rows = augment.cut_rows(batch.rows_seen, count)
         planes = torch.cat([augment.query(batch.query_ranges, batch.query_rgb, batch.query_height_m, rows),
-                            augment.survey(batch.survey_ranges, batch.survey_height_m, rows)])  # fmt: skip
+                            augment.survey(batch.survey_ranges, batch.survey_intensity, batch.survey_height_m, rows)])  # fmt: skip
         large = functional.interpolate(planes, size=(224, 224), mode="nearest").contiguous(
             memory_format=torch.channels_last
         )

@@ -19,10 +19,11 @@ from service.errors import BundleError, DatasetError
 from service.geometry.rigid import heading_of_body, transform_from, transform_points
 from service.imaging.pca import Level, level_scan, principal_heading
 from service.imaging.view_grid import (
+    LidarView,
     ViewGrid,
     panorama_from_points,
-    ranges_from_panorama,
     survey_planes,
+    view_from_panorama,
 )
 from service.imaging.weather import remove_weather_noise
 from service.localization.encoder import Encoder
@@ -64,7 +65,7 @@ class BuildSettings:
 
 @dataclass(frozen=True, slots=True)
 class LevelledScan:
-    """One kept scan: its number, level points (n, 3), level, and the principal heading that its fan starts at (rad)."""
+    """One kept scan: its number, level points with intensity (n, 4), level, and the principal heading that its fan starts at (rad)."""
 
     number: int
     points: NDArray[np.float32]
@@ -116,12 +117,13 @@ def build_map(
     for k, scan in enumerate(levelled_scans(dataset, kept, settings)):
         T = poses[scan.number] @ transform_from(scan.level.R_level_sensor.T, np.zeros(3))
         planes = np.stack([
-            survey_planes(ranges, sensor_height_m=scan.level.height_m, rows_seen=rows_seen, grid=grid)
-            for ranges in _fan_ranges(scan, turns, grid)
+            survey_planes(view, sensor_height_m=scan.level.height_m, rows_seen=rows_seen, grid=grid)
+            for view in _fan_views(scan, turns, grid)
         ])  # fmt: skip
         descriptors.append(encoder.encode(planes, "survey"))
         headings.append((heading_of_body(T) + scan.start_rad + turns + np.pi) % (2 * np.pi) - np.pi)
-        near = scan.points[np.linalg.norm(scan.points, axis=1) < CLOUD_REACH_M].astype(np.float64)
+        points = scan.points[:, :3]
+        near = points[np.linalg.norm(points, axis=1) < CLOUD_REACH_M].astype(np.float64)
         cloud.add(transform_points(T, near))
         T_map_level[k], heights[k] = T, scan.level.height_m
         report("places", k + 1, len(kept))
@@ -167,13 +169,13 @@ def view_ranges(
     kept = thinned(dataset.survey_poses(), settings.spacing_m)
     turns = fan(settings.headings)
     for scan in levelled_scans(dataset, kept, settings):
-        yield np.stack(list(_fan_ranges(scan, turns, grid))) * rows_seen[:, None]
+        yield np.stack([view[0] for view in _fan_views(scan, turns, grid)]) * rows_seen[:, None]
 
 
-def _fan_ranges(scan: LevelledScan, turns: NDArray[np.float64], grid: ViewGrid) -> Iterator[NDArray[np.float32]]:
+def _fan_views(scan: LevelledScan, turns: NDArray[np.float64], grid: ViewGrid) -> Iterator[LidarView]:
     panorama = panorama_from_points(scan.points, grid)
     for turn in turns:
-        yield ranges_from_panorama(panorama, scan.start_rad + float(turn), grid)
+        yield view_from_panorama(panorama, scan.start_rad + float(turn), grid)
 
 
 def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:
@@ -190,12 +192,12 @@ def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:
 def levelled_scans(dataset: Dataset, numbers: NDArray[np.int64], settings: BuildSettings) -> Iterator[LevelledScan]:
     """Scans one at a time, levelled by PCA, each with its principal heading."""
     for number in numbers:
-        points = dataset.scan(int(number))[:, :3]
+        points = dataset.scan(int(number))
         if settings.remove_weather:
-            points = points[remove_weather_noise(points)]
-        level = level_scan(points, expected_height_m=settings.expected_lidar_height_m)
-        levelled = points @ level.R_level_sensor.T.astype(np.float32)
-        yield LevelledScan(int(number), levelled, level, principal_heading(levelled, height_m=level.height_m))
+            points = points[remove_weather_noise(points[:, :3])]
+        level = level_scan(points[:, :3], expected_height_m=settings.expected_lidar_height_m)
+        levelled = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
+        yield LevelledScan(int(number), levelled, level, principal_heading(levelled[:, :3], height_m=level.height_m))
 
 
 def _rows_seen(
@@ -205,7 +207,7 @@ def _rows_seen(
     chosen = kept[:: max(1, len(kept) // sample)]
     measured = np.zeros(grid.rows)
     for scan in levelled_scans(dataset, chosen, settings):
-        measured += (panorama_from_points(scan.points, grid) > 0).mean(axis=1)
+        measured += (panorama_from_points(scan.points, grid)[0] > 0).mean(axis=1)
     seen: NDArray[np.bool_] = measured / len(chosen) > SEEN_SHARE
     if not seen.any():
         raise DatasetError(

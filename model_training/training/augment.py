@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 from torch.nn import functional
 
+from service.imaging.brightness import FLOOR, LEAST_SPREAD, LIMIT
 from service.imaging.view_grid import ViewGrid
 
 FOCAL_BASELINE_PX_M = 80.0
@@ -33,6 +34,10 @@ class Augmentation(BaseModel):
     unseen_top_rows: float = 0.15
     survey_noise_m: float = 0.02
     survey_dropout: float = 0.05
+    no_intensity: float = 0.2
+    intensity_gain: float = 0.3
+    no_brightness: float = 0.2
+    shading: float = 0.3
     height_error_m: float = 0.08
 
 
@@ -68,16 +73,20 @@ class Augmenter:
         top = (self._uniform(count, 1, 1) * 9 + 8).floor() * self._chance(count, self.settings.unseen_top_rows)
         return rows_seen.reshape(1, -1, 1) & (row >= top)
 
-    def survey(self, ranges: Tensor, height_m: Tensor, rows_seen: Tensor) -> Tensor:
-        """Planes (B, 5, rows, columns) of LiDAR views (B, rows, columns), metres."""
+    def survey(self, ranges: Tensor, intensity: Tensor, height_m: Tensor, rows_seen: Tensor) -> Tensor:
+        """Planes (B, 6, rows, columns) of LiDAR views (B, rows, columns): metres and 0..1."""
         s, count = self.settings, len(ranges)
         noisy = ranges + self._normal(*ranges.shape) * s.survey_noise_m
         lost = self._uniform(*ranges.shape) < s.survey_dropout * self._uniform(count, 1, 1)
         keep = (ranges > 0) & ~lost & rows_seen & (noisy < self.grid.max_range_m)
-        return self._planes(noisy * keep, height_m, rows_seen.expand_as(ranges), None)
+        # Sensors differ in how they make up for distance and angle, and some give no intensity at all.
+        wrong = torch.exp(s.intensity_gain * (self._field(count, 3, 8) + 0.5 * self._normal(*ranges.shape)))
+        known = ~self._chance(count, s.no_intensity)
+        bright = brightness(intensity * wrong, measured=keep, seen=keep & known)
+        return self._planes(noisy * keep, height_m, rows_seen.expand_as(ranges), None, bright)
 
     def query(self, ranges: Tensor, rgb: Tensor, height_m: Tensor, rows_seen: Tensor) -> Tensor:
-        """Planes (B, 5, rows, columns) of clean query views (B, rows, columns) with colour (B, 3, rows, columns) 0..255."""
+        """Planes (B, 6, rows, columns) of clean query views (B, rows, columns) with colour (B, 3, rows, columns) 0..255."""
         s, count = self.settings, len(ranges)
         blocked = ranges
         blocked = self._block(blocked, height_m, self._chance(count, s.blocked), 0.12, s.widest_block)
@@ -94,7 +103,17 @@ class Augmenter:
             measured & observed & (z < reach) & (distance < self.grid.max_range_m) & (distance > self.grid.min_range_m)
         )
         height = height_m + self._normal(count) * s.height_error_m
-        return self._planes(distance * keep, height, observed, self._colour(rgb))
+        light = torch.exp(s.shading * (self._field(count, 3, 6) + 0.3 * self._normal(*ranges.shape)))
+        grey = (rgb.mean(dim=1) * light).clamp(max=255.0)
+        # A vehicle in the way has a brightness of its own.
+        hidden = blocked != ranges
+        paint = (
+            15.0 * torch.exp(2.6 * self._uniform(count, 1, 1)) * (1 + 0.1 * self._normal(*ranges.shape)).clamp(min=0.1)
+        )
+        grey = torch.where(hidden, paint.clamp(max=255.0), grey)
+        known = ~self._chance(count, s.no_brightness)
+        bright = brightness(grey, measured=keep, seen=observed & known)
+        return self._planes(distance * keep, height, observed, self._colour(rgb), bright)
 
     def _stereo(self, z: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """Disparity noise, partly correlated; bleeding edges; made-up depth where there is none; holes; a wrong scale."""
@@ -162,10 +181,29 @@ class Augmenter:
         )
         return (planes + 3.0 * self._normal(*planes.shape)) * saturation
 
-    def _planes(self, ranges: Tensor, height_m: Tensor, observed: Tensor, colour: Tensor | None) -> Tensor:
+    def _planes(
+        self, ranges: Tensor, height_m: Tensor, observed: Tensor, colour: Tensor | None, bright: Tensor
+    ) -> Tensor:
         heights = (ranges * torch.sin(self.elevation) + height_m.reshape(-1, 1, 1)) * (ranges > 0)
         if colour is None:
             colour = torch.zeros(len(ranges), 2, self.grid.rows, self.grid.columns, device=self._device)
         seen = observed.to(ranges.dtype)
         colour = colour * seen[:, None]
-        return torch.cat([ranges[:, None], colour, heights[:, None], seen[:, None]], dim=1)
+        return torch.cat([ranges[:, None], colour, heights[:, None], seen[:, None], bright[:, None]], dim=1)
+
+
+def brightness(values: Tensor, *, measured: Tensor, seen: Tensor) -> Tensor:
+    """``service.imaging.brightness`` of a batch (B, rows, columns): in spreads about each view's mean."""
+    count = measured.sum(dim=(1, 2), keepdim=True).clamp(min=1)
+
+    def mean(of: Tensor) -> Tensor:
+        return (of * measured).sum(dim=(1, 2), keepdim=True) / count
+
+    level = mean(values)
+    logarithm = torch.log(values / level.clamp(min=1e-9) + FLOOR)
+    middle = mean(logarithm)
+    spread = mean((logarithm - middle) ** 2).sqrt()
+    told = seen & (level > 0) & (spread >= LEAST_SPREAD)
+    return torch.where(
+        told, ((logarithm - middle) / spread.clamp(min=1e-6)).clamp(-LIMIT, LIMIT), torch.zeros_like(values)
+    )

@@ -16,9 +16,13 @@ PAIR_REACH_M = 2.5
 
 @dataclass(frozen=True)
 class Batch:
-    """Clean views of pairs: tensors (B, rows, columns), colour (B, 3, rows, columns), heights and positions (m)."""
+    """Clean views of pairs: tensors (B, rows, columns), colour (B, 3, rows, columns), heights and positions (m).
+
+    ``survey_intensity`` is 0..1.
+    """
 
     survey_ranges: Tensor
+    survey_intensity: Tensor
     survey_height_m: Tensor
     query_ranges: Tensor
     query_rgb: Tensor
@@ -57,15 +61,15 @@ class City:
             np.rint((heading[:, None] + grid.azimuths_rad + np.pi) / (2 * np.pi) * grid.around).astype(int)
             % grid.around
         )
-        views: NDArray[np.float32] = np.stack(
-            [pack.panoramas[p][:, c] for p, c in zip(place, columns, strict=True)]
-        ).astype(np.float32)
+
+        def views(panoramas: NDArray[np.generic]) -> NDArray[np.generic]:
+            return np.stack([panoramas[p][:, c] for p, c in zip(place, columns, strict=True)])
 
         def tensor(array: NDArray[np.generic]) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(array)).float()
 
         return Batch(
-            tensor(views), tensor(places[:, 3]), tensor(pack.ranges[chosen]), tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)),
-            tensor(queries[:, 3]), torch.from_numpy(np.array(pack.rows_seen)), tensor(places[:, :2]), tensor(queries[:, :2]),
-            chosen,
+            tensor(views(pack.panoramas)), (tensor(views(pack.intensities)) / 255) ** 2, tensor(places[:, 3]),
+            tensor(pack.ranges[chosen]), tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)), tensor(queries[:, 3]),
+            torch.from_numpy(np.array(pack.rows_seen)), tensor(places[:, :2]), tensor(queries[:, :2]), chosen,
         )  # fmt: skip

@@ -19,7 +19,7 @@ from torch.nn import functional
 from service.imaging.view_grid import PLANES
 
 LAYERS = 12
-CHANNELS = 6  # log range, measured, height, observed, V1, V2
+CHANNELS = 7  # log range, measured, height, observed, V1, V2, brightness
 
 
 class EncoderShape(BaseModel):
@@ -53,7 +53,7 @@ class EncoderNet(nn.Module):
         self.full12 = nn.Linear(shape.narrow * cells, shape.descriptor)
 
     def forward(self, planes: Tensor, side: Tensor) -> Tensor:
-        """Descriptors (B, D) of planes (B, 5, rows, columns); ``side`` (B) is 0 for survey views, 1 for queries."""
+        """Descriptors (B, D) of planes (B, 6, rows, columns); ``side`` (B) is 0 for survey views, 1 for queries."""
         x = normalised(planes)
         query = side.reshape(-1, 1, 1, 1)
         x = self.conv1(torch.cat([x * (1 - query), x * query], dim=1))
@@ -69,7 +69,7 @@ class EncoderNet(nn.Module):
 
 def normalised(planes: Tensor) -> Tensor:
     """Metres and grey levels into numbers near one, in the graph itself, so that no caller can forget it."""
-    distance, v1, v2, height, observed = (planes[:, k : k + 1] for k in range(len(PLANES)))
+    distance, v1, v2, height, observed, brightness = (planes[:, k : k + 1] for k in range(len(PLANES)))
     measured = (distance > 0).to(planes.dtype)
     return torch.cat(
         [
@@ -79,6 +79,7 @@ def normalised(planes: Tensor) -> Tensor:
             observed,
             (v1 / 40.0).clamp(-2, 2),
             (v2 / 40.0).clamp(-2, 2),
+            brightness,
         ],
         dim=1,
     )

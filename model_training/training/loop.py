@@ -131,7 +131,12 @@ def train(
             batch = cities[number].draw(config.pairs, rng, wanted)
             count = len(batch.query_xy)
             rows_seen = augment.cut_rows(batch.rows_seen.to(place), count)
-            surveys = augment.survey(batch.survey_ranges.to(place), batch.survey_height_m.to(place), rows_seen)
+            surveys = augment.survey(
+                batch.survey_ranges.to(place),
+                batch.survey_intensity.to(place),
+                batch.survey_height_m.to(place),
+                rows_seen,
+            )
             queries = augment.query(
                 batch.query_ranges.to(place), batch.query_rgb.to(place), batch.query_height_m.to(place), rows_seen
             )

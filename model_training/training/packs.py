@@ -25,7 +25,7 @@ from service.geometry.rigid import heading_of_body, rotation_x, rotation_y, rota
 from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
-FORMAT = 1
+FORMAT = 2
 OWN_DRIVES = 1000  # traversals of the training set: no dataset's drive has the same vehicles and people
 
 
@@ -50,12 +50,14 @@ class PackPlan:
 class Pack:
     """One city, memory-mapped.
 
-    ``panoramas`` (P, rows, around) metres; ``places`` (P, 4): x, y, heading of the panorama's x axis, LiDAR height (m, rad);
+    ``panoramas`` (P, rows, around) metres; ``intensities`` of the same shape, 255 times the root of 0..1;
+    ``places`` (P, 4): x, y, heading of the panorama's x axis, LiDAR height (m, rad);
     ``rows_seen`` (rows); ``ranges`` (Q, rows, columns) metres; ``rgb`` (Q, rows, columns, 3); ``queries`` (Q, 4): x, y,
     heading, camera height.
     """
 
     panoramas: NDArray[np.float16]
+    intensities: NDArray[np.uint8]
     places: NDArray[np.float64]
     rows_seen: NDArray[np.bool_]
     ranges: NDArray[np.float16]
@@ -108,21 +110,24 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
     chosen = [along[k] for k in rng.permutation(len(along))[: plan.places]]
     survey = Scene(joined([city.static, city.occupants(0)]))
     panoramas = np.zeros((len(chosen), grid.rows, grid.around), np.float16)
+    intensities = np.zeros(panoramas.shape, np.uint8)
     places = np.zeros((len(chosen), 4))
     for k, station in enumerate(chosen):
         aside = rng.uniform(-2.2, 2.2)
         x, y = station.x + aside * np.sin(station.heading), station.y - aside * np.cos(station.heading)
         moved = type(station)(x, y, station.heading + (np.pi if rng.random() < 0.5 else 0.0), station.travelled)
         T = lidar_pose(city, moved, rng, height_m=1.8 + rng.normal(0, 0.08))
-        points = scan(survey, model, lidar_rays, T, clear, rng)[:, :3]
-        level = level_scan(points)
-        panoramas[k] = panorama_from_points(points @ level.R_level_sensor.T.astype(np.float32), grid)
+        points = scan(survey, city.ground, model, lidar_rays, T, clear, rng)
+        level = level_scan(points[:, :3])
+        levelled = np.c_[points[:, :3] @ level.R_level_sensor.T.astype(np.float32), points[:, 3]]
+        panoramas[k], intensity = panorama_from_points(levelled, grid)
+        intensities[k] = np.rint(255 * np.sqrt(intensity))
         R_map_level = T[:3, :3] @ level.R_level_sensor.T
         places[k] = (x, y, heading_of_body(np.vstack([np.c_[R_map_level, [0, 0, 0]], [0, 0, 0, 1]])), level.height_m)
     del survey
     ranges, rgb, queries = _queries(city, plan, places, grid, rng)
     arrays: dict[str, NDArray[np.generic]] = {
-        "panoramas": panoramas, "places": places, "rows_seen": rows_seen_by(panoramas),
+        "panoramas": panoramas, "intensities": intensities, "places": places, "rows_seen": rows_seen_by(panoramas),
         "ranges": ranges, "rgb": rgb, "queries": queries,
     }  # fmt: skip
     part = folder.with_name(folder.name + ".part")

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, rotation_z
+from service.imaging.brightness import brightness
 from service.imaging.fusion import fuse_planes
+from service.imaging.ihs import ihs_linear
 from service.imaging.level import level_camera
 from service.imaging.view_grid import PLANES, Planes, ViewGrid, heights_of
 
@@ -32,7 +34,7 @@ class QueryView:
 class QueryViews:
     """The same query seen at several turns, counter-clockwise against the optical axis (rad)."""
 
-    planes: Float32[NDArray[np.float32], "T 5 rows columns"]
+    planes: Float32[NDArray[np.float32], "T 6 rows columns"]
     turns_rad: tuple[float, ...]
     R_level_camera: Rotation
     height_m: float
@@ -92,9 +94,11 @@ def query_views(
         ranges, observed = _median_ranges(depth_m, camera, rays_camera, grid)
         seen = observed & rows_seen[:, None]
         ranges = ranges * seen
-        view[:3] = fuse_planes(_mean_colour(rgb, camera, rays_camera, grid) * seen[..., None], ranges)
+        colour = _mean_colour(rgb, camera, rays_camera, grid) * seen[..., None]
+        view[:3] = fuse_planes(colour, ranges)
         view[3] = heights_of(ranges, level.height_m, grid)
         view[4] = seen
+        view[5] = brightness(ihs_linear(colour)[0], measured=ranges > 0, seen=seen)
     if not planes[:, 0].any():
         raise NoDepthError(
             "the depth picture has no measurement inside the view grid "

@@ -11,13 +11,18 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from numpy.typing import NDArray
 
+from service.imaging.brightness import brightness
+
 #: What the encoder is given of a view, in this order: range (m) in the place of intensity, V1 and V2 (grey levels,
-#: eq. 9; 0 where there is no colour), height above the local ground (m), and 1 where the sensor could have measured.
-PLANES = ("range_m", "v1", "v2", "height_m", "observed")
+#: eq. 9; 0 where there is no colour), height above the local ground (m), 1 where the sensor could have measured, and
+#: brightness (``service.imaging.brightness``): of the LiDAR's return on one side, of the picture on the other.
+PLANES = ("range_m", "v1", "v2", "height_m", "observed", "brightness")
 
 Ranges = Float32[NDArray[np.float32], "rows columns"]
-Panorama = Float32[NDArray[np.float32], "rows around"]
-Planes = Float32[NDArray[np.float32], "5 rows columns"]
+#: Range (m) and intensity (as the sensor gives it) of a LiDAR, all round; and of what lies ahead.
+Panorama = Float32[NDArray[np.float32], "2 rows around"]
+LidarView = Float32[NDArray[np.float32], "2 rows columns"]
+Planes = Float32[NDArray[np.float32], "6 rows columns"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,19 +63,19 @@ class ViewGrid:
         return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
-def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 3"], grid: ViewGrid) -> Panorama:
-    """Range image all round of a levelled scan: each cell takes the point whose ray is nearest to the cell's.
+def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 4"], grid: ViewGrid) -> Panorama:
+    """Range and intensity all round of a levelled scan: each cell takes the point whose ray is nearest to the cell's.
 
     Rows that fall between two beams are filled where the cells above and below agree on one surface.
 
     Args:
-        points_level: metres, z up, origin at the sensor; azimuth 0 is x.
+        points_level: x, y, z (metres, z up, origin at the sensor; azimuth 0 is x) and intensity.
         grid: rows and limits; the panorama has ``grid.around`` columns, column 0 at azimuth -pi.
 
     Returns:
-        Range, metres; 0 where nothing was measured within the limits.
+        Range, metres, and intensity; both 0 where nothing was measured within the limits.
     """
-    x, y, z = points_level[:, 0], points_level[:, 1], points_level[:, 2]
+    x, y, z, intensity = points_level.T
     flat = np.hypot(x, y)
     distance = np.hypot(flat, z)
     elevation = np.arctan2(z, flat)
@@ -85,38 +90,40 @@ def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 3"], grid
     # Written far ones first, so that the nearest to the cell's own ray is written last and stays.
     off = np.abs(row_exact - row)[good] + np.abs(column_exact - np.rint(column_exact))[good]
     order = np.argsort(-off, kind="stable")
-    panorama = np.zeros(grid.rows * around, np.float32)
-    panorama[cell[order]] = distance[good][order]
-    return _fill_between_beams(panorama.reshape(grid.rows, around))
+    panorama = np.zeros((2, grid.rows * around), np.float32)
+    panorama[0, cell[order]] = distance[good][order]
+    panorama[1, cell[order]] = intensity[good][order]
+    return _fill_between_beams(panorama.reshape(2, grid.rows, around))
 
 
 def _fill_between_beams(panorama: Panorama) -> Panorama:
     """Fill gaps of one to three rows, and single columns, whose two sides lie on one surface (within 10 % of range)."""
     filled = panorama.copy()
-    rows = panorama.shape[0]
+    rows = panorama.shape[1]
     for gap in (1, 2, 3):
         for offset in range(1, gap + 1):
-            above, below = filled[: rows - gap - 1], filled[gap + 1 :]
-            hole = filled[offset : rows - gap - 1 + offset]
-            agree = (hole == 0) & (above > 0) & (below > 0)
-            agree &= np.abs(above - below) < (0.10 + 0.05 * gap) * np.minimum(above, below)
+            above, below = filled[:, : rows - gap - 1], filled[:, gap + 1 :]
+            hole = filled[:, offset : rows - gap - 1 + offset]
+            agree = (hole[0] == 0) & (above[0] > 0) & (below[0] > 0)
+            agree &= np.abs(above[0] - below[0]) < (0.10 + 0.05 * gap) * np.minimum(above[0], below[0])
             share = np.float32(offset / (gap + 1))
-            hole[agree] = ((1 - share) * above + share * below)[agree]
-    left, right = np.roll(filled, 1, axis=1), np.roll(filled, -1, axis=1)
-    agree = (filled == 0) & (left > 0) & (right > 0) & (np.abs(left - right) < 0.10 * np.minimum(left, right))
-    filled[agree] = 0.5 * (left + right)[agree]
+            hole[:, agree] = (1 - share) * above[:, agree] + share * below[:, agree]
+    left, right = np.roll(filled, 1, axis=2), np.roll(filled, -1, axis=2)
+    agree = (filled[0] == 0) & (left[0] > 0) & (right[0] > 0)
+    agree &= np.abs(left[0] - right[0]) < 0.10 * np.minimum(left[0], right[0])
+    filled[:, agree] = 0.5 * (left[:, agree] + right[:, agree])
     return filled
 
 
-def ranges_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -> Ranges:
+def view_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -> LidarView:
     """Cut the view that looks along a heading (radians, against the panorama's x) out of a panorama."""
     azimuth = heading_rad + grid.azimuths_rad
     column = np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(np.int64) % grid.around
-    return panorama[:, column]
+    return panorama[:, :, column]
 
 
 def survey_planes(
-    ranges: Float32[NDArray[np.float32], "rows columns"],
+    view: LidarView,
     *,
     sensor_height_m: float,
     rows_seen: Bool[NDArray[np.bool_], " rows"],
@@ -125,16 +132,18 @@ def survey_planes(
     """The encoder's planes of a LiDAR view: no colour, and observed wherever the survey's beams reach.
 
     Args:
-        ranges: the view, metres.
+        view: range (metres) and intensity.
         sensor_height_m: of the LiDAR above the local ground.
         rows_seen: rows that the survey's sensor covers; the others are blank on both sides.
         grid: the view grid.
     """
     planes = np.zeros((len(PLANES), grid.rows, grid.columns), np.float32)
+    ranges, intensity = view
     inside = (ranges >= grid.min_range_m) & (ranges <= grid.max_range_m) & rows_seen[:, None]
     planes[0] = ranges * inside
     planes[3] = heights_of(planes[0], sensor_height_m, grid)
     planes[4] = rows_seen[:, None]
+    planes[5] = brightness(intensity, measured=inside, seen=inside)
     return planes
 
 

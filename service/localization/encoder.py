@@ -69,11 +69,11 @@ class Encoder:
             raise EncoderError(f"the encoder is no ONNX model that runs here: {error}", field="encoder") from error
         return Encoder(session, hashlib.sha256(data).hexdigest())
 
-    def encode(self, planes: Float32[NDArray[np.float32], "B 5 rows columns"], side: Side) -> Descriptors:
+    def encode(self, planes: Float32[NDArray[np.float32], "B 6 rows columns"], side: Side) -> Descriptors:
         """Unit descriptors of views of one side.
 
         Args:
-            planes: as ``service.imaging.view_grid.PLANES`` says, metres and grey levels.
+            planes: as ``service.imaging.view_grid.PLANES`` says, metres, grey levels, spreads.
             side: LiDAR views of the survey, or fused RGB-D queries.
         """
         flags = np.full(len(planes), 1.0 if side == "query" else 0.0, np.float32)

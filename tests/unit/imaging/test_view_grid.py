@@ -6,22 +6,27 @@ from service.imaging.view_grid import (
     ViewGrid,
     heights_of,
     panorama_from_points,
-    ranges_from_panorama,
     survey_planes,
+    view_from_panorama,
 )
 
 GRID = ViewGrid(rows=9, columns=16)
 
 
-def points_at(elevation_deg, azimuth_deg, range_m):
+def points_at(elevation_deg, azimuth_deg, range_m, intensity=0.5):
     elevation, azimuth = np.deg2rad(np.atleast_1d(elevation_deg)), np.deg2rad(np.atleast_1d(azimuth_deg))
     flat = np.cos(elevation)
     rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
-    return (rays * np.atleast_1d(range_m)[:, None]).astype(np.float32)
+    xyz = rays * np.atleast_1d(range_m)[:, None]
+    return np.c_[xyz, np.broadcast_to(intensity, len(xyz))].astype(np.float32)
+
+
+def both_of(points, heading_deg=0.0):
+    return view_from_panorama(panorama_from_points(points, GRID), float(np.deg2rad(heading_deg)), GRID)
 
 
 def view_of(points, heading_deg=0.0):
-    return ranges_from_panorama(panorama_from_points(points, GRID), float(np.deg2rad(heading_deg)), GRID)
+    return both_of(points, heading_deg)[0]
 
 
 def test_rows_run_from_the_top_to_the_bottom():
@@ -114,12 +119,30 @@ def test_a_single_missing_column_is_filled_on_one_surface_only():
     first = -180.0 + step * (GRID.around // 2)
     same = panorama_from_points(points_at([0, 0], [first, first + 2 * step], [10.0, 10.6]), GRID)
     other = panorama_from_points(points_at([0, 0], [first, first + 2 * step], [10.0, 12.0]), GRID)
-    assert same[4, GRID.around // 2 + 1] == pytest.approx(10.3, abs=1e-3)
-    assert other[4, GRID.around // 2 + 1] == 0
+    assert same[0, 4, GRID.around // 2 + 1] == pytest.approx(10.3, abs=1e-3)
+    assert other[0, 4, GRID.around // 2 + 1] == 0
 
 
 def test_an_empty_scan_gives_an_empty_panorama():
-    assert not panorama_from_points(np.zeros((0, 3), np.float32), GRID).any()
+    assert not panorama_from_points(np.zeros((0, 4), np.float32), GRID).any()
+
+
+def test_the_intensity_in_a_cell_is_that_of_the_point_whose_range_it_holds():
+    elevation, azimuth = np.rad2deg(GRID.elevations_rad[4]), np.rad2deg(GRID.azimuths_rad[5])
+    points = points_at([elevation + 1.5, elevation + 0.2], [azimuth] * 2, [7.0, 9.0], [0.9, 0.3])
+    np.testing.assert_allclose(both_of(points)[:, 4, 5], [9.0, 0.3], atol=1e-4)
+
+
+def test_rows_between_beams_are_filled_with_the_intensity_between():
+    elevations = np.rad2deg(GRID.elevations_rad)
+    points = points_at([elevations[2], elevations[4]], [np.rad2deg(GRID.azimuths_rad[7])] * 2, [10.0, 10.2], [0.2, 0.6])
+    np.testing.assert_allclose(both_of(points)[:, 3, 7], [10.1, 0.4], atol=1e-4)
+
+
+def test_intensity_has_no_cell_where_there_is_no_range():
+    ranges, intensity = both_of(points_at(np.zeros(9), np.linspace(-40, 40, 9), np.linspace(30, 50, 9)))
+    assert (intensity[ranges == 0] == 0).all()
+    assert (intensity[ranges > 0] == 0.5).all()
 
 
 def test_heights_count_from_the_ground_and_only_where_something_was_measured():
@@ -133,18 +156,27 @@ def test_heights_count_from_the_ground_and_only_where_something_was_measured():
 
 
 def test_planes_of_a_survey_view_have_no_colour_and_are_blank_in_rows_that_it_does_not_see():
-    ranges = np.full((9, 16), 10.0, np.float32)
+    view = lidar_view(10.0)
     rows_seen = np.arange(9) > 2
-    planes = dict(zip(PLANES, survey_planes(ranges, sensor_height_m=1.8, rows_seen=rows_seen, grid=GRID), strict=True))
+    planes = dict(zip(PLANES, survey_planes(view, sensor_height_m=1.8, rows_seen=rows_seen, grid=GRID), strict=True))
     assert not planes["v1"].any()
     assert not planes["v2"].any()
-    for name in ("range_m", "height_m", "observed"):
+    for name in ("range_m", "height_m", "observed", "brightness"):
         assert not planes[name][:3].any()
     assert (planes["observed"][3:] == 1).all()
     assert (planes["range_m"][3:] == 10).all()
 
 
 def test_survey_planes_forget_what_lies_beyond_the_limit():
-    ranges = np.full((9, 16), 41.0, np.float32)
-    planes = survey_planes(ranges, sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
-    assert not planes[[0, 3]].any()
+    planes = survey_planes(lidar_view(41.0), sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
+    assert not planes[[0, 3, 5]].any()
+
+
+def lidar_view(range_m):
+    rising = np.broadcast_to(np.linspace(0.1, 0.9, 16), (9, 16))
+    return np.stack([np.full((9, 16), range_m), rising]).astype(np.float32)
+
+
+def test_brightness_of_a_survey_view_rises_with_the_intensity():
+    planes = survey_planes(lidar_view(10.0), sensor_height_m=1.8, rows_seen=np.ones(9, np.bool_), grid=GRID)
+    assert (np.diff(planes[PLANES.index("brightness")], axis=1) > 0).all()

@@ -1,8 +1,10 @@
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training.augment import Augmentation, Augmenter  # noqa: E402  # after the skip
+from model_training.training.augment import Augmentation, Augmenter, brightness  # noqa: E402  # after the skip
+from service.imaging.brightness import brightness as of_one_view  # noqa: E402
 from service.imaging.view_grid import PLANES, ViewGrid  # noqa: E402
 
 GRID = ViewGrid()
@@ -10,7 +12,8 @@ COUNT = 300
 #: Everything off.
 NOTHING = Augmentation(
     disparity_noise_px=(1e-6, 1e-6), scale_error=0, invented_depth=0, short_range=0, no_colour=0, narrow_rows=0, narrow_columns=0,
-    blocked=0, small_blocks=0, unseen_top_rows=0, survey_noise_m=0, survey_dropout=0, height_error_m=0,
+    blocked=0, small_blocks=0, unseen_top_rows=0, survey_noise_m=0, survey_dropout=0, height_error_m=0, no_intensity=0,
+    intensity_gain=0, no_brightness=0, shading=0,
 )  # fmt: skip
 
 
@@ -30,6 +33,10 @@ def query(augment, **options):
     return augment.query(*clean(**options))
 
 
+def survey(augment, ranges, height, seen, intensity=None):
+    return augment.survey(ranges, torch.full_like(ranges, 0.4) if intensity is None else intensity, height, seen)
+
+
 def plane(planes, name):
     return planes[:, PLANES.index(name)]
 
@@ -37,8 +44,8 @@ def plane(planes, name):
 def test_planes_of_both_sides_have_the_shape_of_a_view():
     ranges, rgb, height, seen = clean(count=3)
     augment = Augmenter(Augmentation(), GRID, torch.Generator().manual_seed(0), torch.device("cpu"))
-    assert augment.survey(ranges, height, seen).shape == (3, 5, 32, 128)
-    assert augment.query(ranges, rgb, height, seen).shape == (3, 5, 32, 128)
+    assert survey(augment, ranges, height, seen).shape == (3, 6, 32, 128)
+    assert augment.query(ranges, rgb, height, seen).shape == (3, 6, 32, 128)
 
 
 def test_one_generator_gives_one_batch():
@@ -109,7 +116,7 @@ def test_short_ranges_are_cut():
 
 def test_a_survey_view_without_errors_keeps_its_ranges_and_heights():
     ranges, _, height, seen = clean(count=2)
-    found = augmenter().survey(ranges, height, seen)
+    found = survey(augmenter(), ranges, height, seen)
     torch.testing.assert_close(plane(found, "range_m"), ranges)
     sine = torch.sin(torch.tensor(GRID.elevations_rad, dtype=torch.float32))[:, None]
     torch.testing.assert_close(plane(found, "height_m"), (ranges * sine + 1.5))
@@ -120,7 +127,7 @@ def test_rows_that_the_survey_does_not_see_are_blank_on_both_sides():
     ranges, rgb, height, _ = clean(count=2)
     seen = (torch.arange(GRID.rows) >= 10).reshape(1, -1, 1)
     augment = augmenter()
-    for found in (augment.survey(ranges, height, seen), augment.query(ranges, rgb, height, seen)):
+    for found in (survey(augment, ranges, height, seen), augment.query(ranges, rgb, height, seen)):
         assert not bool(found[:, :, :10].any())
 
 
@@ -129,3 +136,40 @@ def test_top_rows_are_cut_in_the_stated_share_of_views():
     cut = ~rows[:, 0, 0]
     assert float(cut.float().mean()) == pytest.approx(0.5, abs=0.1)
     assert bool(rows[:, 17:].all())
+
+
+def uneven(count=4):
+    generator = torch.Generator().manual_seed(3)
+    return torch.rand(count, GRID.rows, GRID.columns, generator=generator)
+
+
+def test_brightness_is_what_the_service_makes_of_the_same_view():
+    values, measured = uneven(), uneven() > 0.4
+    seen = measured | (values > 0.9)
+    values[1] = 0.7  # flat
+    measured[2] = False
+    batch = brightness(values, measured=measured, seen=seen).numpy()
+    for k, found in enumerate(batch):
+        one = of_one_view(values[k].numpy(), measured=measured[k].numpy(), seen=seen[k].numpy())
+        np.testing.assert_allclose(found, one, atol=1e-4)
+    assert batch[0].any()
+    assert not batch[1:3].any()
+
+
+def test_brightness_is_missing_in_the_stated_share_of_views():
+    ranges, rgb, height, seen = clean()
+    lost = ~plane(augmenter(no_brightness=0.3).query(ranges, rgb, height, seen), "brightness").flatten(1).any(dim=1)
+    assert float(lost.float().mean()) == pytest.approx(0.3, abs=0.1)
+    found = survey(augmenter(no_intensity=0.3), ranges, height, seen, uneven(COUNT))
+    assert float((~plane(found, "brightness").flatten(1).any(dim=1)).float().mean()) == pytest.approx(0.3, abs=0.1)
+
+
+def test_a_vehicle_in_the_way_covers_the_brightness_of_what_is_behind_it():
+    ranges, rgb, height, seen = clean(count=40)
+    free = plane(augmenter().query(ranges, rgb, height, seen), "brightness")
+    planes = augmenter(blocked=1, widest_block=0.5).query(ranges, rgb, height, seen)
+    hidden = plane(planes, "range_m") < 14.0
+    assert bool(hidden.any())
+    inside = plane(planes, "brightness")[hidden]
+    alike = torch.corrcoef(torch.stack([inside, free[hidden]]))[0, 1]
+    assert abs(float(alike)) < 0.3  # depth bleeds over the edge, brightness does not

@@ -22,7 +22,7 @@ def net(shape):
 
 def planes_of(shape, count, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    planes = torch.rand(count, 5, shape.rows, shape.columns, generator=generator) * 30
+    planes = torch.rand(count, 6, shape.rows, shape.columns, generator=generator) * 30
     planes[:, 4] = 1.0
     return planes
 
@@ -62,7 +62,7 @@ def test_a_view_does_not_depend_on_its_batch(net, shape):
 
 def test_a_view_without_any_measurement_has_a_descriptor(net, shape):
     with torch.no_grad():
-        assert torch.isfinite(net(torch.zeros(1, 5, shape.rows, shape.columns), torch.zeros(1))).all()
+        assert torch.isfinite(net(torch.zeros(1, 6, shape.rows, shape.columns), torch.zeros(1))).all()
 
 
 @pytest.mark.parametrize("batch", [1, 2, 9])

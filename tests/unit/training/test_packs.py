@@ -14,7 +14,7 @@ from model_training.training.recipe import (
     watch_plans,
 )
 
-PLAN = PackPlan(seed=1001, places=6, queries_a_place=2, lidar="hdl_64", size_m=(60.0, 60.0))
+PLAN = PackPlan(seed=1002, places=6, queries_a_place=2, lidar="hdl_64", size_m=(60.0, 60.0))
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +26,7 @@ def pack(grid, tmp_path_factory):
 
 def test_a_pack_holds_what_its_plan_says(pack, grid):
     assert pack.panoramas.shape == (6, grid.rows, grid.around)
+    assert pack.intensities.shape == pack.panoramas.shape
     assert pack.ranges.shape == (12, grid.rows, grid.columns)
     assert pack.rgb.shape == (12, grid.rows, grid.columns, 3)
     assert (pack.places.shape, pack.queries.shape) == ((6, 4), (12, 4))

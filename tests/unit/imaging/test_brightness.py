@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from service.imaging.brightness import FLOOR, LIMIT, brightness
+
+ALL = np.ones((1, 4), np.bool_)
+VALUES = arrays(np.float32, (4, 6), elements=st.floats(0.0, 255.0, width=32))
+
+
+def of(values, measured=None, seen=None):
+    values = np.atleast_2d(np.asarray(values, np.float32))
+    every = np.ones(values.shape, np.bool_)
+    return brightness(values, measured=every if measured is None else measured, seen=every if seen is None else seen)
+
+
+def test_two_levels_stand_one_spread_to_either_side():
+    np.testing.assert_allclose(of([1.0, 1.0, 3.0, 3.0]), [[-1, -1, 1, 1]], atol=1e-5)
+
+
+def test_mean_and_spread_are_worked_out_over_measured_cells():
+    measured = np.array([[True, True, True, False]])
+    logarithms = np.log(np.array([1.0, 2.0, 6.0]) / 3.0 + FLOOR)
+    expected = (np.log(10.0 / 3.0 + FLOOR) - logarithms.mean()) / logarithms.std()
+    assert of([1.0, 2.0, 6.0, 10.0], measured)[0, 3] == pytest.approx(expected, abs=1e-4)
+
+
+@given(VALUES, st.floats(1e-3, 1e3))
+def test_the_scale_does_not_matter(values, scale):
+    np.testing.assert_allclose(of(values), of(values * np.float32(scale)), atol=2e-3)
+
+
+@given(VALUES)
+def test_it_stays_within_its_limit(values):
+    found = of(values)
+    assert np.isfinite(found).all()
+    assert np.abs(found).max() <= LIMIT
+
+
+def test_what_is_not_seen_is_zero():
+    seen = np.array([[True, True, False, False]])
+    assert (of([1.0, 4.0, 9.0, 16.0], seen=seen)[0, 2:] == 0).all()
+
+
+@pytest.mark.parametrize("values", [[0, 0, 0, 0], [7, 7, 7, 7], [100, 101, 100, 101]])
+def test_a_view_without_contrast_tells_nothing(values):
+    assert not of(values).any()
+
+
+def test_a_view_without_a_measured_cell_tells_nothing():
+    assert not of([1.0, 2.0, 3.0, 4.0], measured=~ALL).any()
