@@ -4,9 +4,8 @@
 PYTHON ?= python3
 # The CPU build where pip is offered one; `make TORCH="torch==2.13.0 --index-url ..." test` takes another.
 TORCH ?= torch==2.13.0
-# Optimiser steps of the stock encoder: at small turns first, then at those that a fan of 24 headings needs.
-STEPS ?= 4600
-SECOND_STEPS ?= 900
+# Optimiser steps of the stock encoder.
+STEPS ?= 4200
 # Further steps on the paper's city, for the encoder that stands beside it in the report.
 PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.
@@ -69,8 +68,7 @@ reports: .venv/.torch ## all reports as one page with plots
 	$(BIN)/python -m benchmarks.render $(ARGS)
 
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
-	$(BIN)/streetfix train --run runs/stock-first --turn 4.5 --steps $(STEPS)
-	$(BIN)/streetfix train --run runs/stock --start-from runs/stock-first --rate 1e-3 --steps $(SECOND_STEPS)
+	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS)
 	$(BIN)/streetfix export runs/stock --out model_training/stock/encoder.onnx
 
 paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there

@@ -35,7 +35,9 @@ def command(
     ] = "city",
     seed: Annotated[int, typer.Option(help="decides everything that is random", min=0)] = 0,
     name: Annotated[str, typer.Option(help="name of the dataset [default: that of the folder]")] = "",
-    size: Annotated[str, typer.Option(help="extent of a random city, metres, 30 to 10000 each")] = "300x400",
+    size: Annotated[
+        str | None, typer.Option(help="extent of a random city, metres, 30 to 10000 each [default: 300x400]")
+    ] = None,
     streets: Annotated[str, typer.Option(help="drive only these streets, e.g. 1,5,between")] = "",
     lidar: Annotated[str, typer.Option(help="paper_32, vlp_16, hdl_64 or os1_128")] = "paper_32",
     spacing: Annotated[float, typer.Option(help="metres between scans", min=0.02)] = 1.0,
@@ -103,15 +105,17 @@ def command(
         raise DatasetError(
             "set: without queries nothing measures depth; ask for some, or set numbers of lidar only", field="set"
         )
+    if city not in ("paper", "city"):
+        raise DatasetError(f"city: {city!r} is neither 'paper' nor 'city'", field="city")
+    if city == "paper" and size is not None:
+        raise DatasetError("size: the paper's city has its own; leave it out, or take --city city", field="size")
     width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
-        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size, "size", least=30, most=10_000),
+        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size or "300x400", "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
         survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
         queries=tuple(plans), lidar_parameters=lidar_parameters,
     )  # fmt: skip
-    if city not in ("paper", "city"):
-        raise DatasetError(f"city: {city!r} is neither 'paper' nor 'city'", field="city")
     with bars() as report:
         simulate(plan, out, workers=workers, report=report)
     Console().print(f"dataset {plan.name}: {out}")

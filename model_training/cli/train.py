@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.training.loop import Progress, TrainingConfig, train
+from model_training.training.loop import Progress, TrainingConfig, device_of, train
 from model_training.training.packs import make_packs
 from model_training.training.recipe import paper_plans, stock_plans
 from service.errors import DatasetError
@@ -17,7 +17,7 @@ from service.imaging.view_grid import ViewGrid
 def command(
     run: Annotated[Path, typer.Option(help="folder of the run: configuration, checkpoint, TensorBoard log")],
     recipe: Annotated[str, typer.Option(help="stock: many cities; paper: the paper's city itself")] = "stock",
-    cities: Annotated[int, typer.Option(help="cities of the stock recipe", min=1, max=1000)] = 24,
+    cities: Annotated[int, typer.Option(help="cities of the stock recipe", min=1, max=1000)] = 26,
     packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
     steps: Annotated[int, typer.Option(help="optimiser steps", min=1)] = 4000,
     pairs: Annotated[int, typer.Option(help="pairs of views a step", min=2, max=2048)] = 128,
@@ -39,6 +39,9 @@ def command(
     """
     if recipe not in ("stock", "paper"):
         raise DatasetError(f"recipe: {recipe!r} is neither 'stock' nor 'paper'", field="recipe")
+    if optimiser not in ("adamw", "sgdm"):
+        raise DatasetError(f"optimiser: {optimiser!r} is neither 'adamw' nor 'sgdm'", field="optimiser")
+    device_of(device)  # said before an hour of simulation, not after it
     config = TrainingConfig.model_validate(
         {"steps": steps, "pairs": pairs, "optimiser": optimiser, "learning_rate": rate, "seed": seed, "turn_deg": turn}
         | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network no longer drift fast

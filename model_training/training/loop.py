@@ -60,10 +60,16 @@ class Progress:
 
 
 def device_of(name: str) -> torch.device:
-    """``auto`` takes CUDA where there is one."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(name)
+    """``auto`` takes CUDA where there is one.
+
+    Raises:
+        DatasetError: no such device here.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise DatasetError(f"device: {name!r} is not auto, cpu or cuda", field="device")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise DatasetError("device: torch finds no CUDA device here; use --device cpu, or auto", field="device")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def train(

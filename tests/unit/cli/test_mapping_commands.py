@@ -117,6 +117,7 @@ def test_simulate_refuses_a_number_that_no_sensor_can_take(
         (("--size", "300xinf"), "size: inf in '300xinf' is not between"),
         (("--lidar", "none"), "lidar: 'none' is no preset"),
         (("--table1",), "--city paper"),
+        (("--city", "paper", "--size", "300x400"), "size: the paper's city has its own"),
         (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 would do nothing"),
         (("--queries", "0", "--set", "depth.noise_px=1"), "without queries nothing measures depth"),
     ],
@@ -224,6 +225,16 @@ def test_train_refuses_a_recipe_that_is_not_there(tmp_path: Path, capsys: pytest
     pytest.importorskip("torch", reason="needs the extra `training`")
     assert run("train", "--run", tmp_path / "run", "--recipe", "soup") == 1
     assert "'soup'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("option", "value"), [("--device", "foo"), ("--optimiser", "lion")])
+def test_train_refuses_what_it_does_not_know_before_it_simulates(
+    option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("torch", reason="needs the extra `training`")
+    assert run("train", "--run", tmp_path / "run", "--packs", tmp_path / "packs", option, value) == 1
+    assert f"{option[2:]}: '{value}'" in capsys.readouterr().err
+    assert not (tmp_path / "packs").exists()
 
 
 def test_export_of_no_run_says_what_makes_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
