@@ -111,7 +111,8 @@ def command(
         raise DatasetError("size: the paper's city has its own; leave it out, or take --city city", field="size")
     width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
-        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed, size_m=_pair(size or "300x400", "size", least=30, most=10_000),
+        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed,
+        size_m=_pair(size or "300x400", "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
         survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
         queries=tuple(plans), lidar_parameters=lidar_parameters,

@@ -39,7 +39,8 @@ def write_pack(folder: Path, *, places: int = 60, seed: int = 0) -> Path:
     queries[:, :2] += rng.uniform(-0.5, 0.5, (places, 2))
     queries[:, 3] = 1.5
     arrays = {
-        "panoramas": panoramas.astype(np.float16), "intensities": (panoramas * 8).astype(np.uint8), "places": poses, "rows_seen": np.ones(GRID.rows, np.bool_),
+        "panoramas": panoramas.astype(np.float16), "intensities": (panoramas * 8).astype(np.uint8), "places": poses,
+        "rows_seen": np.ones(GRID.rows, np.bool_),
         "ranges": np.stack([p[:, c] for p, c in zip(panoramas, columns, strict=True)]).astype(np.float16),
         "rgb": rng.integers(0, 256, (places, GRID.rows, GRID.columns, 3)).astype(np.uint8), "queries": queries,
     }  # fmt: skip
