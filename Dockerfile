@@ -9,7 +9,8 @@ COPY locks/service.txt locks/service.txt
 RUN python -m venv --without-pip /opt/streetfix \
  && pip --python /opt/streetfix/bin/python install --no-cache-dir --only-binary :all: --require-hashes \
     --requirement locks/service.txt
-COPY pyproject.toml README.md LICENSE ./
+# The registration kernel is C: the build brings a compiler from PyPI where the machine has none, as here.
+COPY pyproject.toml hatch_build.py README.md LICENSE ./
 COPY service service
 COPY model_training model_training
 RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels . \

@@ -11,6 +11,9 @@ PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.
 DATA ?= ../shared/data/kitti_stereo
 
+# Compiled when the package is installed.
+KERNEL := hatch_build.py service/registration/kernel.c
+
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 UV := $(BIN)/uv
@@ -90,12 +93,12 @@ clean: ## remove what demos and tools left; .venv, data and runs stay
 	$(PIP) install --quiet 'uv>=0.9,<1'
 	@touch $@
 
-.venv/.mapping: locks/mapping.txt pyproject.toml | .venv/.uv
+.venv/.mapping: locks/mapping.txt pyproject.toml $(KERNEL) | .venv/.uv
 	$(INSTALL) --require-hashes --requirement locks/mapping.txt
 	$(INSTALL) --no-deps --editable .
 	@touch $@
 
-.venv/.dev: locks/dev.txt pyproject.toml | .venv/.uv
+.venv/.dev: locks/dev.txt pyproject.toml $(KERNEL) | .venv/.uv
 	$(INSTALL) --require-hashes --requirement locks/dev.txt
 	$(INSTALL) --no-deps --editable .
 	@touch $@

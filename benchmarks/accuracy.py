@@ -1,4 +1,4 @@
-"""``make evaluate``: retrieval by the stock encoder, by one trained on the paper's city, and by the raw range image.
+"""``make evaluate``: retrieval by the stock encoder and by one trained on the paper's city, the raw image, registration.
 
 Everything is simulated, built and measured here from seeds that no training uses (``model_training.training.recipe``). What is
 finished is kept under ``--work`` and reused, so an interrupted run goes on.
@@ -13,6 +13,8 @@ from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs, share
 from benchmarks.weather import weather_rows
 from model_training.evaluation.error_measures import wilson_interval
+from model_training.evaluation.measures import measure
+from model_training.evaluation.predict import joined
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.stock import ENCODER
 from model_training.training.recipe import EVALUATION_SEEDS
@@ -55,6 +57,55 @@ def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None
     own = runs.figures(bundle, dataset, ["survey_drive_precise"])
     share(report, f"{prefix}.paper_city.same_drive.street_accuracy", own, "street_accuracy")
     share(report, f"{prefix}.paper_city.same_drive.recall_at_1_5m", own, "recall_at_1_5m")
+
+
+def full_paper_rows(report: Report, runs: Runs) -> None:
+    """The paper's city with registration."""
+    dataset = runs.dataset(paper_plan())
+    bundle = runs.bundle(dataset)
+    for preset, street in (("precise", 0.998), ("stereo", 0.985)):
+        figures = runs.figures(bundle, dataset, [f"drive{k}_{preset}" for k in range(1, 6)], refine=True)
+        row, precise = f"full.paper_city.{preset}", preset == "precise"
+        share(report, f"{row}.street_accuracy", figures, "street_accuracy", street)
+        share(report, f"{row}.localized", figures, "localized", 0.99 if precise else None)
+        share(report, f"{row}.within_1_m", figures, "within_1_m")
+        forced = {f"forced_{key}": value for key, value in figures["forced"].items()}
+        for key, bar in (
+            ("mean_distance_error_m", 0.05),
+            ("median_distance_error_m", 0.04),
+            ("forced_mean_distance_error_m", 0.15),
+        ):
+            value = (figures | forced)[key]
+            report.row(f"{row}.{key}", value, "m", bar=bar if precise else None, better="lower", n=figures["queries"])
+
+
+def full_unseen_rows(report: Report, runs: Runs) -> None:
+    """Three unseen cities with registration: shares over all queries, medians over all that were answered."""
+    headings = {"precise": 0.12, "stereo": 0.35}
+    for preset in BOTH:
+        parts, predictions = [], []
+        for index in range(3):
+            dataset = runs.dataset(unseen_plan(index))
+            figures = runs.figures(runs.bundle(dataset), dataset, [f"drive1_{preset}"], refine=True)
+            parts.append(figures)
+            predictions += list(figures["predictions"].values())
+        row = f"full.unseen.{preset}"
+        share(report, f"{row}.within_0_5_m", parts, "within_0_5_m", 0.998 if preset == "precise" else None)
+        share(report, f"{row}.within_1_m", parts, "within_1_m", 0.985 if preset == "stereo" else None)
+        pooled = measure(joined(predictions), [])
+        bar = 0.10 if preset == "stereo" else None
+        report.row(
+            f"{row}.median_distance_error_m",
+            pooled["median_distance_error_m"],
+            "m",
+            bar=bar,
+            better="lower",
+            n=pooled["queries"],
+        )
+        report.row(
+            f"{row}.median_heading_error_deg", pooled["median_heading_error_deg"], "deg", bar=headings[preset], better="lower",
+            n=pooled["queries"],
+        )  # fmt: skip
 
 
 def unseen_rows(report: Report, runs: Runs) -> None:
@@ -139,6 +190,8 @@ def main() -> None:
     kitti_rows(report, runs, arguments.data)
     unseen_rows(report, runs)
     paper_rows(report, runs, "retrieval", barred=True)
+    full_paper_rows(report, runs)
+    full_unseen_rows(report, runs)
     weather_rows(report, runs)
     paper = runs.dataset(paper_plan())
     for preset in BOTH:

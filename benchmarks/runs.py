@@ -30,16 +30,19 @@ RAW_EVERY = 3  # each third query of a set is asked of the raw image too: it is 
 
 @cache
 def code_hash(*folders: str) -> str:
-    """Short hash of the Python files of folders of the repository."""
+    """Short hash of the Python and C files of folders of the repository."""
     digest = hashlib.sha256()
     for folder in folders:
-        for path in sorted((ROOT / folder).rglob("*.py")):
+        for path in sorted(p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".c")):
             digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:8]
 
 
 SIMULATION = ("model_training/simulation", "service/geometry")
-MAPPING = ("model_training/mapping", "service/imaging", "service/geometry", "service/maps", "model_training/datasets")
+MAPPING = (
+    "model_training/mapping", "service/imaging", "service/geometry", "service/maps", "service/registration",
+    "model_training/datasets",
+)  # fmt: skip
 
 
 class Runs:
@@ -68,11 +71,11 @@ class Runs:
                 build_map(dataset, self.encoder, folder, settings, report=report)
         return MapBundle.open(folder)
 
-    def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str]) -> dict[str, Any]:
-        """Evaluate query sets; the answers lie beside for later measures."""
+    def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str], *, refine: bool = False) -> dict[str, Any]:
+        """Evaluate query sets, by retrieval alone or with registration; the answers lie beside for later measures."""
         with bars() as report:
-            result = evaluate(bundle, dataset, names, report=report)
-        folder = self.work / "predictions" / bundle.path.name
+            result = evaluate(bundle, dataset, names, refine=refine, report=report)
+        folder = self.work / "predictions" / ("full" if refine else "retrieval") / bundle.path.name
         folder.mkdir(parents=True, exist_ok=True)
         for name, predictions in result.predictions.items():
             predictions.save(folder / f"{name}.npz")

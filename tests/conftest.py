@@ -12,13 +12,15 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 
+from model_training.mapping.voxel_map import VoxelMap
 from service.geometry.camera import PinholeCamera
-from service.geometry.rigid import rotation_z, transform_from
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
 from service.imaging.query_view import query_view
 from service.imaging.view_grid import ViewGrid
 from service.localization.encoder import Encoder
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
+from service.registration.surfel_map import SurfelMap
 
 GRID = ViewGrid(rows=8, columns=16)
 DESCRIPTOR_SIZE = 16
@@ -88,6 +90,24 @@ def make_pictures(*, seed: int = 3) -> tuple[NDArray[np.uint8], NDArray[np.float
     return rgb, depth_m, camera
 
 
+def make_cloud() -> SurfelMap:
+    """What ``make_pictures`` sees from the true view, as the survey would have mapped it."""
+    _, depth_m, camera = make_pictures()
+    points_camera = (camera.rays_of_pixels() * depth_m[..., None]).reshape(-1, 3)
+    T_map_camera = true_pose()
+    voxels = VoxelMap(0.3, np.round(T_map_camera[:3, 3]))
+    for _ in range(3):  # so that every voxel has points enough for a normal
+        voxels.add(transform_points(T_map_camera, points_camera))
+    return SurfelMap.prepare(voxels.origin, *voxels.tiles(voxels.surfels()))
+
+
+def true_pose() -> NDArray[np.float64]:
+    """T_map_camera of ``make_pictures``: in the true view, 1.5 m above the ground under the true place's LiDAR."""
+    heading = TRUE_HEADING * np.pi / 2
+    place = np.array([10.0 * (TRUE_PLACE % 6), 100.0 * (TRUE_PLACE // 6), 2.0])
+    return transform_from(rotation_z(heading) @ R_BODY_OPTICAL, place + [0.0, 0.0, 1.5 - 1.8])
+
+
 def make_content(*, name: str = "tiny", seed: int = 0, **changed: Any) -> BundleContent:
     """Twelve places, six in each street, four headings each; one view is that of ``make_pictures``."""
     encoder = make_encoder(seed=seed)
@@ -118,7 +138,7 @@ def make_content(*, name: str = "tiny", seed: int = 0, **changed: Any) -> Bundle
         "descriptors": descriptors,
         "encoder": encoder,
         "streets": make_streets(),
-        "cloud": {"0_0": np.zeros((5, 3), np.float32)},
+        "cloud": make_cloud(),
         "parameters": {"lidar_height_m": 1.8, "voxel_m": 0.2},
         "licence": "CC0-1.0",
         "tool_versions": {"streetfix": "0"},

@@ -46,6 +46,9 @@ def command(
     predictions: Annotated[
         Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")
     ] = None,
+    refine: Annotated[
+        bool, typer.Option("--refine/--no-refine", help="register each query on the cloud, or measure retrieval alone")
+    ] = True,
     workers: Annotated[int, typer.Option(help="queries at a time", min=1)] = 2,
 ) -> None:
     """Measure a map against queries whose truth is known.
@@ -64,7 +67,7 @@ def command(
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
     with bars() as report:
-        result = evaluate(opened, data, names, workers=workers, report=report)
+        result = evaluate(opened, data, names, refine=refine, workers=workers, report=report)
         figures = result.figures
         if raw_baseline:
             places = raw_best_views(opened, data, list(result.predictions), report=report)

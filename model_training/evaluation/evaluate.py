@@ -30,10 +30,11 @@ def evaluate(
     dataset: Dataset,
     names: list[str] | None = None,
     *,
+    refine: bool = True,
     workers: int = 2,
     report: Report = lambda *_: None,
 ) -> Evaluation:
-    """Measure a map with query sets; all that have truth where none is named.
+    """Measure a map with query sets; all that have truth where none is named. ``refine=False`` measures retrieval alone.
 
     The figures at the top are over all queries of all sets; ``sets`` has them for each set with its split.
 
@@ -47,7 +48,9 @@ def evaluate(
         )
     localizer = Localizer.open(bundle)
     classes = [] if bundle.streets is None else [street.name for street in bundle.streets.features]
-    predictions = {name: predict(localizer, dataset, name, workers=workers, report=report) for name in names}
+    predictions = {
+        name: predict(localizer, dataset, name, refine=refine, workers=workers, report=report) for name in names
+    }
     figures = measure(joined(list(predictions.values())), classes)
     seen = city_seen_in_training(dataset, localizer.encoder.trained_on)
     sets = {
@@ -58,6 +61,7 @@ def evaluate(
     head = {
         "map": {"name": bundle.name, "version": bundle.manifest.version}, "dataset": dataset.name,
         "split": splits[0] if len(splits) == 1 else "mixed", "encoder_sha256": bundle.manifest.encoder_sha256,
+        "registered": refine and bundle.cloud is not None,
     }  # fmt: skip
     return Evaluation(head | figures | {"sets": sets}, predictions)
 

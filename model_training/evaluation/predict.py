@@ -57,9 +57,10 @@ def joined(parts: list[Predictions]) -> Predictions:
 
 
 def predict(
-    localizer: Localizer, dataset: Dataset, name: str, *, workers: int = 2, report: Report = lambda *_: None
-) -> Predictions:
-    """Ask every query of a set that has truth.
+    localizer: Localizer, dataset: Dataset, name: str, *, refine: bool = True, workers: int = 2,
+    report: Report = lambda *_: None,
+) -> Predictions:  # fmt: skip
+    """Ask every query of a set that has truth; ``refine=False`` asks retrieval alone.
 
     Raises:
         DatasetError: the set has no truth or no frames.
@@ -72,7 +73,7 @@ def predict(
     answers: list[tuple[Answer | None, float]] = []
     with ThreadPoolExecutor(workers) as pool:
         for done, answer in enumerate(
-            _in_order(pool, lambda frame: _ask(localizer, frame), frames, ahead=4 * workers), 1
+            _in_order(pool, lambda frame: _ask(localizer, frame, refine=refine), frames, ahead=4 * workers), 1
         ):
             answers.append(answer)
             report(f"queries {name}", done, len(frames))
@@ -88,9 +89,9 @@ def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: list[T], 
         waiting += [pool.submit(work, item) for item in islice(rest, 1)]
 
 
-def _ask(localizer: Localizer, frame: QueryFrame) -> tuple[Answer | None, float]:
+def _ask(localizer: Localizer, frame: QueryFrame, *, refine: bool) -> tuple[Answer | None, float]:
     began = time.perf_counter()
-    query = Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole(), ranked=RANKED)
+    query = Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole(), ranked=RANKED, refine=refine)
     try:
         answer: Answer | None = localizer.localize(query)
     except NoDepthError:
@@ -111,8 +112,7 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
         localized[k] = answer.status == "LOCALIZED"
         for j, neighbour in enumerate(answer.neighbours[:RANKED]):
             ranked[k, j], ranked_place[k, j] = neighbour.position_m[:2], neighbour.place
-        if answer.vote is not None:
-            street_answer[k] = answer.vote.street
+        street_answer[k] = answer.street
     street_true = np.full(count, -1)
     if streets is not None:
         street_true = np.array([streets.index_at(T[:2, 3]) for T in T_true])

@@ -31,6 +31,7 @@ from service.maps.content import BundleContent
 from service.maps.manifest import NAME, Manifest
 from service.maps.streets import Streets
 from service.maps.writer import write_bundle
+from service.registration.surfel_map import SurfelMap
 
 Report = Callable[[str, int, int], None]
 
@@ -135,7 +136,8 @@ def build_map(
         name=settings.name, grid=grid, headings=settings.headings, spacing_m=settings.spacing_m, rows_seen=rows_seen,
         T_map_place=T_map_level, place_street=_streets_of(streets, T_map_level),
         view_place=np.repeat(np.arange(len(kept), dtype=np.int32), settings.headings), view_heading_rad=np.concatenate(headings),
-        descriptors=np.concatenate(descriptors), encoder=encoder_file.read_bytes(), streets=streets, cloud=cloud.tiles(surfels),
+        descriptors=np.concatenate(descriptors), encoder=encoder_file.read_bytes(), streets=streets,
+        cloud=SurfelMap.prepare(cloud.origin, *cloud.tiles(surfels)),
         preview_webp=preview_webp(surfels.positions, surfels.normals, T_map_level[:, :3, 3]),
         georeference=dataset.description.georeference,
         calibration={"calibrated": False, "why": "this release does not calibrate confidence yet; answers carry confidence null"},

@@ -6,16 +6,16 @@ normal of a voxel is the axis of least variance of the moments of it and its 26 
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.registration.kernel import SURFEL
+
 _SPAN = 1 << 20  # cells along an axis: a key is 3 x 20 bits
 _MOMENTS = 10  # count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's corner
 TILE_M = 40.0
-
-#: A surface element: position relative to the tile's origin, unit normal, thickness across the surface (m), points.
-SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
 
 
 @dataclass(frozen=True)
@@ -77,21 +77,20 @@ class VoxelMap:
         thickness = np.sqrt(np.maximum(variances[:, 0], 0)).astype(np.float32)
         return Surfels(centre + own[:, 1:4] / own[:, :1], normals, thickness, own[:, 0].astype(np.uint32))
 
-    def tiles(self, found: "Surfels") -> dict[str, NDArray[np.generic]]:
-        """Arrays of ``cloud/``: ``surfels``, sorted by tile, and ``tiles``: (n, 5) origin x, y, z (m), first surfel, count."""
-        positions = found.positions
-        tile = np.floor((positions[:, :2] - self.origin[:2]) / TILE_M).astype(np.int64)
+    def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64]]:
+        """Surfels relative to ``origin``, sorted by tile, and tiles (n, 4): centre x, y (m, same frame), first surfel, count.
+
+        float32 holds a tenth of a millimetre as far as 1 km from the origin, and 1 mm as far as 16 km.
+        """
+        positions = found.positions - self.origin
+        tile = np.floor(positions[:, :2] / TILE_M).astype(np.int64)
         order = np.lexsort((tile[:, 1], tile[:, 0]))
-        tile, positions = tile[order], positions[order]
-        corners, first, count = np.unique(tile, axis=0, return_index=True, return_counts=True)
-        origins = np.concatenate(
-            [self.origin[:2] + (corners + 0.5) * TILE_M, np.full((len(corners), 1), self.origin[2])], axis=1
-        )
+        corners, first, count = np.unique(tile[order], axis=0, return_index=True, return_counts=True)
         surfels = np.zeros(len(positions), SURFEL)
-        surfels["xyz"] = positions - np.repeat(origins, count, axis=0)
+        surfels["xyz"] = positions[order]
         surfels["normal"], surfels["thickness_m"] = found.normals[order], found.thickness_m[order]
         surfels["points"] = found.points[order]
-        return {"surfels": surfels, "tiles": np.concatenate([origins, np.stack([first, count], axis=1)], axis=1)}
+        return surfels, np.c_[(corners + 0.5) * TILE_M, first, count]
 
 
 def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,5 +1,6 @@
 """An answer of the service as a person would want to read it."""
 
+import math
 from typing import Any
 
 from rich.console import Console
@@ -30,13 +31,25 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [
         ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f})")),
         ("street", "none" if street is None else f"{street['name']} ({street['vote']:.0%} of the votes)"),
-        ("position", f"{_metres(pose['position'])}, map frame"),
-        ("heading", f"{pose['heading_deg']:.1f} degrees, counter-clockwise from map x"),
+        ("position", f"{_metres(pose['position'])}, map frame{_spread(pose['covariance'], slice(0, 3), 1.0, 'm')}"),
+        (
+            "heading",
+            f"{pose['heading_deg']:.1f} degrees, counter-clockwise from map x"
+            + _spread(pose["covariance"], slice(5, 6), 180 / math.pi, "degrees"),
+        ),
     ]
     if answer.get("vehicle_pose"):
         vehicle = answer["vehicle_pose"]
         facts.append(("vehicle", f"{_metres(vehicle['position'])}, heading {vehicle['heading_deg']:.1f} degrees"))
     return [*facts, ("map", f"{place['name']}, version {place['version']}")]
+
+
+def _spread(covariance: list[float] | None, rows: slice, scale: float, unit: str) -> str:
+    """The largest of the standard deviations, where they are known."""
+    if covariance is None:
+        return ""
+    largest = max(covariance[7 * k] for k in range(6)[rows])
+    return f", +- {scale * math.sqrt(largest):.2f} {unit} (one sigma)"
 
 
 def _neighbours(neighbours: list[dict[str, Any]]) -> Table:

@@ -57,6 +57,7 @@ def query_from_parts(parts: dict[str, bytes]) -> EncodedQuery:
         down_camera=None if request.gravity is None else _down(request.gravity),
         T_vehicle_camera=None if request.T_vehicle_camera is None else _transform(request.T_vehicle_camera),
         neighbours=request.options.neighbours,
+        refine=request.options.refine,
     )
 
 
@@ -149,16 +150,17 @@ def _transform(transform: schema.RigidTransform) -> NDArray[np.float64]:
 
 
 def _street(answer: Answer, bundle: MapBundle) -> schema.Street | None:
-    if answer.vote is None or bundle.streets is None or answer.vote.street < 0:
+    if answer.vote is None or bundle.streets is None or answer.street < 0:
         return None
-    street = bundle.streets[answer.vote.street]
+    street = bundle.streets[answer.street]
+    voted = dict(answer.vote.shares).get(answer.street, 0.0)
     return schema.Street(
         id=street.id,
         name=street.name,
         street=street.street,
         section=street.section,
         class_index=street.class_index,
-        vote=min(1.0, answer.vote.share),
+        vote=min(1.0, voted),
     )
 
 

@@ -73,8 +73,7 @@ class Options(_Strict):
     neighbours: int = Field(5, ge=1, le=MOST_NEIGHBOURS, description="k: distinct places that vote and are answered")
     refine: bool = Field(
         True,
-        description="allow registration on the map's cloud; this release has none, so every answer is of retrieval alone "
-        "and has covariance null",
+        description="register the depth picture on the map's cloud; false: the pose of retrieval alone, covariance null",
     )
 
 
@@ -116,14 +115,14 @@ class LocalizeRequest(_Strict):
 
 
 class Street(BaseModel):
-    """The street that the nearest places voted for."""
+    """The street under the registered position; without registration the one that the nearest places voted for."""
 
     id: str
     name: str = Field(examples=["End of street 4"])
     street: str = Field(examples=["4"])
     section: Literal["beginning", "end"] | None
     class_index: int = Field(description="0 to 15 in the paper's city")
-    vote: float = Field(description="share of the similarity-weighted votes, 0 to 1")
+    vote: float = Field(description="this street's share of the nearest places' similarity-weighted votes, 0 to 1")
 
 
 HeadingDeg = Annotated[
@@ -139,7 +138,7 @@ class Pose(BaseModel):
     orientation: Quaternion
     heading_deg: HeadingDeg
     covariance: list[float] | None = Field(
-        description="6x6, row by row, translation first, map frame; null: not known without registration"
+        description="6x6, row by row, translation first, map axes, about this frame's origin; null: not known without registration"
     )
 
 
@@ -162,7 +161,7 @@ class MapVersion(BaseModel):
 
 
 class TimingsMs(BaseModel):
-    """Milliseconds of each stage; register is 0 as long as nothing is registered."""
+    """Milliseconds of each stage; register is 0 where nothing was registered."""
 
     decode: float
     fuse: float

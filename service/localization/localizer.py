@@ -1,4 +1,4 @@
-"""One query against one map, as the paper runs it: fuse, encode, search, cluster, vote."""
+"""One query against one map: fuse, encode, search, cluster and vote as the paper does; then register on the cloud."""
 
 from time import perf_counter
 
@@ -11,12 +11,16 @@ from service.localization.answer import Answer, Timings
 from service.localization.encoder import Encoder
 from service.localization.hypotheses import ClusterSettings, Hypothesis, cluster
 from service.localization.query import Query
+from service.localization.refine import RefineSettings, refine
 from service.localization.search import distinct_places, search_views
-from service.localization.street_vote import vote
+from service.localization.street_vote import StreetVote, vote
 from service.maps.reader import MapBundle
 
 #: A query is also asked turned a third of the fan's 15 degrees either way: some turn is then within 2.5 degrees of a view.
 TURNS_RAD = tuple(float(turn) for turn in np.deg2rad([-5.0, 0.0, 5.0]))
+
+#: Distinct places that are looked up at least: registration starts from several.
+RANKED = 40
 
 
 class Localizer:
@@ -26,7 +30,9 @@ class Localizer:
         BundleError: the encoder is not the one that made the map's descriptors, or reads another view grid.
     """
 
-    def __init__(self, bundle: MapBundle, encoder: Encoder, *, clusters: ClusterSettings | None = None) -> None:
+    def __init__(
+        self, bundle: MapBundle, encoder: Encoder, *, clusters: ClusterSettings | None = None, refining: RefineSettings | None = None
+    ) -> None:  # fmt: skip
         expected, size = bundle.manifest.encoder_sha256, bundle.manifest.counts.descriptor_size
         if encoder.sha256 != expected or encoder.dimension != size:
             raise BundleError(
@@ -44,6 +50,7 @@ class Localizer:
         self.bundle = bundle
         self.encoder = encoder
         self.clusters = clusters or ClusterSettings()
+        self.refining = refining or RefineSettings()
         self.turns_rad = TURNS_RAD
 
     @classmethod
@@ -65,7 +72,7 @@ class Localizer:
         fused = perf_counter()
         descriptors = self.encoder.encode(views.planes, side="query")
         encoded = perf_counter()
-        wanted = max(query.neighbours, query.ranked)
+        wanted = max(query.neighbours, query.ranked, RANKED)
         matches = search_views(
             self.bundle, descriptors, turns_rad=views.turns_rad, places=wanted, fewest=self.clusters.views
         )
@@ -74,26 +81,42 @@ class Localizer:
         streets = (
             None if self.bundle.streets is None else vote(neighbours[: query.neighbours], self.clusters.temperature)
         )
+        found = perf_counter()
+        refined = None
+        if query.refine and self.bundle.cloud is not None:
+            refined = refine(
+                self.bundle.cloud, query.depth_m, query.camera, matches, R_level_camera=views.R_level_camera,
+                height_m=views.height_m, lidar_height_m=self.bundle.manifest.lidar_height_m, settings=self.refining,
+            )  # fmt: skip
         done = perf_counter()
-        T_map_camera = self._pose_of(hypotheses[0], views)
+        T_map_camera = self._pose_of(hypotheses[0], views) if refined is None else refined.T_map_camera
         return Answer(
             status="LOCALIZED",
             confidence=None,
+            street=self._street_of(T_map_camera, streets, registered=refined is not None),
             vote=streets,
             T_map_camera=T_map_camera,
-            covariance=None,
+            covariance=None if refined is None else refined.covariance,
+            registration=None if refined is None else refined.candidates,
             T_map_vehicle=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
-            neighbours=neighbours,
+            neighbours=neighbours[: max(query.neighbours, query.ranked)],
             hypotheses=hypotheses,
             measured_share=views.measured_share,
             height_m=views.height_m,
             timings=Timings(
                 fuse_ms=1e3 * (fused - started),
                 encode_ms=1e3 * (encoded - fused),
-                search_ms=1e3 * (done - encoded),
+                search_ms=1e3 * (found - encoded),
+                register_ms=0.0 if refined is None else 1e3 * (done - found),
                 total_ms=1e3 * (done - started),
             ),
         )
+
+    def _street_of(self, T_map_camera: Transform, voted: StreetVote | None, *, registered: bool) -> int:
+        """A metric position says which street it lies in; a cluster of places does not know better than their vote."""
+        if self.bundle.streets is None or voted is None:
+            return -1
+        return self.bundle.streets.index_at(T_map_camera[:2, 3]) if registered else voted.street
 
     def _pose_of(self, hypothesis: Hypothesis, view: QueryViews) -> Transform:
         """The camera stands at the hypothesis, at its own height above the ground under the places' LiDAR."""

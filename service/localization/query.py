@@ -23,6 +23,7 @@ class Query:
         down_camera: direction of gravity in the camera frame, if an IMU measured it.
         T_vehicle_camera: where the camera sits, if the vehicle's pose is wanted too.
         neighbours: k, the number of distinct places that vote and are answered.
+        refine: register the picture on the map's cloud, where the map has one.
         ranked: answer at least this many places, beyond the k that vote; evaluation wants R@10.
     """
 
@@ -32,4 +33,5 @@ class Query:
     down_camera: Float64[NDArray[np.float64], "3"] | None = None
     T_vehicle_camera: Transform | None = None
     neighbours: int = 5
+    refine: bool = True
     ranked: int = 0

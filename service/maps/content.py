@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from service.imaging.view_grid import ViewGrid
+from service.registration.surfel_map import SurfelMap
 
 PLACES_FILE, VIEWS_FILE = "places.npy", "views.npy"
 ENCODER_FILE = "encoder.onnx"
@@ -37,7 +38,7 @@ class BundleContent:
         descriptors: unit vectors, a row a view.
         encoder: the ONNX file that made them.
         streets: GeoJSON, or None where the map knows no streets.
-        cloud: tiles of the voxel map by name; written as they are.
+        cloud: the prepared cloud, or None where there is nothing to register on.
         calibration: confidence calibration; empty until there is one.
         preview_webp: the map from above; may be empty.
         parameters: further numbers the map was built with; ``lidar_height_m`` must be there.
@@ -56,7 +57,7 @@ class BundleContent:
     encoder: bytes
     parameters: Mapping[str, float]
     streets: Mapping[str, Any] | None = None
-    cloud: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    cloud: SurfelMap | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
     preview_webp: bytes = b""
     georeference: Mapping[str, Any] | None = None

@@ -10,7 +10,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationErro
 from service.errors import BundleError
 from service.imaging.view_grid import ViewGrid
 
-FORMAT = 1
+FORMAT = 2
 FILE = "manifest.json"
 #: Parts of the manifest that say when and with what a bundle was made, not what is in it.
 _CIRCUMSTANCES = {"version", "made_at", "tool_versions"}
@@ -56,7 +56,7 @@ class FileEntry(_Frozen):
 class Manifest(_Frozen):
     """The first file that is read and the last that is written."""
 
-    format: Literal[1]
+    format: Literal[2]
     name: Name
     version: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
     made_at: AwareDatetime

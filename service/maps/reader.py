@@ -18,6 +18,7 @@ from service.maps.index import ViewIndex
 from service.maps.manifest import Manifest, read_manifest
 from service.maps.streets import Streets
 from service.maps.writer import sha256_of
+from service.registration.surfel_map import SurfelMap
 
 _NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, parts.CALIBRATION_FILE)
 _REMEDY = "copy or build the bundle again"
@@ -36,7 +37,7 @@ class MapBundle:
     view_index: ViewIndex
     streets: Streets | None
     calibration: Mapping[str, Any]
-    cloud: Mapping[str, NDArray[Any]]
+    cloud: SurfelMap | None
 
     @classmethod
     def open(cls, path: Path, *, verify: bool = True) -> "MapBundle":
@@ -61,7 +62,7 @@ class MapBundle:
             view_index=ViewIndex.open(path / index.FILE),
             streets=_streets(path, manifest),
             calibration=_json_object(path / parts.CALIBRATION_FILE),
-            cloud=_cloud(path, manifest),
+            cloud=_cloud(path, manifest, verify=verify),
         )
         _require_consistent(bundle)
         return bundle
@@ -149,10 +150,16 @@ def _streets(path: Path, manifest: Manifest) -> Streets | None:
     return Streets.from_geojson(_json_object(path / streets.FILE))
 
 
-def _cloud(path: Path, manifest: Manifest) -> dict[str, NDArray[Any]]:
+def _cloud(path: Path, manifest: Manifest, *, verify: bool) -> SurfelMap | None:
     prefix, suffix = f"{parts.CLOUD_FOLDER}/", ".npy"
     names = [name for name in manifest.files if name.startswith(prefix) and name.endswith(suffix)]
-    return {name.removeprefix(prefix).removesuffix(suffix): _load(path / name, expected=None) for name in names}
+    if not names:
+        return None
+    arrays = {name.removeprefix(prefix).removesuffix(suffix): _load(path / name, expected=None) for name in names}
+    try:
+        return SurfelMap.from_arrays(arrays, verify=verify)
+    except BundleError as error:
+        raise BundleError(f"{path}/{error}", field=error.field) from error
 
 
 def _require_consistent(bundle: MapBundle) -> None:
@@ -163,7 +170,7 @@ def _require_consistent(bundle: MapBundle) -> None:
         parts.VIEWS_FILE: (len(bundle.views), counts.views, "views"),
         index.FILE: (len(bundle.view_index), counts.views, "descriptors"),
         streets.FILE: (streets_found, counts.streets, "streets"),
-        parts.CLOUD_FOLDER: (sum(len(tile) for tile in bundle.cloud.values()), counts.cloud_points, "points"),
+        parts.CLOUD_FOLDER: (0 if bundle.cloud is None else len(bundle.cloud.surfels), counts.cloud_points, "points"),
     }
     for name, (has, expected, what) in found.items():
         if has != expected:

@@ -74,8 +74,8 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
         writers[parts.PREVIEW_FILE] = lambda path: path.write_bytes(content.preview_webp)
     if content.streets is not None:
         writers[streets.FILE] = lambda path: path.write_bytes(_json(content.streets))
-    for name, tile in content.cloud.items():
-        writers[f"{parts.CLOUD_FOLDER}/{name}.npy"] = _tile_writer(tile)
+    for name, array in ({} if content.cloud is None else content.cloud.arrays()).items():
+        writers[f"{parts.CLOUD_FOLDER}/{name}.npy"] = _array_writer(array)
     for name, write in writers.items():
         write(folder / name)
         _sync(folder / name)
@@ -86,8 +86,8 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
     return made
 
 
-def _tile_writer(tile: NDArray[Any]) -> Callable[[Path], None]:
-    return lambda path: np.save(path, tile, allow_pickle=False)
+def _array_writer(array: NDArray[Any]) -> Callable[[Path], None]:
+    return lambda path: np.save(path, array, allow_pickle=False)
 
 
 def _json(document: object) -> bytes:
@@ -125,7 +125,7 @@ def _counts_of(content: BundleContent) -> Counts:
         places=len(content.T_map_place),
         views=len(content.view_place),
         descriptor_size=content.descriptors.shape[1],
-        cloud_points=sum(len(tile) for tile in content.cloud.values()),
+        cloud_points=0 if content.cloud is None else len(content.cloud.surfels),
         streets=0 if content.streets is None else len(content.streets.get("features", ())),
     )
 
@@ -133,7 +133,6 @@ def _counts_of(content: BundleContent) -> Counts:
 def _require_valid(content: BundleContent) -> None:
     """Refuse what would be refused again on opening, before hours of work are on the disk."""
     named = 0 if content.streets is None else len(streets.Streets.from_geojson(content.streets))
-    tiles = [name for name in content.cloud if not manifest.is_confined(name) or "/" in name]
     if content.rows_seen.shape != (content.grid.rows,):
         what = f"rows_seen has {len(content.rows_seen)} entries for {content.grid.rows} rows"
     elif len(content.T_map_place) == 0 or len(content.view_place) == 0:
@@ -146,11 +145,9 @@ def _require_valid(content: BundleContent) -> None:
         what = "a descriptor or a pose is not finite"
     elif "lidar_height_m" not in content.parameters:
         what = "parameters lacks lidar_height_m"
-    elif tiles:
-        what = f"{tiles[0]!r} is no name for a tile"
-    elif any(tile.dtype.hasobject for tile in content.cloud.values()):
-        what = "a tile of the cloud holds Python objects"
     else:
+        if content.cloud is not None:
+            content.cloud.require_consistent()
         return
     raise BundleError(f"the map {content.name!r} contradicts itself: {what}; mend what builds it")
 

@@ -38,6 +38,7 @@ class EncodedQuery:
     down_camera: NDArray[np.float64] | None = None
     T_vehicle_camera: NDArray[np.float64] | None = None
     neighbours: int = 5
+    refine: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,4 +116,5 @@ class Engine:
             down_camera=encoded.down_camera,
             T_vehicle_camera=encoded.T_vehicle_camera,
             neighbours=encoded.neighbours,
+            refine=encoded.refine,
         )

@@ -32,7 +32,7 @@ def test_every_query_gets_the_answer_that_the_localizer_gives(localizer, small_d
         )
         np.testing.assert_allclose(found.T_answer[k], answer.T_map_camera)
         np.testing.assert_allclose(found.ranked_xy[k, 0], answer.neighbours[0].position_m[:2])
-        assert found.street_answer[k] == answer.vote.street
+        assert found.street_answer[k] == answer.street
 
 
 def test_truth_is_the_datasets(localizer, small_dataset):

@@ -39,13 +39,20 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     assert answer["street"] | {"vote": 1} == {
         "id": "s2", "name": "End of street 2", "street": "2", "section": "end", "class_index": 2, "vote": 1,
     }  # fmt: skip
-    assert answer["pose"]["position"]["x"] == pytest.approx(20, abs=0.05)
+    assert answer["pose"]["position"]["x"] == pytest.approx(20, abs=0.3)
     assert answer["pose"]["heading_deg"] == pytest.approx(90, abs=1)
-    assert answer["pose"]["covariance"] is None
+    assert len(answer["pose"]["covariance"]) == 36
     assert answer["map"]["name"] == "tiny"
     assert list(answer["timings_ms"]) == ["decode", "fuse", "encode", "search", "register", "total"]
     assert answer["neighbours"][0]["street"] == "s2"
     assert len(answer["neighbours"]) == 5
+
+
+def test_without_registration_there_is_no_covariance(client: httpx.Client, parts_of: Parts) -> None:
+    answer = post(client, parts_of(options={"refine": False})).json()
+    assert answer["pose"]["covariance"] is None
+    assert answer["timings_ms"]["register"] == 0
+    assert answer["pose"]["position"]["x"] == pytest.approx(20, abs=0.05)
 
 
 def test_as_many_neighbours_as_asked_for(client: httpx.Client, parts_of: Parts) -> None:

@@ -40,12 +40,47 @@ def test_a_query_finds_the_place_where_it_was_taken(localizer: Localizer, query:
     assert (answer.status, answer.vote.street) == ("LOCALIZED", 2)
 
 
-def test_the_pose_stands_at_the_place_at_the_cameras_own_height(localizer: Localizer, query: Query) -> None:
-    answer = localizer.localize(query)
+def test_without_registration_the_pose_stands_at_the_place_at_the_cameras_own_height(
+    localizer: Localizer, query: Query
+) -> None:
+    answer = localizer.localize(replace(query, refine=False))
+    assert (answer.covariance, answer.registration, answer.timings.register_ms) == (None, None, 0.0)
+    assert answer.vote is not None
+    assert answer.street == answer.vote.street
     # The place's LiDAR is at (20, 100, 2), 1.8 m above the ground; the camera 1.5 m.
     np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, 100, 0.2 + answer.height_m], atol=0.05)
     assert answer.height_m == pytest.approx(1.5, abs=0.05)
     assert np.rad2deg(heading_of_camera(answer.T_map_camera)) == pytest.approx(90, abs=1)
+
+
+def test_with_registration_the_pose_is_where_the_picture_was_taken(localizer: Localizer, query: Query) -> None:
+    answer = localizer.localize(query)
+    assert answer.registration is not None
+    assert answer.covariance is not None
+    assert answer.registration[0].inliers > 0.8
+    np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, 100, 1.7], atol=0.3)
+    assert np.rad2deg(heading_of_camera(answer.T_map_camera)) == pytest.approx(90, abs=1)
+    np.testing.assert_allclose(answer.covariance, answer.covariance.T)
+    assert (np.linalg.eigvalsh(answer.covariance) > 0).all()
+
+
+def test_a_registered_position_says_which_street_it_lies_in(
+    content_of: Callable[..., BundleContent], content: BundleContent, tmp_path: Path, query: Query
+) -> None:
+    """All places are said to lie in street 0; the picture's own position lies in street 2."""
+    write_bundle(tmp_path / "m", content_of(place_street=np.zeros(12, np.int32)))
+    localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
+    registered, voted = (localizer.localize(replace(query, refine=refine)) for refine in (True, False))
+    assert (registered.street, voted.street) == (2, 0)
+
+
+def test_a_map_without_a_cloud_answers_by_retrieval(
+    content_of: Callable[..., BundleContent], tmp_path: Path, query: Query
+) -> None:
+    write_bundle(tmp_path / "m", content_of(cloud=None))
+    answer = Localizer.open(MapBundle.open(tmp_path / "m")).localize(query)
+    assert answer.covariance is None
+    assert answer.neighbours[0].place == 8
 
 
 def test_the_camera_axis_lies_level_where_the_camera_is_level(localizer: Localizer, query: Query) -> None:
@@ -115,8 +150,9 @@ def test_no_depth_is_an_error_of_its_own(localizer: Localizer, query: Query) -> 
 
 def test_the_stages_times_sum_to_the_total(localizer: Localizer, query: Query) -> None:
     times = localizer.localize(query).timings
-    assert times.fuse_ms + times.encode_ms + times.search_ms == pytest.approx(times.total_ms)
-    assert min(times.fuse_ms, times.encode_ms, times.search_ms) > 0
+    stages = (times.fuse_ms, times.encode_ms, times.search_ms, times.register_ms)
+    assert sum(stages) == pytest.approx(times.total_ms)
+    assert min(stages) > 0
 
 
 def test_a_view_found_at_two_turns_is_kept_once_at_the_better_one_and_its_heading_less_that_turn(bundle_path):

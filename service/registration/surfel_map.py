@@ -1,0 +1,124 @@
+"""The prepared cloud of a map: surfels, the tiles they are sorted by, and two grids of nearest surfels.
+
+All of it is made when the map is built and read as it lies on the disk; a request builds nothing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.errors import BundleError
+from service.registration.kernel import BLOCK, SURFEL, NearestGrid, nearest_grid
+
+#: Cells of the grids and how far from a surface they reach, metres: the fine one for the end, the coarse one for the start.
+FINE_CELL_M, FINE_REACH_M = 0.4, 1.2
+COARSE_CELL_M, COARSE_REACH_M = 0.9, 2.7
+
+
+_FLOATS, _NUMBERS = np.dtype("<f8"), np.dtype("<i4")
+#: Type and shape of every array; -1 is any length.
+_EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+    "origin": (_FLOATS, (3,)), "surfels": (SURFEL, (-1,)), "tiles": (_FLOATS, (-1, 4)),
+    "coarse_frame": (_FLOATS, (4,)), "coarse_block": (_NUMBERS, (-1, -1, -1)), "coarse_nearest": (_NUMBERS, (-1, BLOCK**3)),
+    "fine_frame": (_FLOATS, (4,)), "fine_block": (_NUMBERS, (-1, -1, -1)), "fine_nearest": (_NUMBERS, (-1, BLOCK**3)),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfelMap:
+    """Surfels relative to ``origin_m`` (map frame), what prepares them for a request, and their tiles for drawing.
+
+    Attributes:
+        origin_m: of the surfels' frame, map frame.
+        surfels: of dtype ``SURFEL``, sorted by tile.
+        tiles: centre x, y (the surfels' frame, m), first surfel, count.
+        coarse: grid with a wide reach.
+        fine: grid with a narrow one.
+    """
+
+    origin_m: Float64[NDArray[np.float64], "3"]
+    surfels: NDArray[Any]
+    tiles: Float64[NDArray[np.float64], "n 4"]
+    coarse: NearestGrid
+    fine: NearestGrid
+
+    @classmethod
+    def prepare(
+        cls, origin_m: Float64[NDArray[np.float64], "3"], surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"]
+    ) -> "SurfelMap":  # fmt: skip
+        """Build the grids; seconds for a district."""
+        return cls(
+            origin_m,
+            surfels,
+            tiles,
+            nearest_grid(surfels, cell_m=COARSE_CELL_M, reach_m=COARSE_REACH_M),
+            nearest_grid(surfels, cell_m=FINE_CELL_M, reach_m=FINE_REACH_M),
+        )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What is written, by name; ``from_arrays`` reads it again."""
+        found: dict[str, NDArray[Any]] = {"origin": self.origin_m, "surfels": self.surfels, "tiles": self.tiles}
+        for name, grid in (("coarse", self.coarse), ("fine", self.fine)):
+            found[f"{name}_frame"] = np.array([*grid.origin_m, grid.cell_m])
+            found[f"{name}_block"], found[f"{name}_nearest"] = grid.block, grid.nearest
+        return found
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], *, verify: bool = True) -> "SurfelMap":
+        """Put read or memory-mapped arrays together.
+
+        Args:
+            arrays: as ``arrays`` gave them.
+            verify: look at every index: the kernel trusts them.
+
+        Raises:
+            BundleError: an array is missing, of another type or shape, or points outside another; its name is given.
+        """
+        for name, (dtype, shape) in _EXPECTED.items():
+            if name not in arrays:
+                raise _defect(name, "it is missing")
+            array = arrays[name]
+            fits = len(shape) == array.ndim and all(w in (-1, has) for w, has in zip(shape, array.shape, strict=True))
+            if array.dtype != dtype or not fits or not array.flags["C_CONTIGUOUS"]:
+                raise _defect(name, f"it holds {array.dtype} of shape {array.shape}")
+        grids = [
+            NearestGrid(frame[:3], float(frame[3]), arrays[f"{name}_block"], arrays[f"{name}_nearest"])
+            for name in ("coarse", "fine")
+            for frame in [np.array(arrays[f"{name}_frame"])]
+        ]
+        found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), *grids)
+        if verify:
+            found.require_consistent()
+        return found
+
+    def require_consistent(self) -> None:
+        """Refuse indices that point outside, and numbers that are none.
+
+        Raises:
+            BundleError: naming the array.
+        """
+        for name, grid in (("coarse", self.coarse), ("fine", self.fine)):
+            if not np.isfinite(grid.origin_m).all() or not grid.cell_m > 0:
+                raise _defect(f"{name}_frame", "it is no frame")
+            _require_indices(f"{name}_block", grid.block, len(grid.nearest))
+            _require_indices(f"{name}_nearest", grid.nearest, len(self.surfels))
+        first, count = self.tiles[:, 2], self.tiles[:, 3]
+        if not np.isfinite(self.tiles).all() or (first < 0).any() or (count < 0).any():
+            raise _defect("tiles", "a number makes no sense")
+        if len(self.tiles) and (first + count).max() > len(self.surfels):
+            raise _defect("tiles", "a tile ends beyond the surfels")
+        if not np.isfinite(self.surfels["xyz"]).all():
+            raise _defect("surfels", "a position is not finite")
+
+
+def _require_indices(name: str, indices: NDArray[np.int32], count: int) -> None:
+    if indices.size and (int(indices.min()) < -1 or int(indices.max()) >= count):
+        raise _defect(name, f"it points outside the {count} there are")
+
+
+def _defect(name: str, what: str) -> BundleError:
+    return BundleError(f"cloud/{name}.npy: {what}; copy or build the bundle again", field=f"cloud/{name}.npy")
