@@ -32,7 +32,7 @@ TRUE_PLACE, TRUE_HEADING = 8, 1
 def make_encoder(*, seed: int = 0, size: int = DESCRIPTOR_SIZE) -> bytes:
     """A random projection with the inputs and the output of a real encoder."""
     helper, numpy_helper, floats = onnx.helper, onnx.numpy_helper, onnx.TensorProto.FLOAT
-    flat = 5 * GRID.rows * GRID.columns
+    flat = 6 * GRID.rows * GRID.columns
     weights = np.random.default_rng(seed).normal(size=(flat, size)).astype(np.float32)
     nodes = [
         helper.make_node("Flatten", ["planes"], ["flat"], axis=1),
@@ -46,7 +46,7 @@ def make_encoder(*, seed: int = 0, size: int = DESCRIPTOR_SIZE) -> bytes:
         nodes,
         "tiny",
         [
-            helper.make_tensor_value_info("planes", floats, ["B", 5, GRID.rows, GRID.columns]),
+            helper.make_tensor_value_info("planes", floats, ["B", 6, GRID.rows, GRID.columns]),
             helper.make_tensor_value_info("side", floats, ["B"]),
         ],
         [helper.make_tensor_value_info("descriptor", floats, ["B", size])],
