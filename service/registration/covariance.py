@@ -5,10 +5,11 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 #: The points of one picture err together (correlated disparities, the survey's own pose error), so they know far less than
-#: their number says. Standard deviations are this many times what independent points would give, and never less than the floor;
-#: both measured on watch city 2002 (decision log), to be checked on others.
+#: their number says: standard deviations are this many times what independent points would give, and never less than the floor.
+#: Watch city 2002, 400 queries a preset, those within 1 m: the 95 % ellipsoid of the position holds 97 % (precise) and 92 %
+#: (stereo) of the truths, that of the full pose 98 and 91 %; without inflation 62 and 31 %.
 INFLATION = 4.0
-FLOOR_M = 0.02
+FLOOR_M = 0.03
 FLOOR_RAD = float(np.deg2rad(0.05))
 #: What is known beside the points, weakly: position, height, tilt, heading, scale (log), disparity offset.
 _PRIOR_SIGMA = np.array([30.0, 30.0, 0.3, *np.deg2rad([2.0, 2.0, 10.0]), 0.01, 0.3])
