@@ -16,8 +16,9 @@ FLAGS = ["-O3", "-std=c11", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
 def compiler() -> list[str] | None:
     """The C compiler of this machine, ``CC`` first; None where there is none."""
     for name in (os.environ.get("CC"), "cc", "gcc", "clang"):
-        if name and shutil.which(name.split()[0]):
-            return name.split()
+        words = (name or "").split()
+        if words and shutil.which(words[0]):
+            return words
     return None
 
 

@@ -137,7 +137,7 @@ def build_map(
         T_map_place=T_map_level, place_street=_streets_of(streets, T_map_level),
         view_place=np.repeat(np.arange(len(kept), dtype=np.int32), settings.headings), view_heading_rad=np.concatenate(headings),
         descriptors=np.concatenate(descriptors), encoder=encoder_file.read_bytes(), streets=streets,
-        cloud=SurfelMap.prepare(cloud.origin, *cloud.tiles(surfels)),
+        cloud=SurfelMap.prepare(cloud.origin, *cloud.tiles(surfels)) if len(surfels.positions) else None,
         preview_webp=preview_webp(surfels.positions, surfels.normals, T_map_level[:, :3, 3]),
         georeference=dataset.description.georeference,
         calibration={"calibrated": False, "why": "this release does not calibrate confidence yet; answers carry confidence null"},

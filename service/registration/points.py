@@ -43,9 +43,14 @@ class PointSettings:
     movable_m: float = 2.0
     movable_weight: float = 0.1
 
+    def __post_init__(self) -> None:
+        """Refuse a share that would leave no point above the ground."""
+        if not 0 <= self.ground_share < 1:
+            raise ValueError(f"ground_share: {self.ground_share:g} is not at least 0 and less than 1")
+
 
 def inverse_depth_noise(depth_m: Float32[NDArray[np.float32], "H W"]) -> float:
-    """Standard deviation of one pixel's inverse depth, 1/m: from second differences along rows and columns."""
+    """Standard deviation of one pixel's inverse depth, 1/m: from second differences along rows."""
     picture = depth_m[::2]
     valid = picture > 0
     inverse = np.where(valid, 1.0 / np.where(valid, picture, 1), 0).astype(np.float32)
@@ -85,13 +90,16 @@ def points_of(
     enough = count >= max(1, (samples.shape[1] + 1) // 2)
     at = np.arange(len(inverse))
     pick = [inverse[at, np.maximum((share * (count - 1)).astype(int), 0)] for share in (0.1, 0.5, 0.9)]
+    # The median of an even number lies between the two middle ones: the lower alone would push every surface away.
+    pick[1] = 0.5 * (pick[1] + inverse[at, np.maximum(count // 2, 0)])
     low, middle, high = (np.where(enough, p, 1.0) for p in pick)
     noise = inverse_depth_noise(depth_m)
     spread = (high - low) - 2.56 * noise
     z = (1.0 / middle).astype(np.float32)
     keep = enough & (spread < settings.edge * middle) & (z < settings.reach_m)
     v, u = np.divmod(at, columns)
-    u, v = (u + 0.5) * size - 0.5, (v + 0.5) * size - 0.5
+    centre_px = float(np.arange(0, size, skip).mean())  # of the pixels that were read, not of the block
+    u, v = u * size + centre_px, v * size + centre_px
     rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
     length = np.linalg.norm(rays, axis=1)
     sigma = np.hypot(z**2 * noise * np.sqrt(1 + settings.correlated) * length, settings.floor_m)

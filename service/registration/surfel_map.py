@@ -111,8 +111,11 @@ class SurfelMap:
             raise _defect("tiles", "a number makes no sense")
         if len(self.tiles) and (first + count).max() > len(self.surfels):
             raise _defect("tiles", "a tile ends beyond the surfels")
-        if not np.isfinite(self.surfels["xyz"]).all():
-            raise _defect("surfels", "a position is not finite")
+        if not np.isfinite(self.origin_m).all():
+            raise _defect("origin", "a coordinate is not finite")
+        for name in ("xyz", "normal", "thickness_m"):
+            if not np.isfinite(self.surfels[name]).all():
+                raise _defect("surfels", f"a number of {name} is not finite")
 
 
 def _require_indices(name: str, indices: NDArray[np.int32], count: int) -> None:

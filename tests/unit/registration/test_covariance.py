@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.geometry.rigid import rotation_z
+from service.registration.covariance import FLOOR_M, FLOOR_RAD, INFLATION, covariance_of
+from service.registration.surfel_map import SurfelMap
+
+PRIOR_SIGMA = np.array([30.0, 30.0, 0.3, *np.deg2rad([2.0, 2.0, 10.0])])
+
+
+def random_information(seed, rows, scale):
+    """Of so many points of random gradients."""
+    gradients = np.random.default_rng(seed).normal(size=(rows, 8))
+    return scale * gradients.T @ gradients
+
+
+informations = st.builds(
+    random_information, st.integers(0, 10**6), st.integers(0, 20), st.sampled_from([1.0, 1e3, 1e6])
+)
+
+
+@given(informations)
+def test_a_covariance_is_symmetric_and_positive_definite(information):
+    found = covariance_of(information)
+    np.testing.assert_array_equal(found, found.T)
+    assert np.linalg.eigvalsh(found).min() >= 0.99 * FLOOR_RAD**2
+
+
+@given(informations, informations)
+def test_more_information_means_less_variance_in_every_direction(information, more):
+    gained = covariance_of(information) - covariance_of(information + more)
+    assert np.linalg.eigvalsh(gained).min() > -1e-6
+
+
+def test_more_information_about_every_unknown_means_strictly_less_variance():
+    information = random_information(1, 20, 1e3)
+    variances = [np.diag(covariance_of(factor * information)) for factor in (1, 4, 16)]
+    assert (variances[0] > variances[1]).all()
+    assert (variances[1] > variances[2]).all()
+
+
+def test_without_information_what_is_known_beside_the_points_remains():
+    expected = np.diag(PRIOR_SIGMA**2 + np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
+    np.testing.assert_allclose(covariance_of(np.zeros((8, 8))), expected, rtol=1e-9)
+
+
+def test_endless_information_leaves_the_floor():
+    expected = np.diag(np.repeat([FLOOR_M**2, FLOOR_RAD**2], 3))
+    np.testing.assert_allclose(covariance_of(1e15 * np.eye(8)), expected, rtol=1e-3, atol=1e-12)
+
+
+def test_deviations_are_inflated_over_those_of_independent_points():
+    """A centimetre of independent points is four of ours, and two of the floor."""
+    found = covariance_of(1e4 * np.eye(8))
+    assert np.sqrt(found[0, 0]) == pytest.approx(np.hypot(INFLATION * 0.01, FLOOR_M), rel=1e-3)
+    assert INFLATION >= 1
+
+
+def test_an_unknown_scale_costs_certainty():
+    """Points that only know the sum of x and the log scale know x no better than the scale, by 0.01."""
+    information = np.zeros((8, 8))
+    information[np.ix_([0, 6], [0, 6])] = 1e8
+    x = covariance_of(information)[0, 0]
+    assert np.sqrt(x - FLOOR_M**2) == pytest.approx(0.01, rel=0.01)
+
+
+@pytest.mark.parametrize("heading_deg", [0, 30, 120])
+def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_at, settle, heading_deg):
+    R = rotation_z(np.deg2rad(heading_deg))
+    flat = [
+        ((-30, -4, 0), (60, 0, 0), (0, 8, 0)),
+        ((-30, -4, 0), (60, 0, 0), (0, 0, 6)),
+        ((-30, 4, 0), (60, 0, 0), (0, 0, 6)),
+    ]
+    corridor = scene_of(*(tuple(R @ np.array(each, float) for each in rectangle) for rectangle in flat))
+    surfels = corridor.surfels(0.5)
+    cloud = SurfelMap.prepare(np.zeros(3), surfels, np.array([[0.0, 0, 0, len(surfels)]]))
+    camera = np.array([0, 0, 1.5])
+    points = corridor.points(R, camera)
+    state = settle(cloud, points.subset(np.flatnonzero(np.linalg.norm(points.xyz, axis=1) < 25)), start_at(R, camera))
+    found = covariance_of(state["information"][0])
+    variances, axes = np.linalg.eigh(found[:3, :3])
+    assert abs(axes[:, 2] @ R[:, 0]) > 0.999
+    assert variances[2] > 1000 * variances[1]
+    assert np.sqrt(variances[1]) < 0.05

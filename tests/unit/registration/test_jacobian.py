@@ -1,0 +1,121 @@
+"""The kernel's derivatives against numerical ones, on surfels so lonely that every point keeps its own."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, nearest_grid
+
+UNKNOWNS = ["x", "y", "z", "roll", "pitch", "yaw", "log scale", "disparity offset"]
+FREE = {"reach": 1.0, "robust_first": 1e6, "robust_last": 1e6, "prior_weight": 0.0, "free_offset": True}
+
+
+class Problem:
+    """64 surfels 4 m apart with any normals, one point near each, and the pose, scale and offset that put it there."""
+
+    def __init__(self, seed, *, off_m=0.0):
+        rng = np.random.default_rng(seed)
+        cells = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), axis=-1).reshape(-1, 3)
+        self.surfels = np.zeros(len(cells), SURFEL)
+        self.surfels["xyz"] = 4 * cells + rng.uniform(-0.5, 0.5, cells.shape)
+        normals = rng.normal(size=cells.shape)
+        self.surfels["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        self.surfels["thickness_m"] = rng.uniform(0, 0.05, len(cells))
+        self.grid = nearest_grid(self.surfels, cell_m=0.3, reach_m=1.2)
+        self.R = Rotation.random(random_state=seed).as_matrix()
+        self.t = rng.uniform(-3, 15, 3)
+        self.log_scale, self.offset = rng.uniform(-0.05, 0.05), rng.uniform(-0.1, 0.1)
+        q = rng.uniform(0, 1, len(cells))
+        stretch = np.exp(self.log_scale) / (1 + self.offset * q)
+        there = self.surfels["xyz"] + rng.uniform(-off_m, off_m, cells.shape)
+        rays, f = rng.normal(size=cells.shape), np.float32
+        self.points = QueryPoints(
+            ((there - self.t) @ self.R / stretch[:, None]).astype(f),
+            (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(f),
+            rng.uniform(0.01, 0.1, len(cells)).astype(f), rng.uniform(0.5, 2, len(cells)).astype(f), q.astype(f),
+        )  # fmt: skip
+
+    def residuals(self, change):
+        """Distance of each point from its surfel's plane after the unknowns changed by so much."""
+        R = Rotation.from_rotvec(change[3:6]).as_matrix() @ self.R
+        stretch = np.exp(self.log_scale + change[6]) / (1 + (self.offset + change[7]) * self.points.q.astype(float))
+        there = stretch[:, None] * self.points.xyz.astype(float) @ R.T + self.t + change[:3]
+        return ((there - self.surfels["xyz"]) * self.surfels["normal"].astype(float)).sum(axis=1)
+
+    def jacobian(self):
+        steps = 1e-5 * np.eye(8)
+        return np.stack([(self.residuals(step) - self.residuals(-step)) / 2e-5 for step in steps], axis=1)
+
+    def weights(self, surface_m):
+        along = self.points.sigma * (self.surfels["normal"] * (self.points.ray @ self.R.T)).sum(axis=1)
+        return self.points.weight / (along**2 + surface_m**2 + self.surfels["thickness_m"] ** 2)
+
+    def aligned(self, start_at, *, change=None, **options):
+        change = np.zeros(8) if change is None else change
+        R = Rotation.from_rotvec(change[3:6]).as_matrix() @ self.R
+        state = start_at(R, self.t + change[:3], log_scale=self.log_scale + change[6], offset=self.offset + change[7])
+        align(self.grid, self.surfels, self.points, state, SolverOptions(**(FREE | options)))
+        return state[0]
+
+    def away(self, state):
+        """The unknowns of a state less the true ones."""
+        turn = Rotation.from_matrix(state["R"] @ self.R.T).as_rotvec()
+        return np.array(
+            [*(state["t"] - self.t), *turn, state["log_scale"] - self.log_scale, state["offset"] - self.offset]
+        )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_information_is_that_of_numerical_derivatives(start_at, seed):
+    problem = Problem(seed, off_m=0.3)
+    J = problem.jacobian()
+    expected = J.T * problem.weights(0.05) @ J
+    found = problem.aligned(start_at, iterations=1, surface=0.05)["information"]
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-5)
+    coupled = np.abs(expected / scale) - np.eye(8)
+    assert (coupled.max(axis=1) > 0.1).all()  # or a sign could hide
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_is_that_of_gauss_and_newton(start_at, seed):
+    problem = Problem(seed, off_m=0.05)
+    J, w = problem.jacobian(), problem.weights(0.05)
+    damped = J.T * w @ J + np.diag([0, 0, 0, *[1e-3 * len(w)] * 3, 0, 0])
+    expected = np.linalg.solve(damped, -J.T @ (w * problem.residuals(np.zeros(8))))
+    found = problem.away(problem.aligned(start_at, iterations=1, surface=0.05))
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
+    assert np.abs(expected).min() > 1e-4
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("unknown", range(8), ids=UNKNOWNS)
+def test_a_small_change_of_one_unknown_is_undone_in_one_step(start_at, unknown, sign):
+    problem = Problem(9)
+    size = [0.02, 0.02, 0.02, 0.002, 0.002, 0.002, 0.002, 0.005][unknown]
+    change = sign * size * np.eye(8)[unknown]
+    found = problem.away(problem.aligned(start_at, change=change, iterations=1))
+    np.testing.assert_allclose(found, 0, atol=0.05 * size)
+
+
+def test_a_change_of_everything_is_undone_in_a_few_steps(start_at):
+    problem = Problem(10)
+    change = np.array([0.1, -0.1, 0.1, 0.01, -0.01, 0.01, 0.005, -0.02])
+    found = problem.away(problem.aligned(start_at, change=change, iterations=10))
+    np.testing.assert_allclose(found, 0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("robust_m", "expected"), [(1e6, 100.0), (0.3, 100 * (0.13 / 0.14) ** 2), (1e-6, 100 * (0.04 / 0.05) ** 2)]
+)
+def test_a_point_off_its_surface_informs_the_less_the_narrower_the_robust_width(
+    points_at, start_at, robust_m, expected
+):
+    """0.1 m off, variance 0.1^2: the width's square is 4 x 0.01 and the robust width's square."""
+    surfels = np.zeros(1, SURFEL)
+    surfels["normal"] = [1, 0, 0]
+    grid = nearest_grid(surfels, cell_m=0.3, reach_m=1.2)
+    state = start_at(np.eye(3), [-5, 0, 0])
+    options = SolverOptions(**(FREE | {"robust_first": robust_m, "robust_last": robust_m}), iterations=1, surface=0.1)
+    align(grid, surfels, points_at([[5.1, 0, 0]], sigma=0.0), state, options)
+    assert state["information"][0, 0, 0] == pytest.approx(expected, rel=1e-4)

@@ -1,0 +1,204 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_y
+from service.registration.points import PointSettings, inverse_depth_noise, points_of
+
+ALL = PointSettings(points=100_000, ground_share=0.5)
+HIGH_M = 100.0  # so high that no point is of the ground or of a vehicle
+
+
+def camera_of(width, height):
+    return PinholeCamera(width, height, 0.6 * width, 0.6 * width, (width - 1) / 2, (height - 1) / 2)
+
+
+def points_in(depth, settings=ALL, *, height_m=HIGH_M, R=R_BODY_OPTICAL, camera=None, **options):
+    camera = camera_of(*depth.shape[::-1]) if camera is None else camera
+    return points_of(depth.astype(np.float32), camera, R, height_m, settings, **options)
+
+
+def tilted_plane(width, height, *, noise=0.0, seed=0):
+    """Inverse depth that is linear in the pixel, about 0.1 1/m, and its noise."""
+    v, u = np.mgrid[:height, :width]
+    inverse = 0.1 + 0.03 * u / width - 0.02 * v / height
+    return (1 / (inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape))).astype(np.float32)
+
+
+def depths_of(points):
+    return points.xyz @ R_BODY_OPTICAL[:, 2].astype(np.float32)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 5e-4, 3e-3])
+def test_the_noise_of_the_inverse_depth_is_read_off_a_plane(noise):
+    assert inverse_depth_noise(tilted_plane(320, 240, noise=noise)) == pytest.approx(noise, rel=0.05)
+
+
+def test_a_faultless_plane_has_no_noise():
+    assert inverse_depth_noise(tilted_plane(320, 240)) < 1e-6
+
+
+def test_holes_and_edges_do_not_change_the_noise():
+    depth = tilted_plane(320, 240, noise=1e-3)
+    depth[:, 100:140] *= 0.5
+    depth[np.random.default_rng(1).uniform(size=depth.shape) < 0.2] = 0
+    assert inverse_depth_noise(depth) == pytest.approx(1e-3, rel=0.15)
+
+
+def test_too_few_pixels_tell_no_noise_and_a_quarter_of_a_disparity_is_taken():
+    depth = np.zeros((240, 320), np.float32)
+    depth[:8, :20] = tilted_plane(20, 8, noise=1e-3)
+    assert inverse_depth_noise(depth) == 0.25 / 80
+
+
+def test_every_block_gives_the_point_in_its_middle():
+    """A wall 10 m ahead of 8 x 6 px in blocks of 2: the first one's middle is the pixel (0.5, 0.5)."""
+    camera = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
+    found = points_in(np.full((6, 8), 10.0), PointSettings(columns=4), camera=camera, focal_baseline_px_m=50.0)
+    assert len(found) == 12
+    expected = [[10, 10 * (3.5 - u) / 5, 10 * (2.5 - v) / 5] for v in (0.5, 2.5, 4.5) for u in (0.5, 2.5, 4.5, 6.5)]
+    np.testing.assert_allclose(found.xyz, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.ray * np.linalg.norm(found.xyz, axis=1)[:, None], found.xyz, rtol=1e-5)
+    np.testing.assert_allclose(found.q, 0.2, rtol=1e-6)
+
+
+def test_points_stand_in_the_level_frame():
+    """Looking 10 degrees down at a wall square to the axis: the middle of the picture lies 10 m along the axis."""
+    R = rotation_y(np.deg2rad(10)) @ R_BODY_OPTICAL
+    found = points_in(np.full((5, 5), 10.0), camera=PinholeCamera(5, 5, 3.0, 3.0, 2.0, 2.0), R=R)
+    middle = found.xyz[12]
+    np.testing.assert_allclose(middle, [10 * np.cos(np.deg2rad(10)), 0, -10 * np.sin(np.deg2rad(10))], atol=1e-5)
+
+
+@pytest.mark.parametrize("columns", [80, 40, 20])
+def test_a_wall_square_to_the_axis_stays_flat_in_blocks_of_any_size(columns):
+    found = points_in(np.full((60, 80), 7.0), PointSettings(columns=columns))
+    np.testing.assert_allclose(depths_of(found), 7.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("width", [80, 160, 320, 640, 1280])
+def test_points_of_a_facade_along_the_road_lie_on_it_at_any_resolution(width):
+    camera = camera_of(width, width * 3 // 4)
+    rays = camera.rays_of_pixels()
+    facade = np.where(rays[..., 0] > 0.1, 4 / np.maximum(rays[..., 0], 0.1), 0)  # 4 m to the right
+    found = points_in(facade, camera=camera)
+    assert len(found) > 500
+    assert np.abs(found.xyz[:, 1] + 4).max() < 0.01
+
+
+def test_no_range_is_known_better_than_the_floor():
+    np.testing.assert_allclose(points_in(np.full((60, 80), 8.0)).sigma, ALL.floor_m, rtol=1e-3)
+
+
+def test_the_uncertainty_grows_with_the_square_of_the_depth():
+    depth = np.where(np.arange(80) < 40, 10.0, 20.0) * np.ones((60, 1))
+    depth = 1 / (1 / depth + np.random.default_rng(3).normal(0, 5e-4, depth.shape))
+    found = points_in(depth)
+    per_ray = np.sqrt(found.sigma**2 - ALL.floor_m**2) * depths_of(found) / np.linalg.norm(found.xyz, axis=1)
+    near = depths_of(found) < 15
+    at_10, at_20 = np.median(per_ray[near]), np.median(per_ray[~near])
+    assert at_20 == pytest.approx(4 * at_10, rel=0.05)
+    assert at_10 == pytest.approx(10**2 * 5e-4 * np.sqrt(2), rel=0.1)  # half of the variance is shared by neighbours
+
+
+def test_a_slanted_ray_is_as_uncertain_as_it_is_long():
+    depth = 1 / (0.1 + np.random.default_rng(4).normal(0, 1e-3, (60, 80)))
+    found = points_in(depth, PointSettings(points=100_000, ground_share=0.5, floor_m=0.0))
+    length = np.linalg.norm(found.xyz, axis=1)
+    np.testing.assert_allclose(found.sigma / (length * depths_of(found)), 1e-3 * np.sqrt(2), rtol=0.1)
+
+
+def test_blocks_on_an_edge_are_left_out():
+    """160 x 120 px in blocks of 4; the depth jumps within the 20th column of blocks."""
+    found = points_in(np.where(np.arange(160) < 78, 5.0, 10.0) * np.ones((120, 1)), PointSettings(columns=40))
+    assert len(found) == 39 * 30
+    assert set(np.round(depths_of(found), 4).tolist()) == {5.0, 10.0}
+
+
+def test_a_block_needs_half_of_its_pixels():
+    depth = np.full((120, 160), 5.0)
+    depth[0:2, 0:4] = 0  # 8 of 16 are left
+    depth[0:2, 4:8] = depth[3, 4] = 0  # 7 of 16
+    found = points_in(depth, PointSettings(columns=40))
+    assert len(found) == 40 * 30 - 1
+    np.testing.assert_allclose(depths_of(found), 5.0, rtol=1e-6)
+
+
+def test_an_empty_picture_gives_no_points():
+    assert len(points_in(np.zeros((60, 80)))) == 0
+
+
+@pytest.mark.parametrize(("depth_m", "count"), [(39.9, 4800), (40.1, 0)])
+def test_what_is_beyond_reach_is_left_out(depth_m, count):
+    assert len(points_in(np.full((60, 80), depth_m))) == count
+
+
+def over_a_road(height_m=1.5, wall_m=20.0):
+    """A wall across the road."""
+    down = np.maximum(camera_of(80, 60).rays_of_pixels()[..., 1], 1e-6)
+    return np.minimum(height_m / down, wall_m)
+
+
+def test_the_ground_has_its_share_of_the_points_at_most():
+    settings = PointSettings(points=400, ground_share=0.25)
+    found = points_in(over_a_road(), settings, height_m=1.5)
+    ground = found.xyz[:, 2] + 1.5 < 0.3
+    assert len(found) == 400
+    assert ground.sum() == 100
+
+
+def test_with_little_else_the_ground_has_fifty_points():
+    depth = over_a_road(wall_m=1000.0)
+    depth[:3] = 10.0
+    found = points_in(depth, PointSettings(points=1500), height_m=1.5)
+    ground = found.xyz[:, 2] + 1.5 < 0.3
+    assert (~ground).sum() == 3 * 80
+    assert ground.sum() == 3 * 80 / 3
+    depth[:3] = 1000.0
+    assert len(points_in(depth, PointSettings(points=1500), height_m=1.5)) == 50
+
+
+def test_the_points_are_spread_over_the_whole_picture():
+    found = points_in(np.full((60, 80), 10.0), PointSettings(points=100))
+    assert len(found) == 100
+    corners = 10 * np.array([39.5, 29.5]) / 48
+    assert (found.xyz[:, 1:].max(axis=0) > 0.9 * corners).all()
+    assert (found.xyz[:, 1:].min(axis=0) < -0.9 * corners).all()
+
+
+@given(
+    seed=st.integers(0, 10**6), most=st.integers(1, 3000), ground_share=st.floats(0, 0.95), height_m=st.floats(0.5, 3),
+    known=st.floats(0, 1),
+)  # fmt: skip
+@settings(max_examples=40)
+def test_there_are_never_more_points_than_wanted_and_no_two_alike(seed, most, ground_share, height_m, known):
+    rng = np.random.default_rng(seed)
+    depth = np.where(rng.uniform(size=(60, 80)) < known, over_a_road(height_m, rng.uniform(2, 50)), 0)
+    found = points_in(depth, PointSettings(points=most, ground_share=ground_share), height_m=height_m)
+    assert len(found) <= most
+    assert len(np.unique(found.ray, axis=0)) == len(found)
+
+
+def test_what_may_drive_away_weighs_less():
+    """Of a wall, what is between 0.3 and 2 m above the ground; the ground itself and what is higher weigh full."""
+    found = points_in(over_a_road(wall_m=8.0), height_m=1.5)
+    above_m = found.xyz[:, 2] + 1.5
+    movable = (above_m > 0.3) & (above_m < 2.0)
+    assert min(movable.sum(), (above_m > 2).sum(), (above_m < 0.3).sum()) > 50
+    np.testing.assert_allclose(found.weight, np.where(movable, 0.1, 1.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_depth_of_another_size_and_the_same_aspect_gives_the_same_points(factor):
+    small = np.where(np.arange(80) < 33, 5.0, 12.0) * np.ones((60, 1))
+    large = small.repeat(factor, axis=0).repeat(factor, axis=1)
+    expected = points_in(small, camera=camera_of(80, 60), height_m=1.5)
+    for depth, camera in ((large, camera_of(80, 60)), (large, camera_of(80 * factor, 60 * factor)),
+                          (small, camera_of(80 * factor, 60 * factor))):  # fmt: skip
+        found = points_in(depth, camera=camera.scaled_to(camera.width, camera.height), height_m=1.5)
+        for name in ("xyz", "ray", "sigma", "weight", "q"):
+            np.testing.assert_allclose(
+                getattr(found, name), getattr(expected, name), atol=2e-2 if name == "xyz" else 2e-3
+            )

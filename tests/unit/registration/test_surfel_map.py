@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+
+from service.errors import BundleError
+from service.registration.kernel import SURFEL, SolverOptions, align
+from service.registration.surfel_map import SurfelMap
+
+NAMES = ["origin", "surfels", "tiles", *(f"{g}_{a}" for g in ("coarse", "fine") for a in ("frame", "block", "nearest"))]
+
+
+@pytest.fixture(scope="module")
+def cloud(scene_of):
+    """Two floors in two tiles, 50 m apart."""
+    surfels = scene_of(((0, 0, 0), (3, 0, 0), (0, 3, 0)), ((50, 0, 0), (3, 0, 0), (0, 3, 0))).surfels()
+    half = len(surfels) // 2
+    tiles = np.array([[20.0, 20, 0, half], [60, 20, half, half]])
+    return SurfelMap.prepare(np.array([100.0, 200.0, 30.0]), surfels, tiles)
+
+
+@pytest.fixture
+def arrays(cloud):
+    """To damage."""
+    return {name: array.copy() for name, array in cloud.arrays().items()}
+
+
+def refused(arrays, name, what):
+    with pytest.raises(BundleError, match=rf"cloud/{name}\.npy: .*{what}.*copy or build the bundle again") as error:
+        SurfelMap.from_arrays(arrays)
+    assert error.value.field == f"cloud/{name}.npy"
+
+
+def test_what_is_written_is_read_again(cloud):
+    found = SurfelMap.from_arrays(cloud.arrays()).arrays()
+    assert sorted(found) == sorted(cloud.arrays()) == sorted(NAMES)
+    for name, array in cloud.arrays().items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == array.dtype
+
+
+def test_memory_mapped_arrays_register_like_those_in_memory(cloud, tmp_path, points_at, start_at):
+    for name, array in cloud.arrays().items():
+        np.save(tmp_path / f"{name}.npy", array)
+    mapped = SurfelMap.from_arrays({name: np.load(tmp_path / f"{name}.npy", mmap_mode="r") for name in NAMES})
+    assert isinstance(mapped.surfels, np.memmap)
+    assert isinstance(mapped.fine.nearest, np.memmap)
+    points = points_at([[1.0, 1, -1.4], [-1, 1, -1.4], [0.5, -1, -1.4], [-1, -1, -1.4]])
+    options = SolverOptions(iterations=5, reach=1.2, robust_first=1.0, robust_last=0.1)
+    states = [start_at(np.eye(3), [1.5, 1.5, 1.6]) for _ in range(2)]
+    for each, state in zip((cloud, mapped), states, strict=True):
+        align(each.fine, each.surfels, points, state, options)
+    assert states[0].tobytes() == states[1].tobytes()
+    assert states[0]["inliers"][0] > 0.9
+
+
+def test_the_coarse_grid_reaches_further_than_the_fine_one(cloud, points_at, start_at):
+    """2.7 and 1.2 m: a point that stands 2 m above the middle of a floor meets the coarse grid alone."""
+    once = SolverOptions(iterations=1, reach=5.0, robust_first=1.0, robust_last=1.0)
+    coarse, fine = (start_at(np.eye(3), [1.5, 1.5, 1.0]) for _ in range(2))
+    align(cloud.coarse, cloud.surfels, points_at([[0, 0, 1.0]]), coarse, once)
+    align(cloud.fine, cloud.surfels, points_at([[0, 0, 1.0]]), fine, once)
+    assert (coarse["seen"][0], fine["seen"][0]) == (1, 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_missing_array_is_named(arrays, name):
+    del arrays[name]
+    refused(arrays, name, "it is missing")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_array_of_another_type_is_named(arrays, name):
+    arrays[name] = np.zeros(arrays[name].shape, np.float32)
+    refused(arrays, name, "it holds float32")
+
+
+@pytest.mark.parametrize("name", ["origin", "coarse_frame", "fine_block", "fine_nearest"])
+def test_numbers_of_another_byte_order_are_refused(arrays, name):
+    arrays[name] = arrays[name].astype(arrays[name].dtype.newbyteorder(">"))
+    refused(arrays, name, "it holds")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [("origin", (4,)), ("origin", (1, 3)), ("surfels", (2, 3)), ("tiles", (2, 3)), ("tiles", (8,)),
+     ("coarse_frame", (3,)), ("fine_frame", (5,)), ("coarse_block", (4, 4)), ("fine_block", (64,)),
+     ("coarse_nearest", (3, 511)), ("fine_nearest", (3, 8, 8, 8))],
+)  # fmt: skip
+def test_an_array_of_another_shape_is_named(arrays, name, shape):
+    arrays[name] = np.zeros(shape, arrays[name].dtype)
+    refused(arrays, name, "of shape")
+
+
+@pytest.mark.parametrize("name", ["tiles", "coarse_block", "fine_nearest"])
+def test_an_array_in_another_order_of_memory_is_named(arrays, name):
+    arrays[name] = np.asfortranarray(arrays[name])
+    refused(arrays, name, "of shape")
+
+
+@pytest.mark.parametrize("name", ["coarse_block", "coarse_nearest", "fine_block", "fine_nearest"])
+@pytest.mark.parametrize("beyond", [True, False])
+def test_an_index_that_points_outside_is_named(arrays, name, beyond):
+    among = arrays[name.replace("block", "nearest")] if "block" in name else arrays["surfels"]
+    arrays[name].flat[3] = len(among) if beyond else -2
+    refused(arrays, name, f"outside the {len(among)} there are")
+    arrays[name].flat[3] = len(among) - 1 if beyond else -1
+    assert len(SurfelMap.from_arrays(arrays).surfels) == len(arrays["surfels"])
+
+
+def test_a_tile_that_ends_beyond_the_surfels_is_refused(arrays):
+    arrays["tiles"][1, 3] += 1
+    refused(arrays, "tiles", "ends beyond")
+
+
+@pytest.mark.parametrize(("column", "value"), [(0, np.nan), (1, np.inf), (2, -1), (3, -1), (3, np.nan)])
+def test_a_tile_of_senseless_numbers_is_refused(arrays, column, value):
+    arrays["tiles"][0, column] = value
+    refused(arrays, "tiles", "makes no sense")
+
+
+@pytest.mark.parametrize("name", ["coarse_frame", "fine_frame"])
+@pytest.mark.parametrize(("entry", "value"), [(0, np.nan), (2, np.inf), (3, np.nan), (3, 0.0), (3, -0.4)])
+def test_a_frame_that_is_none_is_refused(arrays, name, entry, value):
+    arrays[name][entry] = value
+    refused(arrays, name, "it is no frame")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_surfel_that_is_nowhere_is_refused(arrays, value):
+    arrays["surfels"]["xyz"][5, 1] = value
+    refused(arrays, "surfels", "not finite")
+
+
+@pytest.mark.parametrize(("name", "field"), [("origin", None), ("surfels", "normal"), ("surfels", "thickness_m")])
+def test_other_numbers_that_are_none_are_refused(arrays, name, field):
+    (arrays[name] if field is None else arrays[name][field])[0] = np.nan
+    with pytest.raises(BundleError):
+        SurfelMap.from_arrays(arrays)
+
+
+def test_who_trusts_the_files_may_skip_the_look_at_every_index(arrays):
+    arrays["fine_nearest"][0, 0] = 10**6
+    assert SurfelMap.from_arrays(arrays, verify=False).fine.nearest[0, 0] == 10**6
+    with pytest.raises(BundleError):
+        SurfelMap.from_arrays(arrays, verify=False).require_consistent()
+
+
+def test_a_map_without_tiles_is_consistent(arrays):
+    arrays["tiles"] = np.zeros((0, 4))
+    assert len(SurfelMap.from_arrays(arrays).tiles) == 0
+
+
+def test_a_surfel_takes_32_bytes():
+    assert SURFEL.itemsize == 32
