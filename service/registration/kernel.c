@@ -153,7 +153,8 @@ static void add_priors(const Options *o, const State *s, double n, double H[UNKN
 
 static void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, State *s)
 {
-    double reach2 = o->reach * o->reach;
+    double reach2 = o->reach * o->reach, known = 0;
+    for (int64_t i = 0; i < q->count; i++) known += q->weight[i];
     for (int64_t it = 0; it < o->iterations; it++) {
         double share = o->iterations > 1 ? (double)it / (double)(o->iterations - 1) : 1.0;
         double robust = o->robust_first * pow(o->robust_last / o->robust_first, share);
@@ -192,7 +193,7 @@ static void align_one(const Grid *g, const Surfel *surfels, const Query *q, cons
             for (int d = 0; d < a; d++) H[d][a] = H[a][d];
         for (int a = 0; a < UNKNOWNS; a++) memcpy(s->H + a * UNKNOWNS, H[a], sizeof H[a]);
         s->seen = total;
-        add_priors(o, s, (double)q->count, H, b);
+        add_priors(o, s, known, H, b);
         if (!solve(H, b)) return;
         for (int k = 0; k < 3; k++) s->t[k] += b[k];
         turn_left(s->R, b + 3);

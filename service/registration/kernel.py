@@ -52,7 +52,7 @@ class SolverOptions:
     robust_first: float
     robust_last: float
     surface: float = 0.03
-    prior_weight: float = 0.05
+    prior_weight: float = 0.01
     tilt: float = float(np.deg2rad(1.0))
     height: float = 0.15
     position: float = 30.0

@@ -32,12 +32,12 @@ class PointSettings:
         movable_weight: so points there count for less, the ground's apart.
     """
 
-    columns: int = 80
-    points: int = 1500
+    columns: int = 128
+    points: int = 3000
     ground_share: float = 0.25
     ground_m: float = 0.3
     edge: float = 0.12
-    correlated: float = 1.0
+    correlated: float = 0.0
     floor_m: float = 0.02
     reach_m: float = 40.0
     movable_m: float = 2.0

@@ -38,7 +38,9 @@ class RegistrationSettings:
     apart_m: float = 0.5
     #: Coarse: surfaces are rough, or what is near and well measured, mostly vehicles, would pull everything its way.
     coarse: SolverOptions = field(
-        default_factory=lambda: SolverOptions(iterations=8, reach=2.7, robust_first=2.0, robust_last=0.5, surface=0.2)
+        default_factory=lambda: SolverOptions(
+            iterations=8, reach=2.7, robust_first=2.0, robust_last=0.5, surface=0.2, prior_weight=0.02
+        )
     )
     fine: SolverOptions = field(
         default_factory=lambda: SolverOptions(iterations=15, reach=1.2, robust_first=0.6, robust_last=0.06)
