@@ -158,7 +158,7 @@ class Dataset:
         return read_tum(self.folder / "survey" / "poses.txt")[1]
 
     def scan(self, number: int) -> NDArray[np.float32]:
-        """Scan ``number``: (n, 4) x, y, z (m, LiDAR frame) and intensity."""
+        """Scan ``number``: (n, 4) x, y, z (m, LiDAR frame) and intensity, 0 where a sensor has none or a nonsensical one."""
         path = scan_path(self.folder, number)
         if not path.is_file():
             raise DatasetError(f"{path} is missing, but survey/poses.txt has a line for it", field=str(path.name))
@@ -168,7 +168,8 @@ class Dataset:
                 f"{path}: {size} bytes are no rows of four float32; the file is truncated", field=str(path.name)
             )
         points = np.fromfile(path, np.float32).reshape(-1, 4)
-        finite: NDArray[np.float32] = points[np.isfinite(points).all(axis=1)]
+        finite: NDArray[np.float32] = points[np.isfinite(points[:, :3]).all(axis=1)]
+        finite[:, 3] = np.maximum(np.nan_to_num(finite[:, 3], posinf=0.0), 0.0)
         return finite
 
     def query_sets(self, *, with_truth: bool = False) -> list[str]:

@@ -108,6 +108,13 @@ def test_points_that_are_not_finite_are_left_out(folder):
     np.testing.assert_array_equal(Dataset(folder).scan(0), points[[0, 2, 4]])
 
 
+def test_a_point_stays_without_an_intensity_that_means_something(folder):
+    points = np.ones((4, 4), np.float32)
+    points[:, 3] = 0.5, np.nan, -1.0, np.inf
+    points.tofile(scan_path(folder, 0))
+    np.testing.assert_array_equal(Dataset(folder).scan(0)[:, 3], [0.5, 0, 0, 0])
+
+
 def test_a_query_set_that_is_not_there_is_refused_with_those_that_are(folder):
     with pytest.raises(DatasetError, match="no query set 'other'; it has: drive"):
         list(Dataset(folder).queries("other"))
