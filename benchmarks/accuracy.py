@@ -184,12 +184,13 @@ def main() -> None:
     parser.add_argument("--note", help="what a reader of the report must know about this run")
     arguments = parser.parse_args()
     report, runs = Report("accuracy", "make evaluate"), Runs(arguments.work, arguments.encoder)
-    kitti_rows(report, runs, arguments.data)
-    unseen_rows(report, runs)
-    paper_rows(report, runs, "retrieval", barred=True)
-    full_paper_rows(report, runs)
-    full_unseen_rows(report, runs)
-    weather_rows(report, runs)
+    for part in (
+        lambda: kitti_rows(report, runs, arguments.data), lambda: unseen_rows(report, runs), lambda: full_unseen_rows(report, runs),
+        lambda: paper_rows(report, runs, "retrieval", barred=True), lambda: full_paper_rows(report, runs),
+        lambda: weather_rows(report, runs),
+    ):  # fmt: skip
+        part()
+        report.write()  # a defect or a stop in a later part costs that part alone
     paper = runs.dataset(paper_plan())
     for preset in BOTH:
         raw_row(
