@@ -1,6 +1,7 @@
 """What PCA-based removal of weather noise does to a survey driven in snow: flakes taken out, structure lost, recall of the map."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from benchmarks.report import Report
 from benchmarks.runs import Runs, share
@@ -10,7 +11,8 @@ from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import EVALUATION_SEEDS
 from service.imaging.weather import remove_weather_noise
 
-FLAKE_INTENSITY = 0.05  # what the simulator gives every return from a flake; structure hits it by chance only
+#: A return of the snowy scan is a flake's if the clear day's scan from the same pose has nothing this near, as far as beams are dense.
+FLAKE_APART_M, JUDGED_M = 0.5, 20.0
 SCANS = 100
 
 
@@ -23,22 +25,24 @@ def snow_plan(survey_condition: str) -> SimulationPlan:
     )  # fmt: skip
 
 
-def removed_and_lost(dataset: Dataset) -> tuple[float, float, int]:
+def removed_and_lost(snow: Dataset, clear: Dataset) -> tuple[float, float, int]:
     """Share of flakes that the filter takes out, share of structure that it takes with them, and number of flakes."""
     flakes = removed = structure = lost = 0
-    for number in np.linspace(0, len(dataset.survey_poses()) - 1, SCANS).astype(int):
-        points = dataset.scan(int(number))
-        flake = np.isclose(points[:, 3], FLAKE_INTENSITY, atol=1e-6)
-        keep = remove_weather_noise(points[:, :3])
+    for number in np.linspace(0, len(snow.survey_poses()) - 1, SCANS).astype(int):
+        points = snow.scan(int(number))[:, :3]
+        keep = remove_weather_noise(points)
+        judged = np.linalg.norm(points, axis=1) < JUDGED_M
+        apart, _ = cKDTree(clear.scan(int(number))[:, :3]).query(points, distance_upper_bound=FLAKE_APART_M)
+        flake = judged & np.isinf(apart)
         flakes, removed = flakes + int(flake.sum()), removed + int((flake & ~keep).sum())
-        structure, lost = structure + int((~flake).sum()), lost + int((~flake & ~keep).sum())
+        structure, lost = structure + int((judged & ~flake).sum()), lost + int((judged & ~flake & ~keep).sum())
     return removed / flakes, lost / structure, flakes
 
 
 def weather_rows(report: Report, runs: Runs) -> None:
     """The effect of ``build-map --remove-weather`` on a snowy survey, beside the clear day's."""
     clear, snow = (runs.dataset(snow_plan(condition)) for condition in ("clear", "snow"))
-    removed, lost, flakes = removed_and_lost(snow)
+    removed, lost, flakes = removed_and_lost(snow, clear)
     report.row("weather.snow.flakes_removed", removed, "share", n=flakes)
     report.row("weather.snow.structure_lost", lost, "share", better="lower")
     for row, dataset, remove in (("clear", clear, False), ("snow", snow, False), ("snow_filtered", snow, True)):
