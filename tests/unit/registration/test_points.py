@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y
 from service.registration.points import PointSettings, inverse_depth_noise, points_of
 
-ALL = PointSettings(points=100_000, ground_share=0.5)
+ALL = PointSettings(columns=80, points=100_000, ground_share=0.5, correlated=1.0)
 HIGH_M = 100.0  # so high that no point is of the ground or of a vehicle
 
 
@@ -105,7 +107,7 @@ def test_the_uncertainty_grows_with_the_square_of_the_depth():
 
 def test_a_slanted_ray_is_as_uncertain_as_it_is_long():
     depth = 1 / (0.1 + np.random.default_rng(4).normal(0, 1e-3, (60, 80)))
-    found = points_in(depth, PointSettings(points=100_000, ground_share=0.5, floor_m=0.0))
+    found = points_in(depth, replace(ALL, floor_m=0.0))
     length = np.linalg.norm(found.xyz, axis=1)
     np.testing.assert_allclose(found.sigma / (length * depths_of(found)), 1e-3 * np.sqrt(2), rtol=0.1)
 
