@@ -27,7 +27,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check format generate lock evaluate bench-training reports encoder paper-encoder install-demo install-test clean
+.PHONY: help demo demo-real test check format generate lock evaluate bench-training reports encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -73,6 +73,9 @@ reports: .venv/.torch ## all reports as one page with plots
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS)
 	$(BIN)/streetfix export runs/stock --out model_training/stock/encoder.onnx
+
+calibration: .venv/.torch ## ask calibration cities and fit confidence anew, for the stock encoder
+	$(BIN)/streetfix calibrate --anew $(ARGS)
 
 paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there
 	$(BIN)/streetfix train --recipe paper --start-from runs/stock --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper

@@ -5,40 +5,24 @@ finished is kept under ``--work`` and reused, so an interrupted run goes on.
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from benchmarks.conditions import condition_rows
+from benchmarks.doubt import doubt_rows
+from benchmarks.full import full_paper_rows, full_unseen_rows
+from benchmarks.kitti_registration import kitti_registration_rows
 from benchmarks.kitti_retrieval import retrieve
+from benchmarks.plans import BOTH, paper_plan, unseen_plan
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs, share
+from benchmarks.sequences import sequence_rows
+from benchmarks.speed import speed_rows
 from benchmarks.weather import weather_rows
-from model_training.evaluation.error_measures import distance_errors, heading_errors_deg, wilson_interval
-from model_training.evaluation.predict import headings_of, joined
-from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.evaluation.error_measures import wilson_interval
 from model_training.stock import ENCODER
-from model_training.training.recipe import EVALUATION_SEEDS
 from service.localization.encoder import Encoder
-
-BOTH = ("precise", "stereo")
-
-
-def paper_plan() -> SimulationPlan:
-    """The paper's city: five other drives with Table I's counts, and frames of the survey's own drive."""
-    drives = tuple(QueryPlan(name=f"drive{k}", traversal=k, per_class=True, depths=BOTH) for k in range(1, 6))
-    own = QueryPlan(name="survey_drive", traversal=0, count=500, on_track=True, depths=("precise",))
-    return SimulationPlan(name="paper-city", city="paper", seed=0, queries=(*drives, own))
-
-
-def unseen_plan(index: int) -> SimulationPlan:
-    """One of three cities that no encoder was trained on: 1,000 queries together, and as many blocked ones."""
-    count = (334, 333, 333)[index]
-    queries = (
-        QueryPlan(name="drive1", traversal=1, count=count, depths=BOTH),
-        QueryPlan(name="blocked25", traversal=2, count=count, depths=("precise",), blocked=0.25),
-    )
-    return SimulationPlan(name=f"unseen-{index + 1}", seed=EVALUATION_SEEDS[index + 1], queries=queries)
 
 
 def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None:
@@ -58,51 +42,6 @@ def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None
     own = runs.figures(bundle, dataset, ["survey_drive_precise"])
     share(report, f"{prefix}.paper_city.same_drive.street_accuracy", own, "street_accuracy")
     share(report, f"{prefix}.paper_city.same_drive.recall_at_1_5m", own, "recall_at_1_5m")
-
-
-def full_paper_rows(report: Report, runs: Runs) -> None:
-    """The paper's city with registration."""
-    dataset = runs.dataset(paper_plan())
-    bundle = runs.bundle(dataset)
-    for preset, street in (("precise", 0.998), ("stereo", 0.985)):
-        figures = runs.figures(bundle, dataset, [f"drive{k}_{preset}" for k in range(1, 6)], refine=True)
-        row, precise = f"full.paper_city.{preset}", preset == "precise"
-        share(report, f"{row}.street_accuracy", figures, "street_accuracy", street)
-        share(report, f"{row}.localized", figures, "localized", 0.99 if precise else None)
-        share(report, f"{row}.within_1_m", figures, "within_1_m")
-        forced = {f"forced_{key}": value for key, value in figures["forced"].items()}
-        for key, bar in (
-            ("mean_distance_error_m", 0.05),
-            ("median_distance_error_m", 0.04),
-            ("forced_mean_distance_error_m", 0.15),
-        ):
-            value = (figures | forced)[key]
-            report.row(f"{row}.{key}", value, "m", bar=bar if precise else None, better="lower", n=figures["queries"])
-
-
-def full_unseen_rows(report: Report, runs: Runs) -> None:
-    """Three unseen cities with registration: shares over all queries, medians over all that were answered."""
-    headings = {"precise": 0.12, "stereo": 0.35}
-    for preset in BOTH:
-        parts, predictions = [], []
-        for index in range(3):
-            dataset = runs.dataset(unseen_plan(index))
-            figures = runs.figures(runs.bundle(dataset), dataset, [f"drive1_{preset}"], refine=True)
-            parts.append(figures)
-            predictions += list(figures["predictions"].values())
-        row = f"full.unseen.{preset}"
-        share(report, f"{row}.within_0_5_m", parts, "within_0_5_m", 0.998 if preset == "precise" else None)
-        share(report, f"{row}.within_1_m", parts, "within_1_m", 0.985 if preset == "stereo" else None)
-        answers = joined(predictions)
-        distance = distance_errors(answers.T_answer[:, :2, 3], answers.T_true[:, :2, 3])
-        turned = heading_errors_deg(headings_of(answers.T_answer), headings_of(answers.T_true))
-        for key, errors, unit, bar in (
-            ("median_distance_error_m", distance, "m", 0.10 if preset == "stereo" else None),
-            ("median_heading_error_deg", turned, "deg", headings[preset]),
-        ):
-            report.row(
-                f"{row}.{key}", float(np.nanmedian(errors)), unit, bar=bar, better="lower", n=int(np.isfinite(errors).sum())
-            )  # fmt: skip
 
 
 def unseen_rows(report: Report, runs: Runs) -> None:
@@ -167,8 +106,25 @@ def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
     report.row("raw.kitti_stereo.recall_at_1", found[best], "share", n=count, why=f"best setting: {best[4:]}")
 
 
+def raw_paper_rows(report: Report, runs: Runs) -> None:
+    """The raw range image in the paper's city."""
+    paper = runs.dataset(paper_plan())
+    for preset in BOTH:
+        found = [runs.raw(runs.bundle(paper), paper, f"drive1_{preset}")]
+        raw_row(report, f"raw.paper_city.{preset}.recall_at_1_5m", found, None)
+
+
+def trained_there_rows(report: Report, work: Path, encoder: Path) -> None:
+    """An encoder that has seen the paper's city."""
+    if encoder.exists():
+        paper_rows(report, Runs(work, encoder), "trained_on_paper_city", barred=False)
+        return
+    why = "no encoder at --paper-encoder: make paper-encoder"
+    report.row("trained_on_paper_city.paper_city.precise.street_accuracy", None, "share", why=why)
+
+
 def main() -> None:
-    """Parse, run all parts, write the report."""
+    """Parse, run the parts, write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--work", type=Path, default=ROOT / "data" / "evaluate", help="where datasets and maps are kept"
@@ -182,35 +138,37 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="real recordings")
     parser.add_argument("--note", help="what a reader of the report must know about this run")
+    parser.add_argument(
+        "--only", help="these parts alone, by commas; the rows of the others stay, each with its commit"
+    )
     arguments = parser.parse_args()
     report, runs = Report("accuracy", "make evaluate"), Runs(arguments.work, arguments.encoder)
-    for part in (
-        lambda: kitti_rows(report, runs, arguments.data), lambda: unseen_rows(report, runs), lambda: full_unseen_rows(report, runs),
-        lambda: paper_rows(report, runs, "retrieval", barred=True), lambda: full_paper_rows(report, runs),
-        lambda: weather_rows(report, runs),
-    ):  # fmt: skip
-        part()
-        report.write()  # a defect or a stop in a later part costs that part alone
-    paper = runs.dataset(paper_plan())
-    for preset in BOTH:
-        raw_row(
-            report,
-            f"raw.paper_city.{preset}.recall_at_1_5m",
-            [runs.raw(runs.bundle(paper), paper, f"drive1_{preset}")],
-            None,
-        )
-    if arguments.paper_encoder.exists():
-        paper_rows(report, Runs(arguments.work, arguments.paper_encoder), "trained_on_paper_city", barred=False)
-    else:
-        report.row(
-            "trained_on_paper_city.paper_city.precise.street_accuracy",
-            None,
-            "share",
-            why="no encoder at --paper-encoder: make paper-encoder",
-        )
+    parts: dict[str, Callable[[], None]] = {
+        "kitti": lambda: kitti_rows(report, runs, arguments.data),
+        "kitti_registration": lambda: kitti_registration_rows(report, runs, arguments.data),
+        "full_unseen": lambda: full_unseen_rows(report, runs),
+        "full_paper": lambda: full_paper_rows(report, runs),
+        "speed": lambda: speed_rows(report, runs),
+        "doubt": lambda: doubt_rows(report, runs),
+        "conditions": lambda: condition_rows(report, runs),
+        "sequences": lambda: sequence_rows(report, runs),
+        "unseen": lambda: unseen_rows(report, runs),
+        "paper": lambda: paper_rows(report, runs, "retrieval", barred=True),
+        "weather": lambda: weather_rows(report, runs),
+        "raw_paper": lambda: raw_paper_rows(report, runs),
+        "trained_there": lambda: trained_there_rows(report, arguments.work, arguments.paper_encoder),
+    }
+    wanted = list(parts) if arguments.only is None else arguments.only.split(",")
+    if unknown := sorted(set(wanted) - set(parts)):
+        parser.error(f"--only: there is no part {unknown[0]!r}; there are: {', '.join(parts)}")
+    if arguments.only is not None:
+        report.keep_others()
     if arguments.note:
         report.notes["run"] = arguments.note
-    print(f"written: {report.write()}")
+    for name in wanted:
+        print(f"--- {name}", flush=True)
+        parts[name]()
+        report.write()  # a defect or a stop in a later part costs that part alone
 
 
 if __name__ == "__main__":

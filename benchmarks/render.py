@@ -42,9 +42,15 @@ def main() -> None:
 def _line(row: dict[str, Any]) -> str:
     value = "-" if row["value"] is None else f"{row['value']:.4g} {row['unit']}"
     interval = "{:.4f} - {:.4f}".format(*row["ci95"]) if "ci95" in row else ""
-    bar = "" if "bar" not in row else f"{'at least' if row['better'] == 'higher' else 'at most'} {row['bar']:g}"
+    bar = _bar(row) if "bar" in row else ""
     mark = "" if "bar" not in row else ("holds" if row["holds"] else "**missed**")
     return f"| `{row['id']}` | {value} | {interval} | {row.get('n', '')} | {bar} | {mark} |"
+
+
+def _bar(row: dict[str, Any]) -> str:
+    if isinstance(row["bar"], list):
+        return "{:g} to {:g}".format(*row["bar"])
+    return f"{'at least' if row['better'] == 'higher' else 'at most'} {row['bar']:g}"
 
 
 def _plot(name: str, rows: list[dict[str, Any]]) -> Path | None:
@@ -59,7 +65,8 @@ def _plot(name: str, rows: list[dict[str, Any]]) -> Path | None:
         axes.plot([low, high], [k, k], color=colour, lw=2, alpha=0.5)
         axes.plot(row["value"], k, "o", color=colour, ms=5)
         if "bar" in row:
-            axes.plot(row["bar"], k, "|", color="black", ms=12, mew=1.5)
+            for bar in row["bar"] if isinstance(row["bar"], list) else [row["bar"]]:
+                axes.plot(bar, k, "|", color="black", ms=12, mew=1.5)
     axes.set_yticks(range(len(shares)), [row["id"] for row in reversed(shares)], fontsize=7)
     axes.set_xlim(0, 1.005)
     axes.grid(axis="x", alpha=0.3)

@@ -11,6 +11,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.evaluation.error_measures import wilson_interval
+
 ROOT = Path(__file__).resolve().parents[1]
 REPORTS = ROOT / "reports"
 
@@ -36,24 +41,43 @@ class Report:
     )
 
     def row(
-        self, row_id: str, value: float | None, unit: str, *, bar: float | None = None, better: Literal["higher", "lower"] = "higher",
-        n: int | None = None, ci95: list[float] | None = None, why: str | None = None,
+        self, row_id: str, value: float | None, unit: str, *, bar: float | tuple[float, float] | None = None,
+        better: Literal["higher", "lower"] = "higher", n: int | None = None, ci95: list[float] | None = None, why: str | None = None,
     ) -> None:  # fmt: skip
-        """Add a row; ``holds`` follows from value and bar."""
+        """Add a row; ``holds`` follows from value and bar; a bar of two numbers is a range."""
         entry: dict[str, Any] = {"id": row_id, "value": value, "unit": unit}
         if n is not None:
             entry["n"] = n
         if ci95 is not None:
             entry["ci95"] = ci95
         if bar is not None:
-            holds = value is not None and (value >= bar if better == "higher" else value <= bar)
-            entry |= {"bar": bar, "better": better, "holds": holds}
+            holds = value is not None and _holds(value, bar, better)
+            shown_bar: object = list(bar) if isinstance(bar, tuple) else bar
+            entry |= {"bar": shown_bar, "better": "inside" if isinstance(bar, tuple) else better, "holds": holds}
         if why is not None:
             entry["why"] = why
         self.rows = [r for r in self.rows if r["id"] != row_id] + [entry]
         mark = "" if bar is None else ("  holds" if entry["holds"] else "  MISSED")
         shown = "-" if value is None else f"{value:.4f}"
-        print(f"{row_id:62} {shown:>10} {unit:8}{'' if bar is None else f' bar {bar:g}'}{mark}", flush=True)
+        print(f"{row_id:62} {shown:>10} {unit:8}{'' if bar is None else f' bar {bar}'}{mark}", flush=True)
+
+    def share(
+        self, row_id: str, right: NDArray[np.bool_], *, bar: float | None = None, better: Literal["higher", "lower"] = "higher"
+    ) -> None:  # fmt: skip
+        """Add a row of a share with its Wilson interval."""
+        if not len(right):
+            self.row(row_id, None, "share", bar=bar, better=better, why="no query of this kind")
+            return
+        interval = list(wilson_interval(int(right.sum()), len(right)))
+        self.row(row_id, float(right.mean()), "share", bar=bar, better=better, n=len(right), ci95=interval)
+
+    def keep_others(self) -> None:
+        """Start from the rows of the last run, each with the commit that it was measured at; new ones replace them."""
+        path = REPORTS / f"{self.name}.json"
+        if path.exists():
+            last = json.loads(path.read_text())
+            self.rows = [{"commit": last["made"]["commit"]} | row for row in last["rows"]]
+            self.notes = last.get("notes", {})
 
     def write(self) -> Path:
         """Write the file and say where."""
@@ -71,6 +95,12 @@ class Report:
         )
         part.rename(path)
         return path
+
+
+def _holds(value: float, bar: float | tuple[float, float], better: str) -> bool:
+    if isinstance(bar, tuple):
+        return bar[0] <= value <= bar[1]
+    return value >= bar if better == "higher" else value <= bar
 
 
 def machine() -> str:

@@ -17,12 +17,14 @@ from model_training.baselines.raw_range import raw_best_views
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.error_measures import wilson_interval
-from model_training.evaluation.evaluate import evaluate
-from model_training.evaluation.measures import recall_at
+from model_training.evaluation.measures import measure, recall_at
+from model_training.evaluation.predict import Predictions, joined, predict
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.plan import SimulationPlan
 from model_training.simulation.simulate import simulate
+from model_training.stock import CALIBRATION
 from service.localization.encoder import Encoder
+from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 RAW_EVERY = 3  # each third query of a set is asked of the raw image too: it is slow, and so many tell 0.3 from 0.4
@@ -39,10 +41,12 @@ def code_hash(*folders: str) -> str:
 
 
 SIMULATION = ("model_training/simulation", "service/geometry")
-MAPPING = (
-    "model_training/mapping", "service/imaging", "service/geometry", "service/maps", "service/registration",
-    "model_training/datasets",
-)  # fmt: skip
+ANSWERING = ("service/imaging", "service/geometry", "service/maps", "service/registration", "service/localization")
+MAPPING = ("model_training/mapping", "model_training/datasets", *ANSWERING)  # it asks its own map to check confidence
+
+
+def _calibration_hash() -> str:
+    return hashlib.sha256(CALIBRATION.read_bytes()).hexdigest()[:8]
 
 
 class Runs:
@@ -63,6 +67,7 @@ class Runs:
         settings = settings or BuildSettings(name=dataset.name)
         made_of = (
             f"{dataset.folder.name.rsplit('-', 1)[-1]}-{Encoder.open(self.encoder).sha256[:12]}-{code_hash(*MAPPING)}"
+            f"-{_calibration_hash()}"
         )
         folder = self.work / "maps" / f"{settings.name}-{made_of}"
         if not folder.exists():
@@ -73,14 +78,24 @@ class Runs:
 
     def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str], *, refine: bool = False) -> dict[str, Any]:
         """Evaluate query sets, by retrieval alone or with registration; the answers lie beside for later measures."""
-        with bars() as report:
-            result = evaluate(bundle, dataset, names, refine=refine, report=report)
-        folder = self.work / "predictions" / ("full" if refine else "retrieval") / bundle.path.name
+        mode = "full" if refine else "retrieval"
+        folder = self.work / "predictions" / f"{mode}-{code_hash(*ANSWERING)}" / bundle.path.name / dataset.folder.name
         folder.mkdir(parents=True, exist_ok=True)
-        for name, predictions in result.predictions.items():
-            predictions.save(folder / f"{name}.npz")
-        (folder / f"{'+'.join(names)[:80]}.json").write_text(json.dumps(result.figures, indent=1))
-        return result.figures | {"predictions": result.predictions}
+        localizer, found = Localizer.open(bundle), {}
+        for name in names:
+            kept = folder / f"{name}.npz"
+            if not kept.exists():
+                with bars() as report:
+                    predict(localizer, dataset, name, refine=refine, report=report).save(kept)
+            found[name] = Predictions.load(kept)
+        classes = [] if bundle.streets is None else [street.name for street in bundle.streets.features]
+        return measure(joined(list(found.values())), classes) | {"predictions": found}
+
+    @staticmethod
+    def forced_within(predictions: Predictions, reach_m: float) -> float:
+        """Share within a distance, whatever the status."""
+        away = np.linalg.norm(predictions.T_answer[:, :2, 3] - predictions.T_true[:, :2, 3], axis=1)
+        return float((np.nan_to_num(away, nan=np.inf) <= reach_m).mean())
 
     def raw(self, bundle: MapBundle, dataset: Dataset, name: str) -> dict[str, tuple[int, int]]:
         """The raw range image: right ones and number of queries by setting, over each third query of a set."""

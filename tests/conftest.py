@@ -139,6 +139,7 @@ def make_content(*, name: str = "tiny", seed: int = 0, **changed: Any) -> Bundle
         "encoder": encoder,
         "streets": make_streets(),
         "cloud": make_cloud(),
+        "calibration": {"calibrated": False, "why": "no cities were asked"},
         "parameters": {"lidar_height_m": 1.8, "voxel_m": 0.2},
         "licence": "CC0-1.0",
         "tool_versions": {"streetfix": "0"},
@@ -216,6 +217,11 @@ def parts_of() -> Callable[..., dict[str, bytes]]:
 @pytest.fixture(scope="session")
 def encoder_of() -> Callable[..., bytes]:
     return make_encoder
+
+
+@pytest.fixture(scope="session")
+def pictures_of() -> Callable[..., tuple[NDArray[np.uint8], NDArray[np.float32], PinholeCamera]]:
+    return make_pictures
 
 
 @pytest.fixture(scope="session")

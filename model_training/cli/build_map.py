@@ -9,7 +9,7 @@ from rich.console import Console
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.build import BuildSettings, build_map, describe
-from model_training.stock import ENCODER
+from model_training.stock import CALIBRATION, ENCODER
 
 
 def command(
@@ -27,6 +27,9 @@ def command(
     lidar_height: Annotated[float, typer.Option(help="of the LiDAR above the ground, roughly, metres", min=0.1)] = 1.8,
     remove_weather: Annotated[bool, typer.Option(help="drop lone points such as rain and snow by local PCA")] = False,
     licence: Annotated[str, typer.Option(help="licence text kept in the manifest")] = "",
+    calibration: Annotated[
+        Path, typer.Option(help="of `streetfix calibrate` for the same encoder [default: the stock encoder's]")
+    ] = CALIBRATION,
     overwrite: Annotated[bool, typer.Option(help="replace a bundle that is there")] = False,
 ) -> None:
     """Build a map bundle of a dataset's survey.
@@ -38,7 +41,7 @@ def command(
     opened = Dataset(dataset)
     settings = BuildSettings(
         name=name or opened.name, spacing_m=spacing, headings=headings, voxel_m=voxel, expected_lidar_height_m=lidar_height,
-        remove_weather=remove_weather, licence=licence,
+        remove_weather=remove_weather, licence=licence, calibration=calibration,
     )  # fmt: skip
     with bars() as report:
         manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)

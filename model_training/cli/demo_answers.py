@@ -140,7 +140,8 @@ def _answered(outcome: Outcome) -> str:
         return _flat(outcome.problem)
     pose, street = answer["pose"], answer["street"]
     text = _where(street and street["name"], pose["position"]["x"], pose["position"]["y"], pose["heading_deg"])
-    return text if answer["status"] == "LOCALIZED" else f"{answer['status']}\n{text}"
+    sure = "" if answer["confidence"] is None else f" {answer['confidence']:.3f}"
+    return f"{text}\n{answer['status']}{sure}"
 
 
 def _where(street: str | None, x: float, y: float, heading_deg: float) -> str:

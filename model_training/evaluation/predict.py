@@ -17,6 +17,7 @@ from service.geometry.rigid import heading_of_camera
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.query import Query
+from service.maps.calibration import FEATURES
 
 RANKED = 10
 Report = Callable[[str, int, int], None]
@@ -30,7 +31,8 @@ class Predictions:
 
     ``T_true`` and ``T_answer`` (n, 4, 4) are T_map_camera, NaN where nothing was answered; ``street_true`` and
     ``street_answer`` (n) are features of the map's streets, -1 for none; ``ranked_xy`` (n, RANKED, 2) are the most similar
-    distinct places, the best first, NaN where there are fewer; ``localized`` (n); ``ms`` (n) of decoding and localizing;
+    distinct places, the best first, NaN where there are fewer; ``localized`` (n); ``confidence`` (n), ``evidence`` (n, F) and
+    ``covariance`` (n, 6, 6), NaN where there is none; ``ms`` (n) of decoding and localizing;
     ``stamp_s`` (n) are the truth's own timestamps, seconds.
     """
 
@@ -41,12 +43,23 @@ class Predictions:
     ranked_xy: NDArray[np.float64]
     ranked_place: NDArray[np.int64]
     localized: NDArray[np.bool_]
+    confidence: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     ms: NDArray[np.float64]
     stamp_s: NDArray[np.float64]
 
     def save(self, path: Path) -> None:
         """Keep them as NPZ, without pickle."""
-        np.savez_compressed(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
+        part = path.with_suffix(".part.npz")
+        np.savez_compressed(part, **{name: getattr(self, name) for name in self.__dataclass_fields__})
+        part.rename(path)
+
+    @staticmethod
+    def load(path: Path) -> "Predictions":
+        """Read what ``save`` wrote."""
+        with np.load(path, allow_pickle=False) as arrays:
+            return Predictions(**{name: arrays[name] for name in Predictions.__dataclass_fields__})
 
 
 def joined(parts: list[Predictions]) -> Predictions:
@@ -105,11 +118,19 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
     T_answer, ranked = np.full((count, 4, 4), np.nan), np.full((count, RANKED, 2), np.nan)
     ranked_place = np.full((count, RANKED), -1)
     street_answer, localized = np.full(count, -1), np.zeros(count, bool)
+    confidence, evidence = np.full(count, np.nan), np.full((count, len(FEATURES)), np.nan)
+    covariance = np.full((count, 6, 6), np.nan)
     for k, (answer, _) in enumerate(answers):
         if answer is None:
             continue
         T_answer[k] = answer.T_map_camera
         localized[k] = answer.status == "LOCALIZED"
+        if answer.confidence is not None:
+            confidence[k] = answer.confidence
+        if answer.evidence is not None:
+            evidence[k] = answer.evidence
+        if answer.covariance is not None:
+            covariance[k] = answer.covariance
         for j, neighbour in enumerate(answer.neighbours[:RANKED]):
             ranked[k, j], ranked_place[k, j] = neighbour.position_m[:2], neighbour.place
         street_answer[k] = answer.street
@@ -124,6 +145,9 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
         ranked,
         ranked_place,
         localized,
+        confidence,
+        evidence,
+        covariance,
         np.array([ms for _, ms in answers]),
         np.array([frame.stamp_s for frame in frames], np.float64),
     )

@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
+from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.preview import preview_webp
-from model_training.mapping.voxel_map import VoxelMap
+from model_training.mapping.site_check import HeldScan, held_out, site_of
+from model_training.mapping.voxel_map import Surfels, VoxelMap
+from model_training.stock import CALIBRATION
 from service.errors import BundleError, DatasetError
 from service.geometry.rigid import heading_of_body, transform_from, transform_points
 from service.imaging.pca import Level, level_scan, principal_heading
@@ -54,6 +57,7 @@ class BuildSettings:
     expected_lidar_height_m: float = 1.8
     remove_weather: bool = False
     licence: str = ""
+    calibration: Path | None = CALIBRATION
 
     def __post_init__(self) -> None:
         """Refuse what would end in an empty fan or a cloud without voxels."""
@@ -113,6 +117,9 @@ def build_map(
     rows_seen = _rows_seen(dataset, kept, grid, settings)
     cloud = VoxelMap(settings.voxel_m, np.round(poses[:, :3, 3].mean(axis=0)))
     turns = fan(settings.headings)
+    calibration = calibration_for(settings.calibration, encoder.sha256)
+    apart = set() if calibration is None else held_out(len(kept))
+    held: list[HeldScan] = []
     T_map_level = np.zeros((len(kept), 4, 4))
     heights, headings, descriptors = np.zeros(len(kept)), [], []
     for k, scan in enumerate(levelled_scans(dataset, kept, settings)):
@@ -123,24 +130,22 @@ def build_map(
         ])  # fmt: skip
         descriptors.append(encoder.encode(planes, "survey"))
         headings.append((heading_of_body(T) + scan.start_rad + turns + np.pi) % (2 * np.pi) - np.pi)
-        points = scan.points[:, :3]
-        near = points[np.linalg.norm(points, axis=1) < CLOUD_REACH_M].astype(np.float64)
-        cloud.add(transform_points(T, near))
+        if k in apart:
+            held.append(HeldScan(k, scan.points, T))
+        else:
+            cloud.add(_near(scan.points, T))
         T_map_level[k], heights[k] = T, scan.level.height_m
         report("places", k + 1, len(kept))
     lidar_height_m = float(np.median(heights))
     T_map_level[:, 2, 3] += lidar_height_m - heights  # so that the ground under each place lies that far below it
     streets = dataset.streets()
-    surfels = cloud.surfels()
     content = BundleContent(
         name=settings.name, grid=grid, headings=settings.headings, spacing_m=settings.spacing_m, rows_seen=rows_seen,
         T_map_place=T_map_level, place_street=_streets_of(streets, T_map_level),
         view_place=np.repeat(np.arange(len(kept), dtype=np.int32), settings.headings), view_heading_rad=np.concatenate(headings),
         descriptors=np.concatenate(descriptors), encoder=encoder_file.read_bytes(), streets=streets,
-        cloud=SurfelMap.prepare(cloud.origin, *cloud.tiles(surfels)) if len(surfels.positions) else None,
-        preview_webp=preview_webp(surfels.positions, surfels.normals, T_map_level[:, :3, 3]),
         georeference=dataset.description.georeference,
-        calibration={"calibrated": False, "why": "this release does not calibrate confidence yet; answers carry confidence null"},
+        calibration={"calibrated": False, "why": "no calibration fits this map's encoder; answers carry confidence null"},
         parameters={
             "lidar_height_m": lidar_height_m, "voxel_m": settings.voxel_m, "weather_removed": float(settings.remove_weather),
             "expected_lidar_height_m": settings.expected_lidar_height_m, "survey_scans": float(len(poses)),
@@ -148,7 +153,28 @@ def build_map(
         licence=settings.licence,
         tool_versions={name: version(name) for name in ("streetfix", "numpy", "faiss-cpu", "onnxruntime")},
     )  # fmt: skip
+    if calibration is not None:
+        site = None
+        if held:
+            site = site_of(replace(content, cloud=_prepared(cloud)), held, calibration, report)
+            for scan_apart in held:
+                cloud.add(_near(scan_apart.points, scan_apart.T_map_level))
+        content = replace(content, calibration=calibration.model_copy(update={"site": site}).model_dump(mode="json"))
+    surfels = cloud.surfels()
+    preview = preview_webp(surfels.positions, surfels.normals, T_map_level[:, :3, 3])
+    content = replace(content, cloud=_prepared(cloud, surfels), preview_webp=preview)
     return write_bundle(out, content, overwrite=overwrite)
+
+
+def _near(points: NDArray[np.float32], T_map_level: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What of a levelled scan goes into the cloud, map frame."""
+    xyz = points[:, :3]
+    return transform_points(T_map_level, xyz[np.linalg.norm(xyz, axis=1) < CLOUD_REACH_M].astype(np.float64))
+
+
+def _prepared(cloud: VoxelMap, surfels: Surfels | None = None) -> SurfelMap | None:
+    found = cloud.surfels() if surfels is None else surfels
+    return SurfelMap.prepare(cloud.origin, *cloud.tiles(found)) if len(found.positions) else None
 
 
 def _streets_of(streets: dict[str, Any] | None, T_map_level: NDArray[np.float64]) -> NDArray[np.int32]:

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.registration.kernel import SURFEL
+from service.registration.surfel_map import TILE_M
 
 _SPAN = 1 << 20  # cells along an axis: a key is 3 x 20 bits
 _MOMENTS = 10  # count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's corner
-TILE_M = 40.0
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from service.errors import DatasetError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
 
 Transforms = NDArray[np.float64]
+DEFAULT_STEP_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,24 @@ def query_candidates(city: City, plan: SimulationPlan, query: QueryPlan, survey:
     track = [survey.stations[k] for k in rng.permutation(len(survey.stations))]
     rounds = 1 + 3 * query.count // max(1, len(track))
     return np.array([query_pose(city, station, drive, rng) for _ in range(rounds) for station in track])
+
+
+def followed(city: City, query: QueryPlan, poses: Transforms) -> Transforms:
+    """Every pose with the frames that led to it, in the order in which they were taken; itself where there is no sequence.
+
+    Straight driving on the ground; the camera keeps its height above it and its angles against the vehicle.
+    """
+    if query.sequence is None:
+        return poses
+    step_m, found = query.step_m or DEFAULT_STEP_M, []
+    for T in poses:
+        heading = np.arctan2(T[1, 2], T[0, 2]) - np.deg2rad(query.turn_deg)
+        for back in range(query.sequence - 1, -1, -1):
+            moved = T.copy()
+            moved[:2, 3] -= back * step_m * np.array([np.cos(heading), np.sin(heading)])
+            moved[2, 3] += city.height(*moved[:2, 3]) - city.height(*T[:2, 3])
+            found.append(moved)
+    return np.array(found)
 
 
 def _camera_on(T_map_lidar: NDArray[np.float64], plan: SimulationPlan, query: QueryPlan) -> NDArray[np.float64]:

@@ -25,7 +25,9 @@ class _Model(BaseModel):
 
         A finished dataset is recognised by its plan's text, which must not change for plans that say nothing new.
         """
-        return {name: value for name, value in handler(self).items() if value != {}}
+        left_out: tuple[object, ...] = ({}, None) if isinstance(self, QueryPlan) else ({},)
+        kept = ("max_depth_m",)  # was always written
+        return {name: value for name, value in handler(self).items() if name in kept or value not in left_out}
 
 
 class CameraPlan(_Model):
@@ -59,6 +61,9 @@ class QueryPlan(_Model):
     blocked: float = Field(0.0, ge=0, le=0.9)
     max_depth_m: float | None = Field(None, ge=1)
     depth_parameters: DepthParameters = DepthParameters()  # in place of those of each of ``depths``
+    # Frames in a row, ``step_m`` of straight driving apart, the last at the pose drawn; None: single pictures.
+    sequence: int | None = Field(None, ge=2, le=20)
+    step_m: float | None = Field(None, ge=0.1, le=10)
 
     def refuse_what_does_nothing(self) -> None:
         """Refuse a field that was changed and that this traversal would pass over in silence.
@@ -69,6 +74,7 @@ class QueryPlan(_Model):
         poses, vehicles = "stands at the survey's own poses", "meets the survey's own vehicles"
         refused = [("aside_m", poses), ("heading_deg", poses)] if self.on_track else []
         refused += [("parked_changed", vehicles)] if self.traversal == 0 else []
+        refused += [("step_m", "has no sequence")] if self.sequence is None else []
         for field, why in refused:
             value = getattr(self, field)
             if value != type(self).model_fields[field].default:
@@ -81,7 +87,7 @@ class SimulationPlan(_Model):
     """A city, its survey and its query traversals."""
 
     name: str
-    city: Literal["paper", "city"] = "city"
+    city: Literal["paper", "city", "repeating"] = "city"
     seed: int = Field(0, ge=0)
     size_m: tuple[CitySide, CitySide] = (300.0, 400.0)
     streets: tuple[str, ...] = ()  # only these are driven; empty: all

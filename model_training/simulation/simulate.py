@@ -34,10 +34,11 @@ from model_training.simulation.camera import take, unit_rays
 from model_training.simulation.city import City
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import measured_depth
-from model_training.simulation.drives import Quota, Survey, query_candidates, quota_of, survey_of
+from model_training.simulation.drives import Quota, Survey, followed, query_candidates, quota_of, survey_of
 from model_training.simulation.lidar import scan
 from model_training.simulation.meshes import joined
 from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.repeating import RepeatingCity
 from model_training.simulation.scene import Scene
 from model_training.simulation.shading import Light
 from service.errors import DatasetError
@@ -64,7 +65,7 @@ def simulate(plan: SimulationPlan, out: Path, *, workers: int | None = None, rep
     plan = plan.checked()
     if not _claim(out, plan):
         return
-    city = City(seed=plan.seed, name=plan.city, size_m=plan.size_m)
+    city = _city(plan)
     survey = survey_of(city, plan)
     workers = workers or os.cpu_count() or 1
     _survey(city, plan, survey, out, workers, report)
@@ -73,6 +74,12 @@ def simulate(plan: SimulationPlan, out: Path, *, workers: int | None = None, rep
     _streets(city, out)
     write_description(out, _description(plan))
     (out / "simulation.json").rename(out / "simulation.done.json")
+
+
+def _city(plan: SimulationPlan) -> City:
+    if plan.city == "repeating":
+        return RepeatingCity(seed=plan.seed)
+    return City(seed=plan.seed, name=plan.city, size_m=plan.size_m)
 
 
 def _claim(out: Path, plan: SimulationPlan) -> bool:
@@ -186,7 +193,8 @@ def _queries(
     for folder in sets.values():
         for part in ("rgb", "depth"):
             (folder / part).mkdir(parents=True, exist_ok=True)
-    job.candidates = candidates[chosen]
+    job.candidates = followed(city, query, candidates[chosen])
+    chosen = np.arange(len(job.candidates))
     todo = [k for k in range(len(chosen)) if not all(_pair(folder, k)[1].exists() for folder in sets.values())]
     for done, _ in enumerate(_run(job, _one_pair, todo, workers), len(chosen) - len(todo) + 1):
         report(f"queries {query.name}", done, len(chosen))
@@ -230,7 +238,12 @@ def _is_free(k: int) -> bool:
     if job is None or job.candidates is None:
         raise RuntimeError("a worker was started without its job")
     rays, _ = unit_rays(_COARSE)
-    T = job.candidates[k]
+    if job.query is None:
+        raise RuntimeError("a worker was started without its query")
+    return all(_has_room(job, T, rays) for T in followed(job.city, job.query, job.candidates[k : k + 1]))
+
+
+def _has_room(job: _Job, T: NDArray[np.float64], rays: NDArray[np.float32]) -> bool:
     distance = job.scene.distances(T[:3, 3], rays @ T[:3, :3].T.astype(np.float32))
     met = distance[distance > 0]
     around = job.scene.distances(T[:3, 3] - [0.0, 0.0, 0.6], _RING)

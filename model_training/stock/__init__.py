@@ -3,3 +3,4 @@
 from pathlib import Path
 
 ENCODER = Path(__file__).with_name("encoder.onnx")
+CALIBRATION = Path(__file__).with_name("calibration.json")

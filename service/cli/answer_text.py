@@ -20,6 +20,8 @@ def print_answer(answer: dict[str, Any], console: Console | None = None) -> None
         facts.add_row(name, value)
     out.print(facts)
     out.print()
+    if answer["status"] != "LOCALIZED" and answer["hypotheses"]:
+        out.print(_hypotheses(answer["hypotheses"]))
     out.print(_neighbours(answer["neighbours"]))
     times = "  ".join(f"{stage} {value:.1f}" for stage, value in answer["timings_ms"].items())
     out.print(f"milliseconds: {times}", style="dim")
@@ -50,6 +52,18 @@ def _spread(covariance: list[float] | None, rows: slice, scale: float, unit: str
         return ""
     largest = max(covariance[7 * k] for k in range(6)[rows])
     return f", +- {scale * math.sqrt(largest):.2f} {unit} (one sigma)"
+
+
+def _hypotheses(hypotheses: list[dict[str, Any]]) -> Table:
+    table = Table(
+        "share", "inliers", "similarity", "position", "heading", title="where it may be", title_justify="left"
+    )
+    for each in hypotheses:
+        table.add_row(
+            f"{each['share']:.2f}", f"{each['inliers']:.2f}", f"{each['similarity']:.3f}", _metres(each["pose"]["position"]),
+            f"{each['pose']['heading_deg']:.0f}",
+        )  # fmt: skip
+    return table
 
 
 def _neighbours(neighbours: list[dict[str, Any]]) -> Table:

@@ -19,13 +19,21 @@ def command(
     ],
     url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
     map_name: Annotated[str | None, typer.Option("--map", help="Needed where several are mounted.")] = None,
+    near: Annotated[
+        str | None,
+        typer.Option(help="Where it was, roughly: X,Y or X,Y,STD in metres of the map frame.", show_default=False),
+    ] = None,
+    heading: Annotated[
+        float | None, typer.Option(help="Where it looked, roughly: degrees, counter-clockwise from map x.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the answer as it came.")] = False,
 ) -> None:
     """Ask where two pictures were taken.
 
-    Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json
+    Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json --near 12,-40
     """
-    answer = localize(url, rgb=rgb, depth=depth, camera=camera, map_name=map_name)
+    prior = _prior(near, heading)
+    answer = localize(url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior)
     if as_json:
         typer.echo(json.dumps(answer))
     else:
@@ -34,7 +42,22 @@ def command(
         print_answer(answer)
 
 
-def localize(url: str, *, rgb: Path, depth: Path, camera: Path, map_name: str | None = None) -> dict[str, Any]:
+def _prior(near: str | None, heading_deg: float | None) -> dict[str, Any] | None:
+    found: dict[str, Any] = {} if heading_deg is None else {"heading_deg": heading_deg}
+    if near is not None:
+        try:
+            numbers = [float(part) for part in near.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (2, 3):
+            raise RequestError(f"--near: {near!r} is not X,Y or X,Y,STD in metres, such as 12,-40,20", field="near")
+        found["position"] = dict(zip(("x", "y", "std_m"), numbers, strict=False))
+    return found or None
+
+
+def localize(
+    url: str, *, rgb: Path, depth: Path, camera: Path, map_name: str | None = None, prior: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Post a pair of pictures.
 
     Args:
@@ -43,6 +66,7 @@ def localize(url: str, *, rgb: Path, depth: Path, camera: Path, map_name: str | 
         depth: file of the depth picture.
         camera: JSON file with the request's parts: camera, depth, gravity and so on.
         map_name: which map; goes above the file's.
+        prior: as in the REST contract; goes above the file's.
 
     Raises:
         RequestError: a file cannot be read, or the camera file is no JSON object.
@@ -52,6 +76,7 @@ def localize(url: str, *, rgb: Path, depth: Path, camera: Path, map_name: str | 
     import httpx
 
     request = _camera_parts(camera) | ({} if map_name is None else {"map": map_name})
+    request |= {} if prior is None else {"prior": prior}
     files = {
         "rgb": (rgb.name, _bytes_of(rgb, "rgb"), "application/octet-stream"),
         "depth": (depth.name, _bytes_of(depth, "depth"), "application/octet-stream"),

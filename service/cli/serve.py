@@ -25,6 +25,10 @@ def command(
     port: Annotated[int | None, typer.Option(help="0 lets the system choose.  [default: 8000]")] = None,
     threads: Annotated[int | None, typer.Option(help="Requests worked on at once.  [default: the cores]")] = None,
     queue: Annotated[int | None, typer.Option(help="Requests that may wait before 503.  [default: 64]")] = None,
+    false_accept_rate: Annotated[
+        float | None,
+        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.01]"),
+    ] = None,
 ) -> None:
     """Serve maps over HTTP; loopback only, unless told otherwise.
 
@@ -37,7 +41,11 @@ def command(
     limit_pools_before_import()
     from service.runtime.settings import load_settings
 
-    serve(load_settings(maps=tuple(maps) if maps else None, host=host, port=port, threads=threads, queue=queue))
+    serve(
+        load_settings(
+            maps=tuple(maps) if maps else None, host=host, port=port, threads=threads, queue=queue, false_accept_rate=false_accept_rate
+        )
+    )  # fmt: skip
 
 
 def serve(settings: "Settings") -> None:

@@ -18,6 +18,8 @@ from service.geometry.rigid import (
 from service.http import schema
 from service.http.problems import request_error_from
 from service.localization.answer import Answer
+from service.localization.evidence import distinct_candidates
+from service.localization.prior import Prior
 from service.localization.search import Neighbour
 from service.maps.reader import MapBundle
 from service.runtime.engine import EncodedQuery, Located
@@ -58,6 +60,9 @@ def query_from_parts(parts: dict[str, bytes]) -> EncodedQuery:
         T_vehicle_camera=None if request.T_vehicle_camera is None else _transform(request.T_vehicle_camera),
         neighbours=request.options.neighbours,
         refine=request.options.refine,
+        prior=None if request.prior is None else _prior(request.prior),
+        prior_wgs84=_wgs84(request.prior),
+        false_accept_rate=request.options.false_accept_rate,
     )
 
 
@@ -74,6 +79,7 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         if answer.T_map_vehicle is None
         else _pose(answer.T_map_vehicle, heading_of_body(answer.T_map_vehicle), None),
         geopose=None,
+        hypotheses=_hypotheses(answer),
         neighbours=[_neighbour(each, bundle) for each in answer.neighbours],
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(
@@ -105,8 +111,6 @@ def map_entry_from(bundle: MapBundle) -> schema.MapEntry:
 
 
 def _require_supported(request: schema.LocalizeRequest) -> None:
-    if request.prior is not None:
-        raise NotYetSupportedError("prior: this release cannot use a prior position; leave it out", field="prior")
     if any(request.camera.distortion):
         raise NotYetSupportedError(
             "camera.distortion: this release reads rectified pictures only; rectify both and send no distortion",
@@ -116,6 +120,43 @@ def _require_supported(request: schema.LocalizeRequest) -> None:
 
 def _camera(camera: schema.Camera) -> PinholeCamera:
     return PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def _prior(prior: schema.Prior) -> Prior:
+    if prior.position is not None and prior.wgs84 is not None:
+        raise RequestError("prior: position and wgs84 say the same thing; send one of them", field="prior")
+    if prior.position is None and prior.wgs84 is None and prior.heading_deg is None:
+        raise RequestError(
+            "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out", field="prior"
+        )
+    position = prior.position
+    std_m = next((known.std_m for known in (position, prior.wgs84) if known is not None), 20.0)
+    return Prior(
+        position_m=None if position is None else np.array([position.x, position.y]),
+        position_std_m=std_m,
+        heading_rad=None if prior.heading_deg is None else math.radians(prior.heading_deg),
+        heading_std_rad=math.radians(prior.heading_std_deg),
+    )
+
+
+def _wgs84(prior: schema.Prior | None) -> tuple[float, float] | None:
+    return None if prior is None or prior.wgs84 is None else (prior.wgs84.latitude_deg, prior.wgs84.longitude_deg)
+
+
+def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
+    candidates = distinct_candidates(answer.candidates or ())
+    if not candidates:
+        return []
+    support = np.array([candidate.support for candidate in candidates])
+    shares = np.exp(support - support.max())
+    shares /= shares.sum()
+    return [
+        schema.HypothesisOfPose(
+            pose=_pose(each.T_map_camera, heading_of_camera(each.T_map_camera), None), share=float(share),
+            inliers=each.registered.inliers, similarity=each.similarity,
+        )
+        for each, share in zip(candidates, shares, strict=True)
+    ]  # fmt: skip
 
 
 def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:

@@ -64,7 +64,36 @@ class Depth(_Strict):
     )
     encoding: Literal["auto", "carla"] = Field("auto", description="carla: depth in the 24 bits of a colour PNG")
     max_range_m: float | None = Field(None, gt=0, le=1e5, description="what lies beyond is no measurement")
-    baseline_m: float | None = Field(None, gt=0, le=100, description="of the stereo rig; needed for disparity")
+    baseline_m: float | None = Field(
+        None, gt=0, le=100, description="of the stereo rig; needed for disparity; the rig's disparity offset is then estimated too"
+    )  # fmt: skip
+
+
+class PriorPosition(_Strict):
+    """Where the camera is believed to be, in the map frame, metres."""
+
+    x: float = Field(ge=-1e7, le=1e7)
+    y: float = Field(ge=-1e7, le=1e7)
+    std_m: float = Field(20.0, gt=0, le=1e6, description="standard deviation of each coordinate")
+
+
+class PriorWgs84(_Strict):
+    """Where the camera is believed to be on the Earth; only where the map is georeferenced."""
+
+    latitude_deg: float = Field(ge=-90, le=90)
+    longitude_deg: float = Field(ge=-180, le=180)
+    std_m: float = Field(20.0, gt=0, le=1e6, description="standard deviation of each horizontal coordinate")
+
+
+class Prior(_Strict):
+    """What is known of the camera's pose beforehand. It narrows the search; the pictures may still contradict it."""
+
+    position: PriorPosition | None = None
+    wgs84: PriorWgs84 | None = None
+    heading_deg: float | None = Field(
+        None, ge=-360, le=360, description="of the optical axis, counter-clockwise from map x"
+    )
+    heading_std_deg: float = Field(20.0, gt=0, le=360)
 
 
 class Options(_Strict):
@@ -73,8 +102,12 @@ class Options(_Strict):
     neighbours: int = Field(5, ge=1, le=MOST_NEIGHBOURS, description="k: distinct places that vote and are answered")
     refine: bool = Field(
         True,
-        description="register the depth picture on the map's cloud; false: the pose of retrieval alone, covariance null",
+        description="register the depth picture on the map's cloud; false: the pose of retrieval alone, covariance and confidence null",
     )
+    false_accept_rate: float | None = Field(
+        None, gt=0, lt=1,
+        description="share of the queries taken outside the map that one can live with being LOCALIZED; default: the service's setting",
+    )  # fmt: skip
 
 
 class LocalizeRequest(_Strict):
@@ -97,6 +130,7 @@ class LocalizeRequest(_Strict):
                     },
                     "depth": {"scale_m": 0.001, "kind": "z", "max_range_m": 80},
                     "gravity": {"x": 0.01, "y": 0.999, "z": 0.02},
+                    "prior": {"position": {"x": 12.0, "y": -40.0, "std_m": 20.0}, "heading_deg": 90.0},
                     "options": {"neighbours": 5},
                 }
             ]
@@ -110,7 +144,7 @@ class LocalizeRequest(_Strict):
     T_vehicle_camera: RigidTransform | None = Field(
         None, description="where the camera sits: the vehicle's pose is answered too"
     )
-    prior: Any = Field(None, description="reserved for a prior position; refused in this release")
+    prior: Prior | None = Field(None, description="a position, a heading, or both")
     options: Options = Options()
 
 
@@ -153,6 +187,15 @@ class Neighbour(BaseModel):
     heading_deg: HeadingDeg
 
 
+class HypothesisOfPose(BaseModel):
+    """A place where the pictures may have been taken."""
+
+    pose: Pose = Field(description="T_map_camera")
+    share: float = Field(description="of the support of all hypotheses, 0 to 1")
+    inliers: float = Field(description="share of the depth's weight that lies on the map, 0 to 1")
+    similarity: float = Field(description="of the pictures to the places around, cosine")
+
+
 class MapVersion(BaseModel):
     """Which map answered."""
 
@@ -175,13 +218,19 @@ class LocalizeAnswer(BaseModel):
     """An answer that is not LOCALIZED is still an answer."""
 
     status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"] = Field(
-        description="LOCALIZED wherever the map has neighbours, as long as confidence is null"
+        description="LOCALIZED: act on it; AMBIGUOUS: in the map, but not sure where; OUT_OF_MAP: the map does not show what "
+        "the pictures do. Always LOCALIZED where confidence is null"
     )
-    confidence: float | None = Field(description="probability of being right; null: the map is not calibrated")
+    confidence: float | None = Field(
+        description="probability that the position is within 1 m; null: not calibrated, or nothing was to be registered"
+    )
     street: Street | None = Field(description="null where the map has no streets, or the neighbours lie in none")
     pose: Pose = Field(description="T_map_camera")
     vehicle_pose: Pose | None = Field(description="T_map_vehicle, where T_vehicle_camera was sent")
     geopose: dict[str, Any] | None = Field(description="null: the map is not georeferenced")
+    hypotheses: list[HypothesisOfPose] = Field(
+        description="distinct poses that were registered, the best supported first; empty without registration"
+    )
     neighbours: list[Neighbour]
     map: MapVersion
     timings_ms: TimingsMs

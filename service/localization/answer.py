@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform
 from service.localization.hypotheses import Hypothesis
+from service.localization.refine import Candidate
 from service.localization.search import Neighbour
 from service.localization.street_vote import StreetVote
-from service.registration.register import Registered
 
 Status = Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
 
@@ -33,13 +33,14 @@ class Answer:
     """The answer to one query.
 
     Attributes:
-        status: how far the answer can be trusted; without confidence calibration always LOCALIZED.
-        confidence: calibrated probability of being right; None until the map is calibrated.
+        status: how far the answer can be trusted; LOCALIZED wherever confidence is None.
+        confidence: calibrated probability that the position is within 1 m; None without registration or calibration.
+        evidence: what the confidence rests on, as ``service.maps.calibration.FEATURES``; None without registration.
         street: number of the street's feature; -1 for none. With registration the street under the position, else the vote's.
         vote: the k-nearest vote over streets; None where the map has none.
         T_map_camera: pose of the camera: registered, or of the heaviest cluster.
         covariance: of ``T_map_camera``, translation first, then rotation, map axes, about the camera; None without registration.
-        registration: the best supported pose and its rivals; None where nothing was registered.
+        candidates: the registered poses, the best supported first; None where nothing was registered.
         T_map_vehicle: pose of the vehicle, where the query said how the camera sits on it.
         neighbours: the k most similar distinct places, the best first.
         hypotheses: all clusters of the most similar views, the heaviest first.
@@ -53,7 +54,8 @@ class Answer:
     vote: StreetVote | None
     T_map_camera: Transform
     covariance: Float64[NDArray[np.float64], "6 6"] | None
-    registration: tuple[Registered, ...] | None
+    candidates: tuple[Candidate, ...] | None
+    evidence: Float64[NDArray[np.float64], " F"] | None
     T_map_vehicle: Transform | None
     neighbours: tuple[Neighbour, ...]
     hypotheses: tuple[Hypothesis, ...]

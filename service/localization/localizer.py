@@ -8,13 +8,17 @@ from service.errors import BundleError
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews, query_views
 from service.localization.answer import Answer, Timings
+from service.localization.decide import decide
 from service.localization.encoder import Encoder
+from service.localization.evidence import evidence_of
+from service.localization.frames import Frame
 from service.localization.hypotheses import ClusterSettings, Hypothesis, cluster
 from service.localization.query import Query
 from service.localization.refine import RefineSettings, refine
 from service.localization.search import distinct_places, search_views
 from service.localization.street_vote import StreetVote, vote
 from service.maps.reader import MapBundle
+from service.registration.points import inverse_depth_noise
 
 #: A query is also asked turned a third of the fan's 15 degrees either way: some turn is then within 2.5 degrees of a view.
 TURNS_RAD = tuple(float(turn) for turn in np.deg2rad([-5.0, 0.0, 5.0]))
@@ -64,6 +68,72 @@ class Localizer:
         Raises:
             NoDepthError: the depth picture holds no measurement within the view grid.
         """
+        return self.localize_frames((query,), (np.eye(4),))
+
+    def localize_frames(self, queries: tuple[Query, ...], T_reference_camera: tuple[Transform, ...]) -> Answer:
+        """Answer several picture pairs whose cameras are known against each other, as one.
+
+        Frames of a drive with the odometry between them, or the cameras of a rig at one instant: what a single picture leaves
+        open, all of them together may tell.
+
+        Args:
+            queries: the reference first; its pose is answered, and its options, its prior and its vehicle count.
+            T_reference_camera: of each; the first is the identity.
+
+        Raises:
+            NoDepthError: a depth picture holds no measurement within the view grid.
+        """
+        started = perf_counter()
+        query = queries[0]
+        fused, encoded, looked_up = 0.0, 0.0, []
+        wanted = max(query.neighbours, query.ranked, RANKED)
+        for each, T in zip(queries, T_reference_camera, strict=True):
+            frame, fuse_s, encode_s = self._look_up(each, T, wanted)
+            looked_up.append(frame)
+            fused, encoded = fused + fuse_s, encoded + encode_s
+        frames = tuple(looked_up)
+        matches = frames[0].matches
+        neighbours = distinct_places(matches, wanted)
+        hypotheses = cluster(matches, self.clusters)
+        streets = (
+            None if self.bundle.streets is None else vote(neighbours[: query.neighbours], self.clusters.temperature)
+        )
+        found = perf_counter()
+        refined, evidence = None, None
+        registers = query.refine and self.bundle.cloud is not None
+        if query.refine and self.bundle.cloud is not None:
+            refined = refine(self.bundle, self.bundle.cloud, frames, query.prior, self.refining)
+            evidence = None if refined is None else evidence_of(frames, refined, neighbours, hypotheses)
+        decision = None
+        if registers and self.bundle.calibration is not None:
+            decision = decide(self.bundle.calibration, evidence, query.false_accept_rate)
+        done = perf_counter()
+        T_map_camera = self._pose_of(hypotheses[0], frames[0].views) if refined is None else refined.best.T_map_camera
+        return Answer(
+            status="LOCALIZED" if decision is None else decision.status,
+            confidence=None if decision is None else decision.confidence,
+            street=self._street_of(T_map_camera, streets, registered=refined is not None),
+            vote=streets,
+            T_map_camera=T_map_camera,
+            covariance=None if refined is None else refined.covariance,
+            candidates=None if refined is None else refined.candidates,
+            evidence=evidence,
+            T_map_vehicle=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
+            neighbours=neighbours[: max(query.neighbours, query.ranked)],
+            hypotheses=hypotheses,
+            measured_share=frames[0].views.measured_share,
+            height_m=frames[0].views.height_m,
+            timings=Timings(
+                fuse_ms=1e3 * fused,
+                encode_ms=1e3 * encoded,
+                search_ms=1e3 * (found - started - fused - encoded),
+                register_ms=0.0 if refined is None else 1e3 * (done - found),
+                total_ms=1e3 * (done - started),
+            ),
+        )
+
+    def _look_up(self, query: Query, T_reference_camera: Transform, places: int) -> tuple[Frame, float, float]:
+        """A frame with its most similar views, and the seconds that fusing and encoding took."""
         started = perf_counter()
         views = query_views(
             query.rgb, query.depth_m, query.camera, turns_rad=self.turns_rad,
@@ -72,45 +142,12 @@ class Localizer:
         fused = perf_counter()
         descriptors = self.encoder.encode(views.planes, side="query")
         encoded = perf_counter()
-        wanted = max(query.neighbours, query.ranked, RANKED)
         matches = search_views(
-            self.bundle, descriptors, turns_rad=views.turns_rad, places=wanted, fewest=self.clusters.views
+            self.bundle, descriptors, turns_rad=views.turns_rad, places=places, fewest=self.clusters.views
         )
-        neighbours = distinct_places(matches, wanted)
-        hypotheses = cluster(matches, self.clusters)
-        streets = (
-            None if self.bundle.streets is None else vote(neighbours[: query.neighbours], self.clusters.temperature)
-        )
-        found = perf_counter()
-        refined = None
-        if query.refine and self.bundle.cloud is not None:
-            refined = refine(
-                self.bundle.cloud, query.depth_m, query.camera, matches, R_level_camera=views.R_level_camera,
-                height_m=views.height_m, lidar_height_m=self.bundle.manifest.lidar_height_m, settings=self.refining,
-            )  # fmt: skip
-        done = perf_counter()
-        T_map_camera = self._pose_of(hypotheses[0], views) if refined is None else refined.T_map_camera
-        return Answer(
-            status="LOCALIZED",
-            confidence=None,
-            street=self._street_of(T_map_camera, streets, registered=refined is not None),
-            vote=streets,
-            T_map_camera=T_map_camera,
-            covariance=None if refined is None else refined.covariance,
-            registration=None if refined is None else refined.candidates,
-            T_map_vehicle=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
-            neighbours=neighbours[: max(query.neighbours, query.ranked)],
-            hypotheses=hypotheses,
-            measured_share=views.measured_share,
-            height_m=views.height_m,
-            timings=Timings(
-                fuse_ms=1e3 * (fused - started),
-                encode_ms=1e3 * (encoded - fused),
-                search_ms=1e3 * (found - encoded),
-                register_ms=0.0 if refined is None else 1e3 * (done - found),
-                total_ms=1e3 * (done - started),
-            ),
-        )
+        noise = inverse_depth_noise(query.depth_m)
+        frame = Frame(query, T_reference_camera, views, descriptors, matches, noise)
+        return frame, fused - started, encoded - fused
 
     def _street_of(self, T_map_camera: Transform, voted: StreetVote | None, *, registered: bool) -> int:
         """A metric position says which street it lies in; a cluster of places does not know better than their vote."""

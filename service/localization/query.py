@@ -8,8 +8,11 @@ from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
+from service.localization.prior import Prior
 
 MOST_NEIGHBOURS = 50
+#: One in a hundred, by the worst kind of queries that calibration asked, those of a noisy stereo rig.
+FALSE_ACCEPT_RATE = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,6 +28,9 @@ class Query:
         neighbours: k, the number of distinct places that vote and are answered.
         refine: register the picture on the map's cloud, where the map has one.
         ranked: answer at least this many places, beyond the k that vote; evaluation wants R@10.
+        prior: what is known of the pose beforehand.
+        baseline_m: of the stereo rig that measured the depth; its disparity offset is then estimated along with the pose.
+        false_accept_rate: share of the queries taken outside the map that one can live with being accepted.
     """
 
     rgb: UInt8[NDArray[np.uint8], "H W 3"]
@@ -35,3 +41,6 @@ class Query:
     neighbours: int = 5
     refine: bool = True
     ranked: int = 0
+    prior: Prior | None = None
+    baseline_m: float | None = None
+    false_accept_rate: float = FALSE_ACCEPT_RATE

@@ -1,19 +1,32 @@
-"""From similar views to a metric pose: register the depth picture from every distinct one and keep the best supported."""
+"""From similar views to a metric pose: register the depth from every distinct start and keep the best supported."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.camera import PinholeCamera
-from service.geometry.rigid import Rotation, Transform, transform_from
-from service.localization.search import ViewMatches
-from service.localization.starts import StartSettings, starts_from
+from service.geometry.rigid import Transform, transform_from
+from service.localization.frames import Frame
+from service.localization.prior import Prior
+from service.localization.similar import similarity_at
+from service.localization.starts import StartSettings, level_from, starts_from
+from service.maps.reader import MapBundle
 from service.registration.covariance import covariance_of
+from service.registration.kernel import QueryPoints
 from service.registration.points import PointSettings, points_of
 from service.registration.register import Registered, RegistrationSettings, register
+from service.registration.rendered import Agreement, agreement
 from service.registration.surfel_map import SurfelMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SupportWeights:
+    """What speaks for a candidate against its rivals, in nats: a conditional logit over the candidates of the watch cities' queries."""
+
+    inliers: float = 8.6
+    similarity: float = 97.0
+    likelihood: float = 2.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,53 +34,149 @@ class RefineSettings:
     """Ours, November 2026.
 
     Attributes:
-        fewest_points: a picture with fewer has nothing to register.
-        similarity_weight: of the similarity against the share of inliers, when candidates are compared: a wrong street can
-            fit as well as the right one whose parked cars have changed.
+        fewest_points: pictures with fewer have nothing to register.
+        focal_baseline_px_m: focal length times baseline of a stereo rig; the unit of its disparity offset.
     """
 
     fewest_points: int = 30
-    similarity_weight: float = 1.0
+    focal_baseline_px_m: float = 80.0
+    support: SupportWeights = field(default_factory=SupportWeights)
     starts: StartSettings = field(default_factory=StartSettings)
     points: PointSettings = field(default_factory=PointSettings)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
 
 
+def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> RefineSettings:
+    """The settings with the disparity offset of a known stereo rig free, under a prior (``OFFSET_PX``)."""
+    registration = settings.registration
+    return replace(
+        settings, focal_baseline_px_m=focal_baseline_px_m,
+        registration=replace(
+            registration, middle=replace(registration.middle, free_offset=True, offset=OFFSET_PX),
+            fine=replace(registration.fine, free_offset=True, offset=OFFSET_PX),
+        ),
+    )  # fmt: skip
+
+
+#: Standard deviation of a rig's disparity offset; SGBM's was 0.1 to 0.46 px on real frames (feasibility.md).
+OFFSET_PX = 0.6
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Refined:
-    """The pose, its covariance (6 x 6, translation first, map axes, about the camera), and all candidates, the best first."""
+class Candidate:
+    """A registered pose and what speaks for it.
+
+    Attributes:
+        T_map_camera: of the reference camera.
+        registered: as the solver left it.
+        similarity: to the places around the pose, mean over the frames.
+        agreement: with the map as drawn at the pose, mean over the frames.
+        support: logarithm, against the other candidates.
+    """
 
     T_map_camera: Transform
+    registered: Registered
+    similarity: float
+    agreement: Agreement
+    support: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """Candidates, the best supported first, its covariance (6 x 6, translation first, map axes, about the camera), points used."""
+
+    candidates: tuple[Candidate, ...]
     covariance: Float64[NDArray[np.float64], "6 6"]
-    candidates: tuple[Registered, ...]
+    points: int
+
+    @property
+    def best(self) -> Candidate:
+        """The best supported."""
+        return self.candidates[0]
 
 
 def refine(
-    cloud: SurfelMap, depth_m: Float32[NDArray[np.float32], "h w"], camera: PinholeCamera, matches: ViewMatches, *,
-    R_level_camera: Rotation, height_m: float, lidar_height_m: float, settings: RefineSettings,
-) -> Refined | None:  # fmt: skip
-    """Register a query; None where its picture has too few points.
+    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], prior: Prior | None, settings: RefineSettings
+) -> Refined | None:
+    """Register picture pairs; None where they have too few points.
 
     Args:
-        cloud: the map's.
-        depth_m: z, metres; 0 where nothing was measured.
-        camera: of the same aspect.
-        matches: the most similar views, the best first.
-        R_level_camera: of the query's level.
-        height_m: of the camera above the ground.
-        lidar_height_m: of the map's places above theirs.
+        bundle: the map.
+        cloud: its prepared cloud.
+        frames: the reference first.
+        prior: of the reference's pose, if anything is known.
         settings: how many starts, points and refinements.
     """
-    points = points_of(depth_m, camera, R_level_camera, height_m, settings.points)
-    if len(points) < settings.fewest_points:
+    reference = frames[0]
+    if reference.query.baseline_m is not None:
+        settings = settings_for_rig(settings, reference.focal_px * reference.query.baseline_m)
+    each = [_points(frame, settings) for frame in frames]
+    merged = each[0] if len(each) == 1 else _merged(frames, each)
+    if len(merged) < settings.fewest_points:
         return None
-    starts, similarities = starts_from(
-        matches, height_m=height_m, lidar_height_m=lidar_height_m, settings=settings.starts
+    starts = starts_from(frames, prior, lidar_height_m=bundle.manifest.lidar_height_m, settings=settings.starts)
+    found = register(cloud, merged, starts, reference.views.height_m, settings.registration)
+    candidates = [_candidate(bundle, cloud, frames, each, pose, prior, settings.support) for pose in found]
+    noise = float(np.median([frame.noise for frame in frames]))
+    candidates.sort(key=lambda candidate: -candidate.support)
+    return Refined(tuple(candidates), covariance_of(candidates[0].registered.information, noise), len(merged))
+
+
+def _points(frame: Frame, settings: RefineSettings) -> QueryPoints:
+    query = frame.query
+    return points_of(
+        query.depth_m,
+        query.camera,
+        frame.R_level_camera,
+        frame.views.height_m,
+        settings.points,
+        noise=frame.noise,
+        focal_baseline_px_m=settings.focal_baseline_px_m,
     )
-    found = register(cloud, points, starts, height_m, settings.registration)
-    support = [each.inliers + settings.similarity_weight * similarities[each.hypothesis] for each in found]
-    ranked = tuple(found[k] for k in np.argsort(-np.array(support), kind="stable"))
-    best = ranked[0]
-    return Refined(
-        transform_from(best.R_map_level @ R_level_camera, best.camera_m), covariance_of(best.information), ranked
+
+
+def _merged(frames: tuple[Frame, ...], each: list[QueryPoints]) -> QueryPoints:
+    """All points in the reference's level frame, as if one camera had seen them."""
+    xyz, ray = [], []
+    for frame, points in zip(frames, each, strict=True):
+        T = level_from(frame.T_reference_camera, frame.R_level_camera, frames[0].R_level_camera).astype(np.float32)
+        xyz.append(points.xyz @ T[:3, :3].T + T[:3, 3])
+        ray.append(points.ray @ T[:3, :3].T)
+    rest = (np.concatenate([getattr(points, name) for points in each]) for name in ("sigma", "weight", "q"))
+    return QueryPoints(np.concatenate(xyz), np.concatenate(ray), *rest)
+
+
+def _candidate(
+    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], each: list[QueryPoints], pose: Registered,
+    prior: Prior | None, weights: SupportWeights,
+) -> Candidate:  # fmt: skip
+    similarities, agreements = [], []
+    for frame, points in zip(frames, each, strict=True):
+        own = pose if frame is frames[0] else _seen_from(frame, frames[0], pose)
+        similarities.append(
+            similarity_at(bundle, frame.descriptors, R_map_level=own.R_map_level, camera_m=own.camera_m)
+        )
+        if len(points):
+            agreements.append(agreement(cloud, points, frame.query.camera, frame.R_level_camera, own))
+    similarity, agreed = float(np.mean(similarities)), Agreement.mean(agreements)
+    support = weights.inliers * pose.inliers + weights.similarity * similarity + weights.likelihood * agreed.likelihood
+    if prior is not None:
+        heading = np.arctan2(pose.R_map_level[1, 0], pose.R_map_level[0, 0])
+        support += float(prior.log_weight(pose.camera_m[None, :2], np.array([heading]))[0])
+    T_map_camera = transform_from(pose.R_map_level @ frames[0].R_level_camera, pose.camera_m)
+    return Candidate(T_map_camera, pose, similarity, agreed, support)
+
+
+def _seen_from(frame: Frame, reference: Frame, pose: Registered) -> Registered:
+    """The pose of another frame's level frame that follows from the reference's."""
+    T = level_from(frame.T_reference_camera, frame.R_level_camera, reference.R_level_camera)
+    R = pose.R_map_level @ T[:3, :3]
+    return Registered(
+        R,
+        pose.camera_m + pose.R_map_level @ T[:3, 3],
+        pose.scale,
+        pose.offset,
+        pose.inliers,
+        pose.information,
+        pose.hypothesis,
     )

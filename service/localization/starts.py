@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.localization.search import ViewMatches
+from service.geometry.rigid import Rotation, Transform, inverse, transform_from
+from service.localization.frames import Frame
+from service.localization.prior import Prior
 from service.registration.register import Start
 
 
@@ -15,44 +17,81 @@ class StartSettings:
     """How many starts, and how far apart. Ours, November 2026.
 
     Attributes:
-        most: so many at most; the best few of them are refined.
+        most: so many at most.
+        less_similar: views that are less similar than the best by more than this start nothing.
         apart_m: of two starts of one heading.
         apart_rad: of two starts of one place.
+        temperature: similarity that a prior's logarithm is worth; near the one that training ends at.
     """
 
-    most: int = 8
+    most: int = 16
+    less_similar: float = 0.05
     apart_m: float = 2.2
     apart_rad: float = float(np.deg2rad(20.0))
+    temperature: float = 0.02
 
 
 def starts_from(
-    matches: ViewMatches, *, height_m: float, lidar_height_m: float, settings: StartSettings
-) -> tuple[list[Start], Float64[NDArray[np.float64], " n"]]:
-    """Level poses of the camera at the most similar views that are distinct, and their similarities.
+    frames: tuple[Frame, ...], prior: Prior | None, *, lidar_height_m: float, settings: StartSettings
+) -> list[Start]:
+    """Level poses of the reference camera at the most similar views that are distinct.
 
     Args:
-        matches: the best first.
-        height_m: of the camera above the ground.
-        lidar_height_m: of the places above theirs.
+        frames: the reference first; what another frame resembles is carried over to where the reference then stood.
+        prior: moves what fits it forward; half of the starts are taken without it, since it may be wrong.
+        lidar_height_m: of the places above their ground.
         settings: how many.
     """
-    xy, heading = matches.T_map_place[:, :2, 3], matches.heading_rad
-    kept: list[int] = []
-    for row in range(len(matches)):
+    poses = np.concatenate([_poses(frame, frames[0], lidar_height_m) for frame in frames])
+    similarity = np.concatenate([frame.matches.similarity for frame in frames])
+    heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    allowed = similarity >= similarity.max() - settings.less_similar
+    rank = similarity
+    if prior is not None:
+        rank = similarity + settings.temperature * prior.log_weight(poses[:, :2, 3], heading)
+        allowed |= rank >= rank.max() - settings.less_similar
+    order = np.argsort(-rank, kind="stable")
+    first = settings.most if prior is None else (settings.most + 1) // 2
+    kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, [], first, settings)
+    if prior is not None:
+        order = np.argsort(-similarity, kind="stable")
+        kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, kept, settings.most, settings)
+    return [Start(poses[k, :3, :3], poses[k, :3, 3], number, float(rank[k])) for number, k in enumerate(kept)]
+
+
+def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:
+    """T_map_level of the reference camera for every match of a frame."""
+    matches = frame.matches
+    up = matches.T_map_place[:, :3, 2]
+    x = np.stack([np.cos(matches.heading_rad), np.sin(matches.heading_rad), np.zeros(len(matches))], axis=1)
+    x -= up * (x * up).sum(axis=1, keepdims=True)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    T = np.tile(np.eye(4), (len(matches), 1, 1))
+    T[:, :3, :3] = np.stack([x, np.cross(up, x), up], axis=2)
+    T[:, :3, 3] = matches.T_map_place[:, :3, 3] + (frame.views.height_m - lidar_height_m) * up
+    if frame is reference:
+        return T
+    T_level_level = level_from(frame.T_reference_camera, frame.R_level_camera, reference.R_level_camera)
+    carried: Float64[NDArray[np.float64], "n 4 4"] = T @ inverse(T_level_level)
+    return carried
+
+
+def level_from(T_reference_camera: Transform, R_level_camera: Rotation, R_level_reference: Rotation) -> Transform:
+    """T_level_level: from a frame's level frame, at its camera, to the reference's at its own."""
+    R = R_level_reference @ T_reference_camera[:3, :3] @ R_level_camera.T
+    return transform_from(R, R_level_reference @ T_reference_camera[:3, 3])
+
+
+def _distinct(
+    rows: NDArray[np.intp], xy: NDArray[np.float64], heading: NDArray[np.float64], kept: list[int], most: int, settings: StartSettings
+) -> list[int]:  # fmt: skip
+    """``kept`` and as many of the rows, in their order, as stand apart from all before them."""
+    kept = list(kept)
+    for row in rows:
+        if len(kept) == most:
+            break
         near = np.hypot(*(xy[kept] - xy[row]).T) < settings.apart_m
         alike = np.cos(heading[kept] - heading[row]) > np.cos(settings.apart_rad)
         if not (near & alike).any():
-            kept.append(row)
-            if len(kept) == settings.most:
-                break
-    starts = [_start(matches, row, number, height_m - lidar_height_m) for number, row in enumerate(kept)]
-    return starts, matches.similarity[kept]
-
-
-def _start(matches: ViewMatches, row: int, number: int, above_lidar_m: float) -> Start:
-    T, heading = matches.T_map_place[row], float(matches.heading_rad[row])
-    up = T[:3, 2]
-    x = np.array([np.cos(heading), np.sin(heading), 0.0])
-    x = x - up * (x @ up)
-    x = x / np.linalg.norm(x)
-    return Start(np.stack([x, np.cross(up, x), up], axis=1), T[:3, 3] + above_lidar_m * up, number)
+            kept.append(int(row))
+    return kept

@@ -16,6 +16,8 @@ ENCODER_FILE = "encoder.onnx"
 CALIBRATION_FILE, PREVIEW_FILE = "calibration.json", "preview.webp"
 CLOUD_FOLDER = "cloud"
 
+UNCALIBRATED = {"calibrated": False, "why": "nobody calibrated it; answers carry confidence null"}
+
 #: A place: pose of the levelled LiDAR (x forward, z up) and the number of its street's feature, -1 for none.
 PLACE = np.dtype([("T_map_place", "<f8", (4, 4)), ("street", "<i4")])
 #: A view: the number of its place and its heading, counter-clockwise from map x.
@@ -39,7 +41,7 @@ class BundleContent:
         encoder: the ONNX file that made them.
         streets: GeoJSON, or None where the map knows no streets.
         cloud: the prepared cloud, or None where there is nothing to register on.
-        calibration: confidence calibration; empty until there is one.
+        calibration: confidence calibration; by default there is none.
         preview_webp: the map from above; may be empty.
         parameters: further numbers the map was built with; ``lidar_height_m`` must be there.
     """
@@ -58,7 +60,7 @@ class BundleContent:
     parameters: Mapping[str, float]
     streets: Mapping[str, Any] | None = None
     cloud: SurfelMap | None = None
-    calibration: Mapping[str, Any] = field(default_factory=dict)
+    calibration: Mapping[str, Any] = field(default_factory=lambda: dict(UNCALIBRATED))
     preview_webp: bytes = b""
     georeference: Mapping[str, Any] | None = None
     licence: str = ""

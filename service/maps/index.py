@@ -74,3 +74,8 @@ class ViewIndex:
         """Similarities (cosines) and numbers of the k most similar views of each query, the best first."""
         similarities, views = self._index.search(np.ascontiguousarray(descriptors), min(k, len(self)))
         return similarities, views
+
+    def vectors(self, views: Int64[NDArray[np.int64], " n"]) -> Descriptors:
+        """Descriptors of some views."""
+        found: Descriptors = self._index.reconstruct_batch(np.ascontiguousarray(views))
+        return found

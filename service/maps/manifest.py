@@ -3,14 +3,15 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
 from service.errors import BundleError
+from service.geometry.earth import Georeference
 from service.imaging.view_grid import ViewGrid
 
-FORMAT = 2
+FORMAT = 3
 FILE = "manifest.json"
 #: Parts of the manifest that say when and with what a bundle was made, not what is in it.
 _CIRCUMSTANCES = {"version", "made_at", "tool_versions"}
@@ -56,7 +57,7 @@ class FileEntry(_Frozen):
 class Manifest(_Frozen):
     """The first file that is read and the last that is written."""
 
-    format: Literal[2]
+    format: Literal[3]
     name: Name
     version: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
     made_at: AwareDatetime
@@ -67,7 +68,7 @@ class Manifest(_Frozen):
     parameters: dict[str, float]
     encoder_sha256: Sha256
     counts: Counts
-    georeference: dict[str, Any] | None
+    georeference: dict[str, float] | None
     licence: str
     files: dict[str, FileEntry]
     tool_versions: dict[str, str]
@@ -145,11 +146,23 @@ def _require_consistent(path: Path, manifest: Manifest) -> None:
         what = "the limits of the view grid are the wrong way round"
     elif "lidar_height_m" not in manifest.parameters:
         what = "parameters lacks lidar_height_m"
+    elif wrong := _not_on_earth(manifest.georeference):
+        what = f"georeference: {wrong}"
     elif bad := [name for name in manifest.files if not is_confined(name)]:
         what = f"the file {bad[0]!r} would lie outside the bundle"
     else:
         return
     raise BundleError(f"{path}: {what}; copy or build the bundle again", field=FILE)
+
+
+def _not_on_earth(georeference: dict[str, float] | None) -> str | None:
+    """What is wrong with it, if anything."""
+    try:
+        if georeference is not None:
+            Georeference(**georeference)
+    except (TypeError, ValueError) as error:
+        return str(error)
+    return None
 
 
 def is_confined(name: str) -> bool:

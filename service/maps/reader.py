@@ -1,7 +1,6 @@
 """Open a map bundle: check everything, then map it into memory."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,11 @@ from jaxtyping import Bool, Float64, Int32
 from numpy.typing import NDArray
 
 from service.errors import BundleError
+from service.geometry.earth import Georeference
 from service.imaging.view_grid import ViewGrid
 from service.maps import content as parts
 from service.maps import index, streets
+from service.maps.calibration import Calibration, read_calibration
 from service.maps.index import ViewIndex
 from service.maps.manifest import Manifest, read_manifest
 from service.maps.streets import Streets
@@ -36,7 +37,7 @@ class MapBundle:
     views: NDArray[Any]
     view_index: ViewIndex
     streets: Streets | None
-    calibration: Mapping[str, Any]
+    calibration: Calibration | None
     cloud: SurfelMap | None
 
     @classmethod
@@ -61,7 +62,9 @@ class MapBundle:
             views=_load(path / parts.VIEWS_FILE, expected=parts.VIEW),
             view_index=ViewIndex.open(path / index.FILE),
             streets=_streets(path, manifest),
-            calibration=_json_object(path / parts.CALIBRATION_FILE),
+            calibration=read_calibration(
+                (path / parts.CALIBRATION_FILE).read_bytes(), path=str(path / parts.CALIBRATION_FILE)
+            ),
             cloud=_cloud(path, manifest, verify=verify),
         )
         _require_consistent(bundle)
@@ -95,6 +98,12 @@ class MapBundle:
         """Heading of each view in the map frame."""
         headings: Float64[NDArray[np.float64], " V"] = self.views["heading_rad"]
         return headings
+
+    @property
+    def earth(self) -> Georeference | None:
+        """Where the map lies on the Earth, where that is known."""
+        georeference = self.manifest.georeference
+        return None if georeference is None else Georeference(**georeference)
 
     def encoder_bytes(self) -> bytes:
         """The encoder that made the descriptors."""
@@ -181,6 +190,8 @@ def _require_consistent(bundle: MapBundle) -> None:
         raise _defect(path / parts.VIEWS_FILE, "a view belongs to a place that is not there")
     if bundle.place_street.min() < -1 or bundle.place_street.max() >= streets_found:
         raise _defect(path / parts.PLACES_FILE, "a place lies in a street that is not there")
+    if not np.array_equal(bundle.view_place, np.repeat(np.arange(counts.places), bundle.manifest.headings)):
+        raise _defect(path / parts.VIEWS_FILE, "views do not lie place by place, a fan each")
     if not np.isfinite(bundle.T_map_place).all() or not np.isfinite(bundle.view_heading_rad).all():
         raise _defect(path / parts.PLACES_FILE, "a pose or a heading is not finite")
 

@@ -50,18 +50,22 @@ typedef struct {
     double inliers, seen, cost;
 } State;
 
-static inline int32_t nearest_at(const Grid *g, double x, double y, double z)
+#define HEIGHT 60.0 /* m */
+#define AHEAD 32 /* points whose memory is fetched together: one by one, most of the time would go into waiting for it */
+
+/* Where the number of the surfel nearest to a point is kept; 0 far from every surface. */
+static inline const int32_t *cell_at(const Grid *g, double x, double y, double z)
 {
-    int64_t ix = (int64_t)floor((x - g->ox) / g->cell);
-    int64_t iy = (int64_t)floor((y - g->oy) / g->cell);
-    int64_t iz = (int64_t)floor((z - g->oz) / g->cell);
-    if (ix < 0 || iy < 0 || iz < 0) return -1;
-    int64_t a = ix / BLOCK, b = iy / BLOCK, c = iz / BLOCK;
-    if (a >= g->bx || b >= g->by || c >= g->bz) return -1;
+    /* Without floor(), a call on a plain x86-64: what is not negative may be cut off instead. */
+    double scale = 1.0 / g->cell, fx = (x - g->ox) * scale, fy = (y - g->oy) * scale, fz = (z - g->oz) * scale;
+    if (!(fx >= 0 && fy >= 0 && fz >= 0 && fx < 1e9 && fy < 1e9 && fz < 1e9)) return 0;
+    uint32_t ix = (uint32_t)(int64_t)fx, iy = (uint32_t)(int64_t)fy, iz = (uint32_t)(int64_t)fz;
+    uint32_t a = ix / BLOCK, b = iy / BLOCK, c = iz / BLOCK;
+    if (a >= g->bx || b >= g->by || c >= g->bz) return 0;
     int32_t block = g->block[(a * g->by + b) * g->bz + c];
-    if (block < 0) return -1;
-    int64_t inside = ((ix % BLOCK) * BLOCK + iy % BLOCK) * BLOCK + iz % BLOCK;
-    return g->nearest[(int64_t)block * BLOCK_CELLS + inside];
+    if (block < 0) return 0;
+    uint32_t inside = ((ix % BLOCK) * BLOCK + iy % BLOCK) * BLOCK + iz % BLOCK;
+    return g->nearest + (int64_t)block * BLOCK_CELLS + inside;
 }
 
 /* Cholesky solution of A x = b in place; 0 where A is not positive definite. */
@@ -116,6 +120,23 @@ static inline void place(const Query *q, int64_t i, const State *s, double e_sca
     for (int k = 0; k < 3; k++) y[k] = s->R[3 * k] * px + s->R[3 * k + 1] * py + s->R[3 * k + 2] * pz;
 }
 
+/* Points first .. first + count - 1 as they stand in the map: ``y`` turned, ``w`` in the world, and their nearest surfels. */
+static void look_up(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
+                    int64_t count, double y[][3], double w[][3], double *stretch, const Surfel **found)
+{
+    const int32_t *cells[AHEAD];
+    for (int64_t k = 0; k < count; k++) {
+        place(q, first + k, s, e_scale, y[k], stretch + k);
+        for (int a = 0; a < 3; a++) w[k][a] = y[k][a] + s->t[a];
+        cells[k] = cell_at(g, w[k][0], w[k][1], w[k][2]);
+        if (cells[k]) __builtin_prefetch(cells[k]);
+    }
+    for (int64_t k = 0; k < count; k++) {
+        found[k] = cells[k] && *cells[k] >= 0 ? surfels + *cells[k] : 0;
+        if (found[k]) __builtin_prefetch(found[k]);
+    }
+}
+
 /* The camera stands at its height above the anchor's ground, upright on it; scale and offset are small. */
 static void add_priors(const Options *o, const State *s, double n, double H[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])
 {
@@ -159,15 +180,16 @@ static void align_one(const Grid *g, const Surfel *surfels, const Query *q, cons
         double share = o->iterations > 1 ? (double)it / (double)(o->iterations - 1) : 1.0;
         double robust = o->robust_first * pow(o->robust_last / o->robust_first, share);
         double H[UNKNOWNS][UNKNOWNS] = {{0}}, b[UNKNOWNS] = {0}, gr[UNKNOWNS], e_scale = exp(s->log_scale);
-        double total = 0;
+        double total = 0, batch_y[AHEAD][3], batch_w[AHEAD][3], batch_stretch[AHEAD];
+        const Surfel *batch_found[AHEAD];
         for (int64_t i = 0; i < q->count; i++) {
-            double y[3], stretch;
-            place(q, i, s, e_scale, y, &stretch);
-            double wx = y[0] + s->t[0], wy = y[1] + s->t[1], wz = y[2] + s->t[2];
-            int32_t j = nearest_at(g, wx, wy, wz);
-            if (j < 0) continue;
-            const Surfel *m = surfels + j;
-            double dx = wx - m->x, dy = wy - m->y, dz = wz - m->z;
+            int64_t in = i % AHEAD, left = q->count - i;
+            if (in == 0)
+                look_up(g, surfels, q, s, e_scale, i, left < AHEAD ? left : AHEAD, batch_y, batch_w, batch_stretch, batch_found);
+            const double *y = batch_y[in], stretch = batch_stretch[in];
+            const Surfel *m = batch_found[in];
+            if (!m) continue;
+            double dx = batch_w[in][0] - m->x, dy = batch_w[in][1] - m->y, dz = batch_w[in][2] - m->z;
             if (dx * dx + dy * dy + dz * dz > reach2) continue;
             double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
             for (int k = 0; k < 3; k++)
@@ -208,17 +230,19 @@ static void align_one(const Grid *g, const Surfel *surfels, const Query *q, cons
 static void score_one(const Grid *g, const Surfel *surfels, const Query *q, double tolerance, double height_min, State *s)
 {
     double inliers = 0, total = 0, e_scale = exp(s->log_scale);
+    double batch_y[AHEAD][3], batch_w[AHEAD][3], batch_stretch[AHEAD];
+    const Surfel *batch_found[AHEAD];
     for (int64_t i = 0; i < q->count; i++) {
-        double y[3], stretch, sigma = q->sigma[i];
-        place(q, i, s, e_scale, y, &stretch);
-        double wx = y[0] + s->t[0], wy = y[1] + s->t[1], wz = y[2] + s->t[2];
-        if (y[2] < height_min) continue;
+        int64_t in = i % AHEAD, left = q->count - i;
+        if (in == 0)
+            look_up(g, surfels, q, s, e_scale, i, left < AHEAD ? left : AHEAD, batch_y, batch_w, batch_stretch, batch_found);
+        double sigma = q->sigma[i];
+        if (batch_y[in][2] < height_min) continue;
         double w = q->weight[i] / (1 + 4 * sigma * sigma);
         total += w;
-        int32_t j = nearest_at(g, wx, wy, wz);
-        if (j < 0) continue;
-        const Surfel *m = surfels + j;
-        double dx = wx - m->x, dy = wy - m->y, dz = wz - m->z;
+        const Surfel *m = batch_found[in];
+        if (!m) continue;
+        double dx = batch_w[in][0] - m->x, dy = batch_w[in][1] - m->y, dz = batch_w[in][2] - m->z;
         if (dx * dx + dy * dy + dz * dz > 1.0 + 4 * sigma * sigma) continue;
         double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
         for (int k = 0; k < 3; k++)
@@ -298,7 +322,13 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
     const float top = (float)(-(cy + 4) / fy), bottom = (float)((height - cy + 4) / fy);
     for (int64_t n = 0; n < tile_count; n++) {
         const double *tile = tiles + 4 * n;
-        if (hypot(tile[0] - t[0], tile[1] - t[1]) > tile_reach) continue;
+        double ex = tile[0] - t[0], ey = tile[1] - t[1];
+        if (hypot(ex, ey) > tile_reach) continue;
+        /* Tiles beside and behind the field of view; HEIGHT is how far surfaces may rise above or fall below the camera. */
+        double ahead = R[2] * ex + R[5] * ey, beside = R[0] * ex + R[3] * ey;
+        double half = tile_reach - reach + HEIGHT * fabs(R[8]), wide = tile_reach - reach + HEIGHT * fabs(R[6]);
+        if (ahead < -half || beside - right * ahead > hypot(1, right) * fmax(half, wide) ||
+            left * ahead - beside > hypot(1, left) * fmax(half, wide)) continue;
         const Surfel *m = surfels + (int64_t)tile[2], *end = m + (int64_t)tile[3];
         for (; m < end; m++) {
             float dx = m->x - tx, dy = m->y - ty, dz = m->z - tz;

@@ -122,6 +122,10 @@ class QueryPoints:
     def __len__(self) -> int:
         return len(self.sigma)
 
+    def weighing_at_least(self, weight: float) -> "QueryPoints":
+        """The same points, none of less weight."""
+        return QueryPoints(self.xyz, self.ray, self.sigma, np.maximum(self.weight, np.float32(weight)), self.q)
+
     def subset(self, rows: NDArray[np.intp]) -> "QueryPoints":
         """Some of the points."""
         return QueryPoints(*(np.ascontiguousarray(getattr(self, name)[rows]) for name in self.__slots__))

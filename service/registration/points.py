@@ -51,7 +51,7 @@ class PointSettings:
 
 def inverse_depth_noise(depth_m: Float32[NDArray[np.float32], "H W"]) -> float:
     """Standard deviation of one pixel's inverse depth, 1/m: from second differences along rows."""
-    picture = depth_m[::2]
+    picture = depth_m[::4]
     valid = picture > 0
     inverse = np.where(valid, 1.0 / np.where(valid, picture, 1), 0).astype(np.float32)
     step = 2  # neighbours at one pixel may have been smoothed together
@@ -64,7 +64,7 @@ def inverse_depth_noise(depth_m: Float32[NDArray[np.float32], "H W"]) -> float:
 
 def points_of(
     depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R_level_camera: Rotation, height_m: float,
-    settings: PointSettings, *, focal_baseline_px_m: float = 80.0,
+    settings: PointSettings, *, noise: float | None = None, focal_baseline_px_m: float = 80.0,
 ) -> QueryPoints:  # fmt: skip
     """Thin a depth picture to points of its level frame.
 
@@ -74,6 +74,7 @@ def points_of(
         R_level_camera: from the optical to the level frame.
         height_m: of the camera above the ground.
         settings: how many, and which.
+        noise: standard deviation of one pixel's inverse depth, 1/m; read off the picture where it is not given.
         focal_baseline_px_m: of the camera; only scales the unit of the disparity offset.
     """
     height, width = depth_m.shape
@@ -93,7 +94,7 @@ def points_of(
     # The median of an even number lies between the two middle ones: the lower alone would push every surface away.
     pick[1] = 0.5 * (pick[1] + inverse[at, np.maximum(count // 2, 0)])
     low, middle, high = (np.where(enough, p, 1.0) for p in pick)
-    noise = inverse_depth_noise(depth_m)
+    noise = inverse_depth_noise(depth_m) if noise is None else noise
     spread = (high - low) - 2.56 * noise
     z = (1.0 / middle).astype(np.float32)
     keep = enough & (spread < settings.edge * middle) & (z < settings.reach_m)

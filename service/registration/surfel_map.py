@@ -1,4 +1,4 @@
-"""The prepared cloud of a map: surfels, the tiles they are sorted by, and two grids of nearest surfels.
+"""The prepared cloud of a map: surfels, the tiles they are sorted by, and a grid of nearest surfels.
 
 All of it is made when the map is built and read as it lies on the disk; a request builds nothing.
 """
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 from service.errors import BundleError
 from service.registration.kernel import BLOCK, SURFEL, NearestGrid, nearest_grid
 
-#: Cells of the grids and how far from a surface they reach, metres: the fine one for the end, the coarse one for the start.
-FINE_CELL_M, FINE_REACH_M = 0.4, 1.2
-COARSE_CELL_M, COARSE_REACH_M = 0.9, 2.7
+#: Cells of the grid and how far from a surface they reach, metres.
+CELL_M, REACH_M = 0.4, 1.2
+#: Edge of a tile, metres.
+TILE_M = 40.0
 
 
 _FLOATS, _NUMBERS = np.dtype("<f8"), np.dtype("<i4")
 #: Type and shape of every array; -1 is any length.
 _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "origin": (_FLOATS, (3,)), "surfels": (SURFEL, (-1,)), "tiles": (_FLOATS, (-1, 4)),
-    "coarse_frame": (_FLOATS, (4,)), "coarse_block": (_NUMBERS, (-1, -1, -1)), "coarse_nearest": (_NUMBERS, (-1, BLOCK**3)),
-    "fine_frame": (_FLOATS, (4,)), "fine_block": (_NUMBERS, (-1, -1, -1)), "fine_nearest": (_NUMBERS, (-1, BLOCK**3)),
+    "grid_frame": (_FLOATS, (4,)), "grid_block": (_NUMBERS, (-1, -1, -1)), "grid_nearest": (_NUMBERS, (-1, BLOCK**3)),
 }  # fmt: skip
 
 
@@ -36,36 +36,28 @@ class SurfelMap:
         origin_m: of the surfels' frame, map frame.
         surfels: of dtype ``SURFEL``, sorted by tile.
         tiles: centre x, y (the surfels' frame, m), first surfel, count.
-        coarse: grid with a wide reach.
-        fine: grid with a narrow one.
+        grid: of the surfel nearest to each cell.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
     surfels: NDArray[Any]
     tiles: Float64[NDArray[np.float64], "n 4"]
-    coarse: NearestGrid
-    fine: NearestGrid
+    grid: NearestGrid
 
     @classmethod
     def prepare(
         cls, origin_m: Float64[NDArray[np.float64], "3"], surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"]
     ) -> "SurfelMap":  # fmt: skip
-        """Build the grids; seconds for a district."""
-        return cls(
-            origin_m,
-            surfels,
-            tiles,
-            nearest_grid(surfels, cell_m=COARSE_CELL_M, reach_m=COARSE_REACH_M),
-            nearest_grid(surfels, cell_m=FINE_CELL_M, reach_m=FINE_REACH_M),
-        )
+        """Build the grid; seconds for a district."""
+        return cls(origin_m, surfels, tiles, nearest_grid(surfels, cell_m=CELL_M, reach_m=REACH_M))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What is written, by name; ``from_arrays`` reads it again."""
-        found: dict[str, NDArray[Any]] = {"origin": self.origin_m, "surfels": self.surfels, "tiles": self.tiles}
-        for name, grid in (("coarse", self.coarse), ("fine", self.fine)):
-            found[f"{name}_frame"] = np.array([*grid.origin_m, grid.cell_m])
-            found[f"{name}_block"], found[f"{name}_nearest"] = grid.block, grid.nearest
-        return found
+        return {
+            "origin": self.origin_m, "surfels": self.surfels, "tiles": self.tiles,
+            "grid_frame": np.array([*self.grid.origin_m, self.grid.cell_m]), "grid_block": self.grid.block,
+            "grid_nearest": self.grid.nearest,
+        }  # fmt: skip
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], *, verify: bool = True) -> "SurfelMap":
@@ -85,12 +77,9 @@ class SurfelMap:
             fits = len(shape) == array.ndim and all(w in (-1, has) for w, has in zip(shape, array.shape, strict=True))
             if array.dtype != dtype or not fits or not array.flags["C_CONTIGUOUS"]:
                 raise _defect(name, f"it holds {array.dtype} of shape {array.shape}")
-        grids = [
-            NearestGrid(frame[:3], float(frame[3]), arrays[f"{name}_block"], arrays[f"{name}_nearest"])
-            for name in ("coarse", "fine")
-            for frame in [np.array(arrays[f"{name}_frame"])]
-        ]
-        found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), *grids)
+        frame = np.array(arrays["grid_frame"])
+        grid = NearestGrid(frame[:3], float(frame[3]), arrays["grid_block"], arrays["grid_nearest"])
+        found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), grid)
         if verify:
             found.require_consistent()
         return found
@@ -101,11 +90,10 @@ class SurfelMap:
         Raises:
             BundleError: naming the array.
         """
-        for name, grid in (("coarse", self.coarse), ("fine", self.fine)):
-            if not np.isfinite(grid.origin_m).all() or not grid.cell_m > 0:
-                raise _defect(f"{name}_frame", "it is no frame")
-            _require_indices(f"{name}_block", grid.block, len(grid.nearest))
-            _require_indices(f"{name}_nearest", grid.nearest, len(self.surfels))
+        if not np.isfinite(self.grid.origin_m).all() or not self.grid.cell_m > 0:
+            raise _defect("grid_frame", "it is no frame")
+        _require_indices("grid_block", self.grid.block, len(self.grid.nearest))
+        _require_indices("grid_nearest", self.grid.nearest, len(self.surfels))
         first, count = self.tiles[:, 2], self.tiles[:, 3]
         if not np.isfinite(self.tiles).all() or (first < 0).any() or (count < 0).any():
             raise _defect("tiles", "a number makes no sense")

@@ -6,9 +6,11 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
 from service.localization.answer import Answer
+from service.localization.prior import Prior
 from service.localization.query import Query
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
@@ -24,6 +26,8 @@ class EncodedQuery:
     Attributes:
         map_name: which map; None where only one is mounted.
         scale_m: metres for each stored unit; None lets the format decide.
+        prior_wgs84: latitude and longitude (degrees) of the prior's position, where it was given so.
+        false_accept_rate: None takes the service's setting.
     """
 
     rgb: bytes
@@ -39,6 +43,9 @@ class EncodedQuery:
     T_vehicle_camera: NDArray[np.float64] | None = None
     neighbours: int = 5
     refine: bool = True
+    prior: Prior | None = None
+    prior_wgs84: tuple[float, float] | None = None
+    false_accept_rate: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +91,7 @@ class Engine:
         """
         localizer = self.registry.get(encoded.map_name)
         started = perf_counter()
-        query = self._decode(encoded)
+        query = replace(self._decode(encoded), prior=_prior_in(encoded, localizer.bundle))
         decode_ms = 1e3 * (perf_counter() - started)
         answer = localizer.localize(query)
         timings = replace(answer.timings, decode_ms=decode_ms, total_ms=answer.timings.total_ms + decode_ms)
@@ -117,4 +124,19 @@ class Engine:
             T_vehicle_camera=encoded.T_vehicle_camera,
             neighbours=encoded.neighbours,
             refine=encoded.refine,
+            baseline_m=encoded.baseline_m,
+            false_accept_rate=encoded.false_accept_rate or self.settings.false_accept_rate,
         )
+
+
+def _prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:
+    """The prior in the map's frame."""
+    if encoded.prior is None or encoded.prior_wgs84 is None:
+        return encoded.prior
+    earth = bundle.earth
+    if earth is None:
+        raise RequestError(
+            f"prior.wgs84: the map {bundle.name!r} is not georeferenced; send prior.position in its own frame", field="prior.wgs84"
+        )  # fmt: skip
+    latitude_deg, longitude_deg = encoded.prior_wgs84
+    return replace(encoded.prior, position_m=earth.to_map(latitude_deg, longitude_deg, earth.height_m)[:2])

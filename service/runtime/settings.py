@@ -8,6 +8,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.errors import RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
+from service.localization.query import FALSE_ACCEPT_RATE
 
 
 class Limits(BaseModel):
@@ -34,6 +35,10 @@ class Settings(BaseSettings):
     threads: int | None = Field(None, ge=1, le=256, description="requests worked on at once; default: the usable cores")
     queue: int = Field(64, ge=0, le=100_000, description="requests that may wait for a thread before 503")
     request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
+    false_accept_rate: float = Field(
+        FALSE_ACCEPT_RATE, gt=0, lt=1,
+        description="share of the queries taken outside the map that one can live with being answered LOCALIZED",
+    )  # fmt: skip
     limits: Limits = Limits()
 
     @field_validator("maps", mode="before")

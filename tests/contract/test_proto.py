@@ -15,7 +15,7 @@ def fields_of(message: str) -> set[str]:
     text = (PROTO / "streetfix" / "v1" / "localization.proto").read_text()
     body = re.search(rf"^message {message} {{(.*?)^}}", text, flags=re.MULTILINE | re.DOTALL)
     assert body is not None
-    return set(re.findall(r"^  (?:optional |repeated )?\w+ (\w+) = \d+;", body[1], flags=re.MULTILINE))
+    return set(re.findall(r"^ +(?:optional |repeated )?\w+ (\w+) = \d+;", body[1], flags=re.MULTILINE))
 
 
 def test_the_proto_is_lint_clean(tmp_path: Path) -> None:
@@ -34,9 +34,21 @@ def test_the_proto_is_formatted(tmp_path: Path) -> None:
 
 
 def test_messages_have_the_fields_of_the_rest_contract() -> None:
-    same = ["Camera", "Options", "Street", "Pose", "Neighbour", "MapVersion", "RigidTransform"]
+    same = [
+        "Camera",
+        "Options",
+        "Street",
+        "Pose",
+        "Neighbour",
+        "MapVersion",
+        "RigidTransform",
+        "Prior",
+        "PriorPosition",
+        "PriorWgs84",
+    ]
     for name in same:
         assert fields_of(name) == set(getattr(schema, name).model_fields), name
+    assert fields_of("Hypothesis") == set(schema.HypothesisOfPose.model_fields)
 
 
 def test_the_answer_has_the_fields_of_the_rest_contract() -> None:
@@ -46,6 +58,6 @@ def test_the_answer_has_the_fields_of_the_rest_contract() -> None:
 
 def test_the_request_has_the_fields_of_the_rest_contract() -> None:
     renamed = {"depth": "depth_format", "T_vehicle_camera": "vehicle_from_camera"}
-    expected = {renamed.get(name, name) for name in schema.LocalizeRequest.model_fields} - {"prior"}
+    expected = {renamed.get(name, name) for name in schema.LocalizeRequest.model_fields}
     assert fields_of("LocalizeRequest") == expected | {"rgb", "depth"}
     assert fields_of("DepthFormat") == set(schema.Depth.model_fields)

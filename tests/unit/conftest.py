@@ -1,9 +1,107 @@
-"""A simulated drive and its map, for the packages that stand on both; made once, and only where a test asks for them."""
+"""What several packages' tests stand on: a simulated drive and its map, made once and only where a test asks for them; factories."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+
+from model_training.mapping.voxel_map import VoxelMap
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
+from service.imaging.query_view import QueryViews
+from service.localization.frames import Frame
+from service.localization.query import Query
+from service.localization.search import ViewMatches
+from service.maps.calibration import FEATURES, Calibration
+from service.maps.content import BundleContent
+from service.maps.reader import MapBundle
+from service.maps.writer import write_bundle
+from service.registration.surfel_map import SurfelMap
+
+BERLIN = {"latitude_deg": 52.52, "longitude_deg": 13.405, "height_m": 70.0}
+
+
+def matches_of(xyz: Any, heading_deg: Any, similarity: Any, *, R_map_place: Any = None) -> ViewMatches:
+    """One view for each place."""
+    n, R = len(xyz), np.eye(3) if R_map_place is None else R_map_place
+    poses = [transform_from(R, np.array(each, np.float64)) for each in xyz]
+    return ViewMatches(
+        np.arange(n), np.array(similarity, np.float64), np.arange(n, dtype=np.int32), np.zeros(n, np.int32),
+        np.deg2rad(np.array(heading_deg, np.float64)), np.stack(poses),
+    )  # fmt: skip
+
+
+def frame_of(
+    matches: ViewMatches, *, depth_m: Any = None, camera: PinholeCamera | None = None, R_level_camera: Any = R_BODY_OPTICAL,
+    height_m: float = 1.4, T_reference_camera: Any = None, descriptors: Any = ((1.0, 0.0),), noise: float = 1e-4,
+) -> Frame:  # fmt: skip
+    """A picture pair that was looked up with these matches; the pictures themselves are black and empty unless given."""
+    camera = camera or PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
+    depth_m = np.zeros((camera.height, camera.width), np.float32) if depth_m is None else depth_m
+    query = Query(rgb=np.zeros((*depth_m.shape, 3), np.uint8), depth_m=depth_m, camera=camera)
+    turned = np.array(descriptors, np.float32)
+    views = QueryViews(
+        np.zeros((len(turned), 6, 2, 2), np.float32), (0.0,) * len(turned), np.array(R_level_camera), height_m, 0.75
+    )
+    T = np.eye(4) if T_reference_camera is None else T_reference_camera
+    return Frame(query, T, views, turned, matches, noise)
+
+
+def calibration_document(**changed: Any) -> dict[str, Any]:
+    """A good ``calibration.json``: whatever the evidence, it is right at even odds and in the map three times in four."""
+    count = len(FEATURES)
+    flat = {"mean": [0.0] * count, "spread": [1.0] * count, "weights": [0.0] * (3 * count)}
+    document = {
+        "calibrated": True, "features": list(FEATURES), "right": flat | {"bias": 0.0}, "known": flat | {"bias": float(np.log(3.0))},
+        "thresholds": [{"false_accept_rate": 0.001, "confidence": 0.9}, {"false_accept_rate": 0.01, "confidence": 0.4}],
+        "site": None, "measured_on": {"cities": "none", "queries": 0},
+    }  # fmt: skip
+    return document | changed
+
+
+@pytest.fixture(scope="session")
+def matches_at() -> Callable[..., ViewMatches]:
+    return matches_of
+
+
+@pytest.fixture(scope="session")
+def frame_with() -> Callable[..., Frame]:
+    return frame_of
+
+
+@pytest.fixture(scope="session")
+def calibration_json() -> Callable[..., dict[str, Any]]:
+    return calibration_document
+
+
+@pytest.fixture(scope="session")
+def calibration_of() -> Callable[..., Calibration]:
+    return lambda **changed: Calibration.model_validate(calibration_document(**changed))
+
+
+@pytest.fixture(scope="session")
+def bundle_at(
+    content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., MapBundle]:
+    """A map of places at some positions, with the same headings (degrees) at each; a row of descriptors a view."""
+
+    def bundle(xyz: Any, heading_deg: Any, descriptors: Any, **changed: Any) -> MapBundle:
+        places, headings = len(xyz), np.deg2rad(np.array(heading_deg, np.float64))
+        content = content_of(
+            T_map_place=np.stack([transform_from(np.eye(3), np.array(each, np.float64)) for each in xyz]),
+            place_street=np.full(places, -1, np.int32), streets=None, headings=len(headings),
+            view_place=np.repeat(np.arange(places, dtype=np.int32), len(headings)),
+            view_heading_rad=np.tile(headings, places), descriptors=np.array(descriptors, np.float32),
+            **{"cloud": None} | changed,
+        )  # fmt: skip
+        folder = tmp_path_factory.mktemp("bundles") / "m"
+        write_bundle(folder, content)
+        return MapBundle.open(folder)
+
+    return bundle
 
 
 @pytest.fixture(scope="session")
@@ -36,5 +134,52 @@ def small_map(small_dataset: Any, encoder_file: Path, tmp_path_factory: pytest.T
     from model_training.mapping.build import BuildSettings, build_map
 
     out: Path = tmp_path_factory.mktemp("maps") / "small"
-    build_map(small_dataset, encoder_file, out, BuildSettings(name="small", headings=6, spacing_m=5.0), threads=1)
+    settings = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None)
+    build_map(small_dataset, encoder_file, out, settings, threads=1)
     return out
+
+
+@pytest.fixture(scope="session")
+def calibration_file_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """A calibration file that says whose answers it was measured on."""
+
+    def made(encoder_sha256: str, **changed: Any) -> Path:
+        path = tmp_path_factory.mktemp("calibrations") / "calibration.json"
+        path.write_text(json.dumps(calibration_document(measured_on={"encoder_sha256": encoder_sha256}, **changed)))
+        return path
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def streets_alike(
+    content_of: Callable[..., BundleContent], pictures_of: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., Path]:
+    """A bundle of two streets that retrieval cannot tell apart, each measured as the camera saw it from (20, 0) or (20, 90), looking
+    north; the walls of the first are those of the picture of another seed. The map's origin lies in Berlin."""
+
+    def made(*, seed_of_first: int = 3) -> Path:
+        voxels = VoxelMap(0.3, np.array([20.0, 0.0, 2.0]))
+        for y, seed in ((0.0, seed_of_first), (90.0, 3)):
+            _, depth_m, camera = pictures_of(seed=seed)
+            T_map_camera = transform_from(rotation_z(np.pi / 2) @ R_BODY_OPTICAL, np.array([20.0, y, 1.7]))
+            points_camera = (camera.rays_of_pixels() * depth_m[..., None]).reshape(-1, 3)
+            for _ in range(3):  # so that every voxel has points enough for a normal
+                voxels.add(transform_points(T_map_camera, points_camera))
+        content = content_of(
+            name="alike", streets=None, place_street=np.full(12, -1, np.int32), georeference=BERLIN,
+            cloud=SurfelMap.prepare(voxels.origin, *voxels.tiles(voxels.surfels())),
+        )  # fmt: skip
+        content.T_map_place[6:, 1, 3] = 90.0
+        content.descriptors[:24] = content.descriptors[24:]
+        folder = tmp_path_factory.mktemp("maps") / "alike"
+        write_bundle(folder, content)
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def twin_map(streets_alike: Callable[..., Path]) -> Path:
+    """Two streets that nothing tells apart."""
+    return streets_alike()

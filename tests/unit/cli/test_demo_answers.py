@@ -21,6 +21,7 @@ OF_PLACE = replace(IN_STREET, street=None, place=2)
 def answer_of(*, street: str | None = "s4", place: int = 2) -> dict[str, Any]:
     return {
         "status": "LOCALIZED",
+        "confidence": None,
         "street": None if street is None else {"id": street, "name": f"Street {street[1:]}"},
         "pose": {"position": {"x": 13.0, "y": 24.0, "z": 9.0}, "heading_deg": -175.0},
         "neighbours": [{"place": place, "similarity": 0.9}],
@@ -67,6 +68,19 @@ def test_a_refused_question_is_wrong_and_its_problem_is_shown(monkeypatch: pytes
     text = printed([ask(IN_STREET, "http://127.0.0.1:1"), outcome_of()])
     assert "No depth" in text
     assert "1 of 2 streets right" in text
+
+
+@pytest.mark.parametrize(
+    ("status", "confidence", "wanted"),
+    [
+        ("LOCALIZED", 0.9871, "LOCALIZED 0.987"),
+        ("AMBIGUOUS", 0.0, "AMBIGUOUS 0.000"),
+        ("LOCALIZED", None, "LOCALIZED  "),
+    ],
+)
+def test_an_answers_status_and_confidence_are_shown(status: str, confidence: float | None, wanted: str) -> None:
+    answer = answer_of() | {"status": status, "confidence": confidence}
+    assert wanted in printed([Outcome(IN_STREET, answer, "", 0.05)])
 
 
 def test_the_next_command_is_one_line_with_a_pair_that_was_right() -> None:

@@ -11,7 +11,9 @@ from rich.console import Console
 
 from service.cli.answer_text import print_answer
 from service.cli.localize import localize
+from service.cli.main import main
 from service.errors import RefusedError, RequestError, UnreachableError
+from service.http.schema import Prior
 
 ANSWER: dict[str, Any] = {
     "status": "LOCALIZED",
@@ -20,6 +22,12 @@ ANSWER: dict[str, Any] = {
     "pose": {"position": {"x": 1.234, "y": 5, "z": 1.5}, "orientation": {}, "heading_deg": 90.4, "covariance": None},
     "vehicle_pose": None,
     "geopose": None,
+    "hypotheses": [
+        {"pose": {"position": {"x": 1.234, "y": 5, "z": 1.5}, "orientation": {}, "heading_deg": 90.4, "covariance": None},
+         "share": 0.625, "inliers": 0.5, "similarity": 0.9},
+        {"pose": {"position": {"x": 77, "y": -88, "z": 1.5}, "orientation": {}, "heading_deg": -89.6, "covariance": None},
+         "share": 0.375, "inliers": 0.25, "similarity": 0.875},
+    ],
     "neighbours": [
         {"place": 8, "distance": 0.1, "similarity": 0.995, "street": None, "position": {"x": 1, "y": 2, "z": 3},
          "heading_deg": 90.0},
@@ -98,6 +106,54 @@ def test_a_file_that_is_missing_is_named(files: dict[str, Path]) -> None:
         localize("http://x", **files)
 
 
+@pytest.mark.parametrize(
+    ("flags", "prior"),
+    [
+        (["--near", "12,-40"], {"position": {"x": 12.0, "y": -40.0}}),
+        (["--near", "-12.5, 40, 3"], {"position": {"x": -12.5, "y": 40.0, "std_m": 3.0}}),
+        (["--near=1e2,2e2"], {"position": {"x": 100.0, "y": 200.0}}),
+        (["--heading", "-30"], {"heading_deg": -30.0}),
+        (["--heading", "0", "--near", "0,0"], {"heading_deg": 0.0, "position": {"x": 0.0, "y": 0.0}}),
+        ([], None),
+    ],
+)
+def test_what_is_known_beforehand_is_sent_as_the_contract_has_it(
+    files: dict[str, Path], answering: Callable[..., Any], flags: list[str], prior: dict[str, Any] | None
+) -> None:
+    posted = answering(httpx.Response(200, json=ANSWER))
+    given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
+    with pytest.raises(SystemExit) as end:
+        main(["localize", *given, *flags])
+    assert end.value.code in (0, None)
+    request = json.loads(posted[0]["files"]["request"][1])
+    assert request == {"camera": {}, "map": "a"} | ({} if prior is None else {"prior": prior})
+    if prior is not None:
+        Prior.model_validate(request["prior"])
+
+
+def test_a_prior_of_the_flags_goes_above_the_files(files: dict[str, Path], answering: Callable[..., Any]) -> None:
+    files["camera"].write_text('{"camera": {}, "prior": {"heading_deg": 5}}')
+    posted = answering(httpx.Response(200, json=ANSWER))
+    for prior in (None, {"position": {"x": 1.0, "y": 2.0}}):
+        localize("http://x", **files, prior=prior)
+    sent = [json.loads(each["files"]["request"][1])["prior"] for each in posted]
+    assert sent == [{"heading_deg": 5}, {"position": {"x": 1.0, "y": 2.0}}]
+
+
+@pytest.mark.parametrize("near", ["", "12", "12;40", "1,2,3,4", "here", "1,", ",", "12,-40,", "1,2m"])
+def test_a_place_that_is_none_is_refused_with_an_example_and_nothing_is_sent(
+    files: dict[str, Path], answering: Callable[..., Any], near: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    posted = answering(httpx.Response(200, json=ANSWER))
+    given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
+    with pytest.raises(SystemExit) as end:
+        main(["localize", *given, f"--near={near}"])
+    assert end.value.code == 1
+    error = capsys.readouterr().err
+    assert error == f"streetfix: --near: {near!r} is not X,Y or X,Y,STD in metres, such as 12,-40,20\n"
+    assert posted == []
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"fx": 1}'])
 def test_a_camera_file_that_is_none_is_refused(files: dict[str, Path], text: str) -> None:
     files["camera"].write_text(text)
@@ -117,3 +173,40 @@ def test_people_read_street_position_and_neighbours() -> None:
         "0.995",
     ):
         assert wanted in text
+
+
+def text_of(**changed: Any) -> str:
+    stream = io.StringIO()
+    print_answer(ANSWER | changed, Console(file=stream, width=120))
+    return stream.getvalue()
+
+
+def test_people_read_how_sure_an_answer_is() -> None:
+    assert "AMBIGUOUS (confidence 0.317)" in text_of(status="AMBIGUOUS", confidence=0.3171)
+    assert "confidence" not in text_of()
+
+
+@pytest.mark.parametrize("status", ["AMBIGUOUS", "OUT_OF_MAP"])
+def test_people_read_where_else_it_may_be_when_it_is_not_sure(status: str) -> None:
+    lines = text_of(status=status, confidence=0.3).splitlines()
+    start = next(k for k, line in enumerate(lines) if "where it may be" in line)
+    for wanted in (
+        ("0.62", "0.50", "0.900", "x 1.23  y 5.00", "90"),
+        ("0.38", "0.25", "0.875", "x 77.00  y -88.00", "-90"),
+    ):
+        assert any(all(part in line for part in wanted) for line in lines[start : start + 8]), wanted
+
+
+def test_people_are_not_told_of_other_places_when_it_is_sure_or_when_there_are_none() -> None:
+    assert "where it may be" not in text_of(confidence=0.999)
+    assert "where it may be" not in text_of(status="AMBIGUOUS", confidence=0.0, hypotheses=[])
+
+
+def test_people_read_one_standard_deviation_of_position_and_heading() -> None:
+    """The worst of 0.1, 0.3 and 0.2 m; a hundredth of a radian is 0.57 degrees."""
+    covariance = [0.0] * 36
+    covariance[0], covariance[7], covariance[14], covariance[35] = 0.01, 0.09, 0.04, 1e-4
+    text = text_of(pose=ANSWER["pose"] | {"covariance": covariance})
+    assert "+- 0.30 m (one sigma)" in text
+    assert "+- 0.57 degrees (one sigma)" in text
+    assert "sigma" not in text_of()

@@ -40,7 +40,18 @@ def mount(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 def test_help_lists_all_commands_with_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--help") == 0
     out = capsys.readouterr().out
-    for name in ("serve", "localize", "simulate", "import", "train", "export", "build-map", "evaluate", "demo"):
+    for name in (
+        "serve",
+        "localize",
+        "simulate",
+        "import",
+        "train",
+        "export",
+        "build-map",
+        "evaluate",
+        "demo",
+        "calibrate",
+    ):
         assert f"\n  {name} " in out
 
 

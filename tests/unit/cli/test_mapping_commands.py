@@ -1,12 +1,14 @@
 """``simulate``, ``import``, ``build-map``, ``train`` and ``export`` as a person calls them."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from model_training.datasets.dataset import Dataset
 from service.cli.main import main
+from service.localization.encoder import Encoder
 from service.maps.reader import MapBundle
 
 SMALL = ("--size", "60x60", "--spacing", "20", "--camera", "96x72", "--workers", "1")
@@ -182,10 +184,15 @@ def test_what_is_no_number_to_simulate_with_is_one_line(
     assert not (tmp_path / "no").exists()
 
 
-def test_build_map_makes_a_bundle_that_opens(simulated: Path, encoder_file: Path, tmp_path: Path) -> None:
+def test_build_map_makes_a_bundle_that_opens(
+    simulated: Path, encoder_file: Path, calibration_file_of: Callable[..., Path], tmp_path: Path
+) -> None:
+    calibration = calibration_file_of(Encoder.open(encoder_file).sha256)
     arguments = (
         "--encoder",
         encoder_file,
+        "--calibration",
+        calibration,
         "--spacing",
         "20",
         "--headings",
@@ -196,8 +203,22 @@ def test_build_map_makes_a_bundle_that_opens(simulated: Path, encoder_file: Path
         "CC0-1.0",
     )
     assert run("build-map", simulated, "--out", tmp_path / "map", *arguments) == 0
-    manifest = MapBundle.open(tmp_path / "map").manifest
+    bundle = MapBundle.open(tmp_path / "map")
+    assert bundle.calibration is not None
+    manifest = bundle.manifest
     assert (manifest.name, manifest.headings, manifest.spacing_m, manifest.licence) == ("town", 4, 20.0, "CC0-1.0")
+
+
+def test_build_map_with_a_calibration_that_is_missing_says_what_makes_one(
+    simulated: Path, encoder_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("--encoder", encoder_file, "--calibration", tmp_path / "no.json", "--spacing", "20", "--headings", "2")
+    assert run("build-map", simulated, "--out", tmp_path / "map", *given) == 1
+    assert (
+        "no.json cannot be read (No such file or directory); make it with streetfix calibrate"
+        in capsys.readouterr().err
+    )
+    assert not (tmp_path / "map").exists()
 
 
 def test_build_map_of_no_dataset_says_what_makes_one(

@@ -6,6 +6,7 @@ import pytest
 from model_training.evaluation.measures import measure, recall_at
 from model_training.evaluation.predict import RANKED, Predictions, headings_of, joined
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+from service.maps.calibration import FEATURES
 
 STREETS = ["Street 1", "Street 2"]
 
@@ -27,7 +28,8 @@ def make_predictions(errors_m, *, answered=None, street_answer=None, street_true
     return Predictions(
         T_true, T_answer, np.zeros(count, int) if street_true is None else np.array(street_true),
         np.zeros(count, int) if street_answer is None else np.array(street_answer), ranked, np.full((count, RANKED), -1),
-        ~nothing if answered is None else np.array(answered), np.full(count, 20.0), np.arange(float(count)),
+        ~nothing if answered is None else np.array(answered), np.full(count, np.nan), np.full((count, len(FEATURES)), np.nan),
+        np.full((count, 6, 6), np.nan), np.full(count, 20.0), np.arange(float(count)),
     )  # fmt: skip
 
 
@@ -132,6 +134,10 @@ def test_predictions_survive_a_file_without_pickle(tmp_path):
     with np.load(tmp_path / "predictions.npz", allow_pickle=False) as stored:
         for name in Predictions.__dataclass_fields__:
             np.testing.assert_array_equal(stored[name], getattr(predictions, name))
+    again = Predictions.load(tmp_path / "predictions.npz")
+    for name in Predictions.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(again, name), getattr(predictions, name))
+    assert [each.name for each in tmp_path.iterdir()] == ["predictions.npz"]
 
 
 def test_headings_are_of_the_optical_axis():

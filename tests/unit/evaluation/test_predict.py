@@ -9,6 +9,7 @@ from model_training.evaluation.predict import RANKED, predict
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
 from service.localization.query import Query
+from service.maps.calibration import FEATURES
 from service.maps.reader import MapBundle
 
 NAME = "drive1_precise"
@@ -33,6 +34,19 @@ def test_every_query_gets_the_answer_that_the_localizer_gives(localizer, small_d
         np.testing.assert_allclose(found.T_answer[k], answer.T_map_camera)
         np.testing.assert_allclose(found.ranked_xy[k, 0], answer.neighbours[0].position_m[:2])
         assert found.street_answer[k] == answer.street
+        np.testing.assert_allclose(found.evidence[k], answer.evidence)
+        np.testing.assert_allclose(found.covariance[k], answer.covariance)
+    assert np.isfinite(found.evidence).all()
+    assert np.isnan(found.confidence).all()  # the map is not calibrated
+
+
+def test_retrieval_alone_has_neither_evidence_nor_covariance(localizer, small_dataset):
+    found = predict(localizer, small_dataset, NAME, refine=False)
+    assert np.isfinite(found.T_answer).all()
+    for nothing in (found.confidence, found.evidence, found.covariance):
+        assert np.isnan(nothing).all()
+    assert found.evidence.shape == (5, len(FEATURES))
+    assert found.covariance.shape == (5, 6, 6)
 
 
 def test_truth_is_the_datasets(localizer, small_dataset):

@@ -33,7 +33,7 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     answer = response.json()
     assert response.status_code == 200
     assert list(answer) == [
-        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings_ms",
+        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "neighbours", "map", "timings_ms",
     ]  # fmt: skip
     assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
     assert answer["street"] | {"vote": 1} == {
@@ -46,11 +46,16 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     assert list(answer["timings_ms"]) == ["decode", "fuse", "encode", "search", "register", "total"]
     assert answer["neighbours"][0]["street"] == "s2"
     assert len(answer["neighbours"]) == 5
+    best = answer["hypotheses"][0]
+    assert list(best) == ["pose", "share", "inliers", "similarity"]
+    assert best["pose"] == answer["pose"] | {"covariance": None}
+    assert best["inliers"] > 0.8
 
 
 def test_without_registration_there_is_no_covariance(client: httpx.Client, parts_of: Parts) -> None:
     answer = post(client, parts_of(options={"refine": False})).json()
     assert answer["pose"]["covariance"] is None
+    assert answer["hypotheses"] == []
     assert answer["timings_ms"]["register"] == 0
     assert answer["pose"]["position"]["x"] == pytest.approx(20, abs=0.05)
 
@@ -161,6 +166,21 @@ CAMERA = {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
         ({"gravity": {"x": 0, "y": 0, "z": 0}}, "gravity"),
         ({"gravity": {"x": 0, "y": 1}}, "gravity.z"),
         ({"options": {"neighbours": 51}}, "options.neighbours"),
+        ({"options": {"false_accept_rate": 0}}, "options.false_accept_rate"),
+        ({"options": {"false_accept_rate": 1}}, "options.false_accept_rate"),
+        ({"prior": {"position": {"x": 0, "y": 0, "z": 0}}}, "prior.position.z"),
+        ({"prior": {"position": {"x": 0}}}, "prior.position.y"),
+        ({"prior": {"position": {"x": 0, "y": 0, "std_m": 0}}}, "prior.position.std_m"),
+        ({"prior": {"wgs84": {"latitude_deg": 91, "longitude_deg": 0}}}, "prior.wgs84.latitude_deg"),
+        ({"prior": {"wgs84": {"latitude_deg": 0, "longitude_deg": -181}}}, "prior.wgs84.longitude_deg"),
+        ({"prior": {"wgs84": {"latitude_deg": 0, "longitude_deg": 0, "height_m": 0}}}, "prior.wgs84.height_m"),
+        ({"prior": {"heading_deg": 361}}, "prior.heading_deg"),
+        ({"prior": {"heading_deg": 0, "heading_std_deg": 0}}, "prior.heading_std_deg"),
+        ({"prior": {"place": 8}}, "prior.place"),
+        ({"prior": {}}, "prior"),
+        ({"prior": {"heading_std_deg": 5}}, "prior"),
+        ({"prior": {"position": {"x": 0, "y": 0}, "wgs84": {"latitude_deg": 0, "longitude_deg": 0}}}, "prior"),
+        ({"prior": {"wgs84": {"latitude_deg": 0, "longitude_deg": 0}}}, "prior.wgs84"),
         ({"surprise": 1}, "surprise"),
         ({"T_vehicle_camera": {"position": ORIGIN, "orientation": ORIGIN | {"w": 0}}}, "T_vehicle_camera.orientation"),
     ],
@@ -178,7 +198,6 @@ def test_a_request_that_is_no_json_object_is_refused(client: httpx.Client, parts
 @pytest.mark.parametrize(
     ("changed", "field"),
     [
-        ({"prior": {"position": {"x": 0, "y": 0, "z": 0, "std_m": 20}}}, "prior"),
         ({"camera": CAMERA | {"distortion": [0.1, 0, 0, 0]}}, "camera.distortion"),
     ],
 )
@@ -186,6 +205,19 @@ def test_what_this_release_cannot_use_is_refused_and_not_ignored(
     client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str
 ) -> None:
     require_problem(post(client, parts_of(**changed)), 422, "not-yet", field)
+
+
+TRUE_PRIOR = {"position": {"x": 20, "y": 100, "std_m": 5}, "heading_deg": 90}
+
+
+@pytest.mark.parametrize("prior", [
+    TRUE_PRIOR, {"heading_deg": -270}, {"position": {"x": 5000, "y": -5000, "std_m": 0.1}, "heading_deg": 270, "heading_std_deg": 1},
+])  # fmt: skip
+def test_a_prior_right_or_wrong_does_not_move_an_answer_that_the_pictures_are_sure_of(
+    client: httpx.Client, parts_of: Parts, prior: dict[str, Any]
+) -> None:
+    alone, with_prior = (post(client, parts_of(**changed)).json() for changed in ({}, {"prior": prior}))
+    assert with_prior["pose"] == alone["pose"]
 
 
 def test_gravity_of_any_length_is_taken(client: httpx.Client, parts_of: Parts) -> None:

@@ -1,6 +1,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import heading_of_camera, transform_from
 from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
+from service.localization.prior import Prior
 from service.localization.query import Query
 from service.localization.search import distinct_places, search_views
+from service.maps.calibration import FEATURES
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
@@ -44,7 +47,12 @@ def test_without_registration_the_pose_stands_at_the_place_at_the_cameras_own_he
     localizer: Localizer, query: Query
 ) -> None:
     answer = localizer.localize(replace(query, refine=False))
-    assert (answer.covariance, answer.registration, answer.timings.register_ms) == (None, None, 0.0)
+    assert (answer.covariance, answer.candidates, answer.evidence, answer.timings.register_ms) == (
+        None,
+        None,
+        None,
+        0.0,
+    )
     assert answer.vote is not None
     assert answer.street == answer.vote.street
     # The place's LiDAR is at (20, 100, 2), 1.8 m above the ground; the camera 1.5 m.
@@ -55,9 +63,10 @@ def test_without_registration_the_pose_stands_at_the_place_at_the_cameras_own_he
 
 def test_with_registration_the_pose_is_where_the_picture_was_taken(localizer: Localizer, query: Query) -> None:
     answer = localizer.localize(query)
-    assert answer.registration is not None
+    assert answer.candidates is not None
     assert answer.covariance is not None
-    assert answer.registration[0].inliers > 0.8
+    assert answer.candidates[0].registered.inliers > 0.8
+    np.testing.assert_array_equal(answer.candidates[0].T_map_camera, answer.T_map_camera)
     np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, 100, 1.7], atol=0.3)
     assert np.rad2deg(heading_of_camera(answer.T_map_camera)) == pytest.approx(90, abs=1)
     np.testing.assert_allclose(answer.covariance, answer.covariance.T)
@@ -169,3 +178,102 @@ def test_a_view_found_at_two_turns_is_kept_once_at_the_better_one_and_its_headin
         each = [float(s[np.flatnonzero(v == view)[0]]) for s, v in zip(*by_turn, strict=True)]
         assert similarity == pytest.approx(max(each), abs=1e-6)
         assert heading == pytest.approx(float(bundle.view_heading_rad[view]) - turns[int(np.argmax(each))])
+
+
+def test_the_evidence_has_a_number_for_every_feature(localizer: Localizer, query: Query) -> None:
+    answer = localizer.localize(query)
+    assert answer.evidence is not None
+    assert answer.evidence.shape == (len(FEATURES),)
+    assert np.isfinite(answer.evidence).all()
+    assert answer.evidence[FEATURES.index("inliers")] == answer.candidates[0].registered.inliers
+
+
+def test_a_map_that_is_not_calibrated_answers_without_confidence(localizer: Localizer, query: Query) -> None:
+    answer = localizer.localize(query)
+    assert (answer.status, answer.confidence) == ("LOCALIZED", None)
+
+
+@pytest.mark.parametrize(("rate", "status"), [(0.01, "LOCALIZED"), (0.001, "AMBIGUOUS")])
+def test_a_calibrated_map_says_how_sure_it_is_and_accepts_by_the_rate_asked_for(
+    content_of: Callable[..., BundleContent],
+    calibration_json: Callable[..., dict[str, Any]],
+    tmp_path: Path,
+    query: Query,
+    rate: float,
+    status: str,
+) -> None:
+    """Even odds whatever the evidence: above the threshold of 0.4 for one in a hundred, below the 0.9 for one in a thousand."""
+    write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
+    localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
+    answer = localizer.localize(replace(query, false_accept_rate=rate))
+    assert (answer.status, answer.confidence) == (status, 0.5)
+    retrieved = localizer.localize(replace(query, false_accept_rate=rate, refine=False))
+    assert (retrieved.status, retrieved.confidence) == ("LOCALIZED", None)
+
+
+def test_a_calibrated_map_believes_nothing_of_a_picture_that_is_too_empty_to_register(
+    content_of: Callable[..., BundleContent],
+    calibration_json: Callable[..., dict[str, Any]],
+    tmp_path: Path,
+    query: Query,
+) -> None:
+    write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
+    few = np.zeros_like(query.depth_m)
+    few[20:23, 20:24] = query.depth_m[20:23, 20:24]
+    answer = Localizer.open(MapBundle.open(tmp_path / "m")).localize(replace(query, depth_m=few))
+    assert (answer.status, answer.confidence, answer.evidence, answer.candidates) == ("OUT_OF_MAP", 0.0, None, None)
+
+
+def test_one_frame_of_a_sequence_is_answered_like_a_single_query(localizer: Localizer, query: Query) -> None:
+    alone, sequence = localizer.localize(query), localizer.localize_frames((query,), (np.eye(4),))
+    np.testing.assert_array_equal(sequence.T_map_camera, alone.T_map_camera)
+    np.testing.assert_array_equal(sequence.evidence, alone.evidence)
+
+
+def test_a_sequence_is_answered_with_the_pose_of_its_first_frame(localizer: Localizer, query: Query) -> None:
+    """The second frame is said to have been taken 5 m behind the first, in the same place: so the first stands 5 m ahead."""
+    behind = transform_from(np.eye(3), np.array([0.0, 0.0, -5.0]))
+    few = np.zeros_like(query.depth_m)
+    few[20:23, 20:24] = query.depth_m[20:23, 20:24]  # enough to be looked up, nothing to register
+    answer = localizer.localize_frames((replace(query, depth_m=few), query), (np.eye(4), behind))
+    np.testing.assert_allclose(localizer.localize(query).T_map_camera[:2, 3], [20, 100], atol=0.3)
+    np.testing.assert_allclose(answer.T_map_camera[:2, 3], [20, 105], atol=0.3)
+
+
+def test_a_sequence_needs_a_pose_for_every_frame(localizer: Localizer, query: Query) -> None:
+    with pytest.raises(ValueError, match="zip"):
+        localizer.localize_frames((query, query), (np.eye(4),))
+
+
+def test_a_prior_that_is_wrong_does_not_move_a_pose_that_the_pictures_are_sure_of(
+    localizer: Localizer, query: Query
+) -> None:
+    alone = localizer.localize(query)
+    for wrong in (
+        Prior(position_m=np.array([20.0, 0.0]), position_std_m=1.0, heading_rad=np.pi / 2),
+        Prior(position_m=np.array([-1e6, 1e6]), position_std_m=0.1),
+        Prior(heading_rad=-np.pi / 2, heading_std_rad=0.01),
+    ):
+        answer = localizer.localize(replace(query, prior=wrong))
+        np.testing.assert_allclose(answer.T_map_camera, alone.T_map_camera, atol=1e-9)
+        assert answer.covariance is not None
+        np.testing.assert_allclose(answer.covariance, alone.covariance, atol=1e-9)
+
+
+@pytest.mark.parametrize("y", [0.0, 90.0])
+def test_a_prior_decides_between_streets_that_nothing_else_tells_apart(twin_map: Path, query: Query, y: float) -> None:
+    localizer = Localizer.open(MapBundle.open(twin_map))
+    known = Prior(position_m=np.array([15.0, y + 5.0]), position_std_m=10.0)
+    answer = localizer.localize(replace(query, prior=known))
+    np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, y, 1.7], atol=0.3)
+
+
+@pytest.mark.parametrize("seed", [4, 6, 8, 10])
+def test_a_prior_in_a_street_that_looks_the_same_but_measures_otherwise_does_not_win(
+    streets_alike: Callable[..., Path], query: Query, seed: int
+) -> None:
+    """In the first street, 90 m away, half of the depth at best lies on the map; where the picture was taken, all of it does."""
+    localizer = Localizer.open(MapBundle.open(streets_alike(seed_of_first=seed)))
+    for wrong in (None, Prior(position_m=np.array([20.0, 0.0]), position_std_m=10.0)):
+        answer = localizer.localize(replace(query, prior=wrong))
+        np.testing.assert_allclose(answer.T_map_camera[:2, 3], [20, 90], atol=0.3)

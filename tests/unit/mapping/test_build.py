@@ -1,16 +1,19 @@
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
+from model_training.mapping import site_check
 from model_training.mapping.build import BuildSettings, build_map, describe, fan, thinned, view_ranges
 from service.errors import BundleError, DatasetError, EncoderError
+from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.localization.query import Query
 from service.maps.reader import MapBundle
 
-SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0)
+SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +102,7 @@ def test_the_same_build_twice_has_the_same_version(small_dataset, encoder_file, 
 
 
 def test_another_spacing_has_another_version_and_fewer_places(small_dataset, encoder_file, bundle, tmp_path):
-    settings = BuildSettings(name="small", headings=6, spacing_m=15.0)
+    settings = replace(SETTINGS, spacing_m=15.0)
     other = build_map(small_dataset, encoder_file, tmp_path / "other", settings, threads=1)
     assert other.version != bundle.manifest.version
     assert other.counts.places < bundle.manifest.counts.places
@@ -107,7 +110,7 @@ def test_another_spacing_has_another_version_and_fewer_places(small_dataset, enc
 
 
 def test_weather_removal_is_recorded(small_dataset, encoder_file, tmp_path):
-    settings = BuildSettings(name="dry", headings=2, spacing_m=20.0, remove_weather=True)
+    settings = BuildSettings(name="dry", headings=2, spacing_m=20.0, remove_weather=True, calibration=None)
     assert (
         build_map(small_dataset, encoder_file, tmp_path / "dry", settings, threads=1).parameters["weather_removed"]
         == 1.0
@@ -180,6 +183,80 @@ def test_a_file_that_is_no_encoder_is_refused(small_dataset, tmp_path):
     (tmp_path / "encoder.onnx").write_bytes(b"nothing of the kind")
     with pytest.raises(EncoderError):
         build_map(small_dataset, tmp_path / "encoder.onnx", tmp_path / "out", SETTINGS, threads=1)
+
+
+@pytest.fixture
+def calibration_file(calibration_file_of, encoder_file):
+    """Even odds whatever the evidence, measured on the answers of this encoder."""
+    return calibration_file_of(Encoder.open(encoder_file).sha256)
+
+
+def test_without_a_calibration_of_its_encoder_a_map_says_that_it_has_none(
+    small_dataset, encoder_file, bundle, calibration_file_of, tmp_path
+):
+    assert bundle.calibration is None
+    settings = replace(SETTINGS, calibration=calibration_file_of("0" * 64))
+    other = build_map(small_dataset, encoder_file, tmp_path / "other", settings, threads=1)
+    assert MapBundle.open(tmp_path / "other").calibration is None
+    assert other.version == bundle.manifest.version
+
+
+def test_a_calibration_of_its_encoder_goes_into_the_map_unchecked_where_places_are_few(
+    small_dataset, encoder_file, bundle, calibration_file, tmp_path
+):
+    settings = replace(SETTINGS, calibration=calibration_file)
+    build_map(small_dataset, encoder_file, tmp_path / "sure", settings, threads=1)
+    sure = MapBundle.open(tmp_path / "sure")
+    assert sure.calibration is not None
+    assert sure.calibration.site is None
+    assert sure.calibration.known.bias == pytest.approx(np.log(3))
+    assert sure.manifest.counts == bundle.manifest.counts
+
+
+def test_some_scans_are_held_out_to_check_it_and_are_in_the_map_all_the_same(
+    small_dataset, encoder_file, bundle, calibration_file, tmp_path, monkeypatch
+):
+    """Every fourth place. The untrained encoder's answers are wrong, so even odds are too high, and are lowered."""
+    monkeypatch.setattr(site_check, "_EACH", 4)
+    monkeypatch.setattr(site_check, "FEWEST", 2)
+    settings, told = replace(SETTINGS, calibration=calibration_file), []
+    build_map(
+        small_dataset, encoder_file, tmp_path / "m", settings, threads=1, report=lambda *event: told.append(event)
+    )
+    checked = MapBundle.open(tmp_path / "m")
+    site, places = checked.calibration.site, bundle.manifest.counts.places
+    assert site.queries == places // 4 >= 2
+    assert [event for event in told if event[0] == "site check"] == [
+        ("site check", k + 1, site.queries) for k in range(site.queries)
+    ]
+    assert 0 <= site.right <= site.queries
+    assert site.offset <= 0
+    assert checked.manifest.counts == bundle.manifest.counts
+    np.testing.assert_array_equal(checked.T_map_place, bundle.T_map_place)
+    np.testing.assert_allclose(
+        np.sort(checked.cloud.surfels["xyz"][:, 0]), np.sort(bundle.cloud.surfels["xyz"][:, 0]), atol=1e-3
+    )
+
+
+def test_a_calibration_that_is_missing_or_none_stops_the_build_before_any_place(small_dataset, encoder_file, tmp_path):
+    told = []
+    (tmp_path / "none.json").write_text("{}")
+    for name, error, message in (
+        ("missing.json", DatasetError, "missing.json cannot be read .*make it with streetfix calibrate"),
+        ("none.json", BundleError, "it does not say whether the map is calibrated"),
+    ):
+        settings = replace(SETTINGS, calibration=tmp_path / name)
+        with pytest.raises(error, match=message):
+            build_map(
+                small_dataset,
+                encoder_file,
+                tmp_path / "out",
+                settings,
+                threads=1,
+                report=lambda *event: told.append(event),
+            )
+    assert told == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_map_is_described_in_one_line(bundle):

@@ -79,8 +79,8 @@ def test_a_manifest_that_is_none_is_refused(bundle_copy: Path, text: str) -> Non
 
 
 def test_another_format_version_is_refused_with_both_versions(bundle_copy: Path) -> None:
-    edit_manifest(bundle_copy, lambda document: document.update(format=1), stamp=False)
-    with pytest.raises(BundleError, match="format 1, but this program reads format 2"):
+    edit_manifest(bundle_copy, lambda document: document.update(format=2), stamp=False)
+    with pytest.raises(BundleError, match="format 2, but this program reads format 3"):
         MapBundle.open(bundle_copy)
 
 
@@ -158,16 +158,16 @@ def test_a_pickled_array_is_never_loaded(bundle_copy: Path, tmp_path: Path) -> N
 
 
 def test_a_grid_that_points_outside_the_surfels_is_refused(bundle_copy: Path, tmp_path: Path) -> None:
-    nearest = np.load(bundle_copy / "cloud" / "fine_nearest.npy")
+    nearest = np.load(bundle_copy / "cloud" / "grid_nearest.npy")
     nearest[0, 0] = 1_000_000
-    replace_file(bundle_copy, "cloud/fine_nearest.npy", npy_bytes(tmp_path / "a.npy", nearest))
-    with pytest.raises(BundleError, match=r"cloud/fine_nearest\.npy: it points outside the [0-9]+ there are"):
+    replace_file(bundle_copy, "cloud/grid_nearest.npy", npy_bytes(tmp_path / "a.npy", nearest))
+    with pytest.raises(BundleError, match=r"cloud/grid_nearest\.npy: it points outside the [0-9]+ there are"):
         MapBundle.open(bundle_copy)
 
 
 def test_a_grid_of_another_type_is_refused(bundle_copy: Path, tmp_path: Path) -> None:
-    replace_file(bundle_copy, "cloud/coarse_block.npy", npy_bytes(tmp_path / "a.npy", np.zeros((2, 2, 2))))
-    with pytest.raises(BundleError, match=r"cloud/coarse_block\.npy: it holds float64"):
+    replace_file(bundle_copy, "cloud/grid_block.npy", npy_bytes(tmp_path / "a.npy", np.zeros((2, 2, 2))))
+    with pytest.raises(BundleError, match=r"cloud/grid_block\.npy: it holds float64"):
         MapBundle.open(bundle_copy)
 
 
@@ -179,7 +179,52 @@ def test_a_view_of_a_place_that_is_not_there_is_refused(bundle_copy: Path, tmp_p
         MapBundle.open(bundle_copy)
 
 
+def test_views_that_do_not_lie_place_by_place_are_refused(bundle_copy: Path, tmp_path: Path) -> None:
+    """Every place has its four, but the last view of one and the first of the next are swapped."""
+    views = np.load(bundle_copy / "views.npy")
+    views[[3, 4]] = views[[4, 3]]
+    replace_file(bundle_copy, "views.npy", npy_bytes(tmp_path / "a.npy", views))
+    with pytest.raises(BundleError, match=r"views\.npy: views do not lie place by place, a fan each"):
+        MapBundle.open(bundle_copy)
+
+
+def test_a_fan_of_another_size_is_refused(bundle_copy: Path) -> None:
+    edit_manifest(bundle_copy, lambda document: document.update(headings=3))
+    with pytest.raises(BundleError, match=r"views\.npy: views do not lie place by place, a fan each"):
+        MapBundle.open(bundle_copy)
+
+
 def test_without_verification_sizes_are_still_compared(bundle_copy: Path) -> None:
     (bundle_copy / "views.npy").write_bytes((bundle_copy / "views.npy").read_bytes()[:-8])
     with pytest.raises(BundleError, match="bytes instead of"):
         MapBundle.open(bundle_copy, verify=False)
+
+
+@pytest.mark.parametrize(
+    ("georeference", "what"),
+    [
+        ({"latitude_deg": 91, "longitude_deg": 0}, "latitude_deg: 91.0 is not between -90 and 90"),
+        (
+            {"latitude_deg": 0, "longitude_deg": -200, "height_m": 3},
+            "longitude_deg: -200.0 is not between -180 and 180",
+        ),
+        ({"latitude_deg": 1}, "missing .*'longitude_deg'"),
+        ({"latitude_deg": 1, "longitude_deg": 2, "epsg": 3}, "'epsg'"),
+        ({}, "missing .*'latitude_deg'"),
+    ],
+)
+def test_a_georeference_that_is_no_place_on_the_earth_is_refused(
+    bundle_copy: Path, georeference: dict[str, float], what: str
+) -> None:
+    edit_manifest(bundle_copy, lambda document: document.update(georeference=georeference))
+    with pytest.raises(BundleError, match=f"georeference: .*{what}.*; copy or build the bundle again"):
+        MapBundle.open(bundle_copy)
+
+
+def test_a_georeference_of_anything_but_numbers_is_refused(bundle_copy: Path) -> None:
+    def edit(document: dict[str, Any]) -> None:
+        document["georeference"] = {"latitude_deg": "north", "longitude_deg": 0}
+
+    edit_manifest(bundle_copy, edit, stamp=False)
+    with pytest.raises(BundleError, match=r"georeference\.latitude_deg"):
+        MapBundle.open(bundle_copy)

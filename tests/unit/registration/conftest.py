@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from model_training.mapping.voxel_map import VoxelMap
 from service.geometry.camera import PinholeCamera
-from service.geometry.rigid import rotation_z, transform_from
-from service.localization.search import ViewMatches
+from service.geometry.rigid import rotation_z
 from service.registration.kernel import STATE, SURFEL, QueryPoints, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 
@@ -102,15 +101,15 @@ def states_at(
     return states
 
 
-COARSE = {"iterations": 12, "reach": 2.7, "robust_first": 2.0, "robust_last": 0.5, "surface": 0.2}
+COARSE = {"iterations": 12, "reach": 1.2, "robust_first": 0.8, "robust_last": 0.3, "surface": 0.1}
 FINE = {"iterations": 20, "reach": 1.2, "robust_first": 0.6, "robust_last": 0.06}
 
 
 def settled(cloud: SurfelMap, points: QueryPoints, states: Any, **changed: Any) -> Any:
-    """Coarse, then fine; the starts given stay as they are."""
+    """Rough, then exact; the starts given stay as they are."""
     states = states.copy()
-    align(cloud.coarse, cloud.surfels, points, states, SolverOptions(**(COARSE | changed)))
-    align(cloud.fine, cloud.surfels, points, states, SolverOptions(**(FINE | changed)))
+    align(cloud.grid, cloud.surfels, points, states, SolverOptions(**(COARSE | changed)))
+    align(cloud.grid, cloud.surfels, points, states, SolverOptions(**(FINE | changed)))
     return states
 
 
@@ -131,16 +130,6 @@ def street_at(x0: float, y0: float) -> list[tuple[Any, Any, Any]]:
         ((x0, y0 + 6, 0), (30, 0, 0), (0, 0, 5)), ((x0 + 30, y0 - 6, 0), (0, 12, 0), (0, 0, 5)),
         *box((x0 + 14, y0 + 3, 0), (x0 + 19, y0 + 5, 3)), *box((x0 + 11, y0 - 4, 0), (x0 + 11.6, y0 - 3.4, 4)),
     ]  # fmt: skip
-
-
-def matches_of(xyz: Any, heading_deg: Any, similarity: Any, *, R_map_place: Any = None) -> ViewMatches:
-    """One view for each place."""
-    n, R = len(xyz), np.eye(3) if R_map_place is None else R_map_place
-    poses = [transform_from(R, np.array(each, np.float64)) for each in xyz]
-    return ViewMatches(
-        np.arange(n), np.array(similarity, np.float64), np.arange(n, dtype=np.int32), np.zeros(n, np.int32),
-        np.deg2rad(np.array(heading_deg, np.float64)), np.stack(poses),
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")
@@ -184,11 +173,6 @@ def points_at() -> Callable[..., QueryPoints]:
 @pytest.fixture(scope="session")
 def start_at() -> Callable[..., Any]:
     return states_at
-
-
-@pytest.fixture(scope="session")
-def matches_at() -> Callable[..., ViewMatches]:
-    return matches_of
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ def scored(cloud, points, states, **options):
     """Share of inliers of starts that are left where they are."""
     states = states.copy()
     still = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
-    align(cloud.fine, cloud.surfels, points, states, still, **options)
+    align(cloud.grid, cloud.surfels, points, states, still, **options)
     return states
 
 

@@ -95,9 +95,9 @@ def test_no_range_is_known_better_than_the_floor():
 
 
 def test_the_uncertainty_grows_with_the_square_of_the_depth():
-    depth = np.where(np.arange(80) < 40, 10.0, 20.0) * np.ones((60, 1))
+    depth = np.where(np.arange(320) < 160, 10.0, 20.0) * np.ones((240, 1))
     depth = 1 / (1 / depth + np.random.default_rng(3).normal(0, 5e-4, depth.shape))
-    found = points_in(depth)
+    found = points_in(depth, replace(ALL, columns=320))
     per_ray = np.sqrt(found.sigma**2 - ALL.floor_m**2) * depths_of(found) / np.linalg.norm(found.xyz, axis=1)
     near = depths_of(found) < 15
     at_10, at_20 = np.median(per_ray[near]), np.median(per_ray[~near])
@@ -204,3 +204,12 @@ def test_depth_of_another_size_and_the_same_aspect_gives_the_same_points(factor)
             np.testing.assert_allclose(
                 getattr(found, name), getattr(expected, name), atol=2e-2 if name == "xyz" else 2e-3
             )
+
+
+def test_the_noise_may_be_given_and_is_then_not_read_off_the_picture():
+    """A faultless wall 10 m ahead, told to be noisy: 10^2 * 1e-3 * sqrt(2) m along the straight ray."""
+    depth = np.full((60, 80), 10.0)
+    found = points_in(depth, replace(ALL, floor_m=0.0), noise=1e-3)
+    straight = np.argmax(found.ray @ R_BODY_OPTICAL[:, 2])
+    assert found.sigma[straight] == pytest.approx(0.1 * np.sqrt(2), rel=1e-3)
+    assert points_in(depth, replace(ALL, floor_m=0.0)).sigma.max() < 1e-3

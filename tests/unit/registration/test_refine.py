@@ -1,14 +1,22 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from service.geometry.camera import PinholeCamera
-from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, rotation_y, rotation_z, transform_from
-from service.localization.refine import RefineSettings, refine
+from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
+from service.localization.prior import Prior
+from service.localization.refine import RefineSettings, SupportWeights, refine, settings_for_rig
+from service.localization.starts import StartSettings
+from service.registration.points import inverse_depth_noise
+from service.registration.register import RegistrationSettings
 
 CAMERA = PinholeCamera(80, 60, 50.0, 50.0, 39.5, 29.5)
 R_LEVEL_CAMERA = rotation_y(np.deg2rad(4.0)) @ R_BODY_OPTICAL
 HEADING_DEG = 5.0
 TRUE = transform_from(rotation_z(np.deg2rad(HEADING_DEG)) @ R_LEVEL_CAMERA, np.array([0.8, 0.5, 1.5]))
+EVERY_VIEW = StartSettings(less_similar=3.0)  # no two cosines are so far apart
+BY_INLIERS = RegistrationSettings(similarity_weight=0.0)  # so that candidates of both streets come to the end
 
 
 @pytest.fixture(scope="module")
@@ -17,18 +25,34 @@ def cloud(scene_of, streets_at):
     return scene_of(*streets_at(-6.0, 0.0), *streets_at(-6.0, 40.0)[:4]).survey()
 
 
+def taken(street, T_map_camera, *, seed=8):
+    """Depth with some noise."""
+    inverse_depth = 1 / np.maximum(street.depth(CAMERA, T_map_camera), 1e-3)
+    noise = np.random.default_rng(seed).normal(0, 1e-4, inverse_depth.shape)
+    return (1 / (inverse_depth + noise)).astype(np.float32)
+
+
 @pytest.fixture(scope="module")
 def depth(street):
-    """Taken in the street itself, with some noise."""
-    inverse = 1 / np.maximum(street.depth(CAMERA, TRUE), 1e-3)
-    return (1 / (inverse + np.random.default_rng(8).normal(0, 1e-4, inverse.shape))).astype(np.float32)
+    """Taken in the street itself."""
+    return taken(street, TRUE)
 
 
-def refined(cloud, depth, matches, **options):
-    return refine(
-        cloud, depth, CAMERA, matches, R_level_camera=R_LEVEL_CAMERA, height_m=1.5, lidar_height_m=1.8,
-        settings=RefineSettings(**options),
-    )  # fmt: skip
+@pytest.fixture(scope="module")
+def bundle_like(bundle_at):
+    """Five places in the street beside, five in the true one; every view of a street is alike similar to (1, 0)."""
+
+    def bundle(beside, true):
+        xyz = [(x, y, 1.8) for y in (40.0, 0.0) for x in range(5)]
+        views = [(s, np.sqrt(1 - s * s)) for s in (beside, true) for _ in range(5)]
+        return bundle_at(xyz, [0.0], views)
+
+    return bundle
+
+
+@pytest.fixture(scope="module")
+def bundle(bundle_like):
+    return bundle_like(0.9, 0.4)
 
 
 @pytest.fixture
@@ -37,55 +61,198 @@ def both(matches_at):
     return matches_at([(0, 40, 1.8), (0, 0, 1.8)], [0, 0], [0.9, 0.4])
 
 
-def test_a_picture_is_found_where_it_was_taken(cloud, depth, matches_at):
-    found = refined(cloud, depth, matches_at([(0, 0, 1.8)], [0], [0.9]))
+@pytest.fixture
+def here(matches_at):
+    return matches_at([(0, 0, 1.8)], [0], [0.9])
+
+
+@pytest.fixture
+def seen_in(frame_with):
+    """A frame of a depth picture."""
+
+    def frame(depth_m, matches, *, R_level_camera=R_LEVEL_CAMERA, T_reference_camera=None):
+        noise = inverse_depth_noise(depth_m) if depth_m.any() else 1e-4
+        return frame_with(
+            matches, depth_m=depth_m, camera=CAMERA, R_level_camera=R_level_camera, height_m=1.5, noise=noise,
+            T_reference_camera=T_reference_camera,
+        )  # fmt: skip
+
+    return frame
+
+
+def refined(bundle, cloud, *frames, prior=None, **weights):
+    support = SupportWeights(**weights) if weights else SupportWeights()
+    return refine(
+        bundle, cloud, frames, prior, RefineSettings(starts=EVERY_VIEW, support=support, registration=BY_INLIERS)
+    )
+
+
+ONLY_INLIERS = {"inliers": 1.0, "similarity": 0.0, "likelihood": 0.0}
+
+
+def test_a_picture_is_found_where_it_was_taken(bundle, cloud, depth, here, seen_in):
+    found = refined(bundle, cloud, seen_in(depth, here))
     assert found is not None
-    np.testing.assert_allclose(found.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
-    assert np.rad2deg(heading_of_camera(found.T_map_camera)) == pytest.approx(HEADING_DEG, abs=0.2)
-    np.testing.assert_allclose(found.T_map_camera[:3, :3], TRUE[:3, :3], atol=0.005)
-    np.testing.assert_array_equal(found.T_map_camera[3], [0, 0, 0, 1])
+    T = found.best.T_map_camera
+    np.testing.assert_allclose(T[:3, 3], TRUE[:3, 3], atol=0.05)
+    assert np.rad2deg(heading_of_camera(T)) == pytest.approx(HEADING_DEG, abs=0.2)
+    np.testing.assert_allclose(T[:3, :3], TRUE[:3, :3], atol=0.005)
+    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
 
 
-def test_the_pose_and_its_covariance_are_those_of_the_first_candidate(cloud, depth, both):
-    found = refined(cloud, depth, both)
-    best = found.candidates[0]
-    np.testing.assert_array_equal(found.T_map_camera[:3, 3], best.camera_m)
-    np.testing.assert_allclose(found.T_map_camera[:3, :3] @ R_LEVEL_CAMERA.T, best.R_map_level, atol=1e-12)
+def test_every_candidates_pose_is_its_cameras_and_the_covariance_the_firsts(bundle, cloud, depth, both, seen_in):
+    found = refined(bundle, cloud, seen_in(depth, both))
+    assert found.best is found.candidates[0]
+    for each in found.candidates:
+        np.testing.assert_array_equal(each.T_map_camera[:3, 3], each.registered.camera_m)
+        R_map_level = each.T_map_camera[:3, :3] @ R_LEVEL_CAMERA.T
+        np.testing.assert_allclose(R_map_level, each.registered.R_map_level, atol=1e-12)
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
-    deviation = np.sqrt(np.diag(found.covariance)[:3])
+    deviation, best = np.sqrt(np.diag(found.covariance)[:3]), found.best.registered
     assert (np.abs(TRUE[1, 3] + 40 * (best.hypothesis == 0) - best.camera_m[1])) < 4 * deviation[1] + 0.02
     assert deviation.max() < 0.3
 
 
 @pytest.mark.parametrize(("weight", "y_m"), [(0.0, 0.5), (1.0, 40.5)])
-def test_the_weight_of_the_similarity_decides_between_two_like_streets(cloud, depth, both, weight, y_m):
-    """The true street fits better; the view of the other one is more similar."""
-    found = refined(cloud, depth, both, similarity_weight=weight)
-    inliers = {each.hypothesis: each.inliers for each in reversed(found.candidates)}
+def test_the_weight_of_the_similarity_decides_between_two_like_streets(
+    bundle, cloud, depth, both, seen_in, weight, y_m
+):
+    """The true street fits better; the views of the other one are more similar by 0.5."""
+    found = refined(bundle, cloud, seen_in(depth, both), inliers=1.0, similarity=weight, likelihood=0.0)
+    inliers = {each.registered.hypothesis: each.registered.inliers for each in reversed(found.candidates)}
     assert inliers[0] < inliers[1] < inliers[0] + 0.5
-    assert found.T_map_camera[1, 3] == pytest.approx(y_m, abs=0.3)
-    assert found.candidates[0].hypothesis == (0 if weight else 1)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(y_m, abs=0.3)
+    assert found.best.registered.hypothesis == (0 if weight else 1)
 
 
-def test_like_similarity_leaves_it_to_the_points(cloud, depth, matches_at):
-    matches = matches_at([(0, 40, 1.8), (0, 0, 1.8)], [0, 0], [0.7, 0.7])
-    assert refined(cloud, depth, matches).T_map_camera[1, 3] == pytest.approx(0.5, abs=0.05)
+@pytest.mark.parametrize("weights", [{}, ONLY_INLIERS, {"inliers": 0.0, "similarity": 0.0, "likelihood": 1.0}])
+def test_like_similarity_leaves_it_to_the_points(bundle_like, cloud, depth, both, seen_in, weights):
+    found = refined(bundle_like(0.7, 0.7), cloud, seen_in(depth, both), **weights)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(0.5, abs=0.05)
 
 
-def test_candidates_come_in_the_order_of_their_support(cloud, depth, both):
-    found = refined(cloud, depth, both, similarity_weight=0.3)
-    support = [each.inliers + 0.3 * (0.9, 0.4)[each.hypothesis] for each in found.candidates]
+def test_similarity_is_of_the_places_around_the_pose_not_of_the_view_that_it_started_from(
+    bundle, cloud, depth, matches_at, seen_in
+):
+    """The start in the true street came by a match of 0.95, but what stands there is 0.4 similar."""
+    found = refined(bundle, cloud, seen_in(depth, matches_at([(0, 0, 1.8)], [0], [0.95])))
+    assert [each.similarity for each in found.candidates] == pytest.approx([0.4] * len(found.candidates), abs=1e-6)
+
+
+def test_candidates_come_in_the_order_of_their_support(bundle, cloud, depth, both, seen_in):
+    found = refined(bundle, cloud, seen_in(depth, both), inliers=2.0, similarity=3.0, likelihood=0.5)
+    sums = [2 * c.registered.inliers + 3 * c.similarity + 0.5 * c.agreement.likelihood for c in found.candidates]
+    support = [candidate.support for candidate in found.candidates]
     assert len(support) > 1
+    assert support == pytest.approx(sums)
     assert support == sorted(support, reverse=True)
 
 
-def test_an_empty_picture_is_not_registered(cloud, depth, both):
-    assert refined(cloud, np.zeros_like(depth), both) is None
+@pytest.mark.parametrize(("y_m", "heading_rad"), [(0.0, None), (40.0, None), (40.0, 0.0)])
+def test_a_prior_decides_where_nothing_else_does(bundle, cloud, depth, both, seen_in, y_m, heading_rad):
+    prior = Prior(position_m=np.array([0.0, y_m]), position_std_m=10.0, heading_rad=heading_rad)
+    nothing = {"inliers": 0.0, "similarity": 0.0, "likelihood": 0.0}
+    found = refined(bundle, cloud, seen_in(depth, both), prior=prior, **nothing)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(y_m + 0.5, abs=0.3)
+    xy = np.array([each.T_map_camera[:2, 3] for each in found.candidates])
+    headings = np.array([heading_of_camera(each.T_map_camera) for each in found.candidates])
+    np.testing.assert_allclose(
+        [each.support for each in found.candidates], prior.log_weight(xy, headings), atol=5e-3
+    )  # the camera's heading is the level frame's but for the lean
 
 
-def test_a_picture_of_too_few_points_is_not_registered(cloud, depth, both):
+def test_an_empty_picture_is_not_registered(bundle, cloud, depth, both, seen_in):
+    assert refined(bundle, cloud, seen_in(np.zeros_like(depth), both)) is None
+
+
+def test_a_picture_of_too_few_points_is_not_registered(bundle, cloud, depth, both, seen_in):
     few = np.zeros_like(depth)
     few[20, 10:39] = depth[20, 10:39]
-    assert refined(cloud, few, both) is None
+    assert refined(bundle, cloud, seen_in(few, both)) is None
     few[20, 39:45] = depth[20, 39:45]
-    assert refined(cloud, few, both) is not None
+    found = refined(bundle, cloud, seen_in(few, both))
+    assert found is not None
+    assert 30 <= found.points <= 35
+
+
+# A frame 2 m further on that is turned by 20 degrees, leans otherwise, and was levelled otherwise too.
+R_LEVEL_OTHER = rotation_y(np.deg2rad(-3.0)) @ R_BODY_OPTICAL
+OTHER = transform_from(rotation_z(np.deg2rad(25.0)) @ R_LEVEL_OTHER, np.array([2.8, 0.3, 1.6]))
+
+
+@pytest.fixture
+def two_frames(street, depth, here, seen_in):
+    other = seen_in(
+        taken(street, OTHER, seed=9), here, R_level_camera=R_LEVEL_OTHER, T_reference_camera=inverse(TRUE) @ OTHER
+    )
+    return seen_in(depth, here), other
+
+
+def test_two_frames_together_are_found_where_the_reference_was_taken(bundle, cloud, two_frames):
+    found = refined(bundle, cloud, *two_frames)
+    np.testing.assert_allclose(found.best.T_map_camera, TRUE, atol=0.03)
+    alone = [refined(bundle, cloud, replace(frame, T_reference_camera=np.eye(4))).points for frame in two_frames]
+    assert found.points == sum(alone)
+
+
+def test_what_another_frame_saw_finds_a_reference_that_saw_nothing(bundle, cloud, depth, here, two_frames, seen_in):
+    found = refined(bundle, cloud, seen_in(np.zeros_like(depth), here), two_frames[1])
+    np.testing.assert_allclose(found.best.T_map_camera, TRUE, atol=0.1)
+    assert found.best.agreement.through < 0.02
+
+
+def test_agreement_is_the_mean_of_what_each_frame_sees_from_where_it_stood(bundle, cloud, two_frames, matches_at):
+    found = refined(bundle, cloud, *two_frames).best
+    alone = []
+    for frame, T_true, heading_deg in zip(two_frames, (TRUE, OTHER), (5, 25), strict=True):
+        there = matches_at([(*T_true[:2, 3], 1.8)], [heading_deg], [0.9])
+        own = refined(bundle, cloud, replace(frame, T_reference_camera=np.eye(4), matches=there)).best
+        np.testing.assert_allclose(own.T_map_camera, T_true, atol=0.05)
+        alone.append(own.agreement)
+    assert found.agreement.likelihood == pytest.approx(np.mean([each.likelihood for each in alone]), abs=0.1)
+    assert found.agreement.through == pytest.approx(np.mean([each.through for each in alone]), abs=0.02)
+
+
+def test_it_does_not_matter_in_which_level_frame_a_frame_is_told(bundle, cloud, two_frames, matches_at):
+    """The second one's turned by a right angle, and the heading of what it resembles with it."""
+    other = two_frames[1]
+    views = replace(other.views, R_level_camera=rotation_z(np.pi / 2) @ other.R_level_camera)
+    turned = replace(other, views=views, matches=matches_at([(0, 0, 1.8)], [-90], [0.9]))
+    one, same = (refined(bundle, cloud, two_frames[0], each) for each in (other, turned))
+    np.testing.assert_allclose(same.best.T_map_camera, one.best.T_map_camera, atol=1e-4)
+    np.testing.assert_allclose(same.covariance, one.covariance, rtol=1e-2, atol=1e-9)
+    assert same.best.agreement.likelihood == pytest.approx(one.best.agreement.likelihood, abs=0.01)
+
+
+def test_similarity_is_the_mean_over_frames(bundle, cloud, two_frames):
+    """In the true street, whose views are (0.4, 0.917), a frame of (1, 0) is 0.4 similar and one of (0, 1) 0.917."""
+    across = replace(two_frames[1], descriptors=np.array([[0.0, 1.0]], np.float32))
+    found = refined(bundle, cloud, two_frames[0], across)
+    assert found.best.similarity == pytest.approx((0.4 + np.sqrt(0.84)) / 2, abs=1e-6)
+
+
+def test_a_stereo_rigs_disparity_offset_is_estimated_where_its_baseline_is_known(bundle, cloud, street, here, seen_in):
+    """50 px times 1 m: 5 px of disparity at 10 m, of which 0.3 px are missing, so that all seems 6 % further away there."""
+    true = street.depth(CAMERA, TRUE)
+    measured = (1 / (1 / np.maximum(true, 1e-3) - 0.3 / 50.0)).astype(np.float32)
+    frame = seen_in(measured, here)
+    rig = replace(frame, query=replace(frame.query, baseline_m=1.0))
+    corrected, believed = (refined(bundle, cloud, each).best.T_map_camera[:2, 3] for each in (rig, frame))
+    np.testing.assert_allclose(corrected, TRUE[:2, 3], atol=0.08)
+    assert np.linalg.norm(believed - TRUE[:2, 3]) > 2 * np.linalg.norm(corrected - TRUE[:2, 3])
+
+
+def test_settings_for_a_rig_free_the_offset_once_the_pose_is_roughly_known():
+    settings = RefineSettings()
+    found = settings_for_rig(settings, 123.0)
+    assert found.focal_baseline_px_m == 123.0
+    free = {name: getattr(found.registration, name).free_offset for name in ("coarse", "middle", "fine")}
+    assert free == {"coarse": False, "middle": True, "fine": True}
+    assert not settings.registration.fine.free_offset
+
+
+@pytest.mark.parametrize(("width", "focal_px"), [(80, 50.0), (40, 25.0)])
+def test_the_focal_length_is_that_of_the_depth_picture(here, seen_in, width, focal_px):
+    frame = seen_in(np.ones((60, 80), np.float32), here)
+    depth_m = np.ones((width * 3 // 4, width), np.float32)
+    assert replace(frame, query=replace(frame.query, depth_m=depth_m)).focal_px == focal_px

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from service.geometry.rigid import rotation_y, rotation_z
-from service.registration.kernel import QueryPoints, SolverOptions
+from service.registration.kernel import QueryPoints, SolverOptions, align
 from service.registration.register import RegistrationSettings, Start, register
 
 HEIGHT_M = 1.5
+STILL = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
+NOTHING_MOVES = {"coarse": STILL, "middle": STILL, "fine": STILL, "turns_rad": ()}
 
 
 def start(R, camera_m, hypothesis, *, turned_deg=0.0, moved_m=(0.0, 0.0, 0.0)):
@@ -80,12 +82,11 @@ def test_every_candidate_keeps_the_number_of_its_hypothesis(two_streets, seen, p
 
 
 def test_the_starts_that_are_refined_stand_apart_and_are_few(surveyed, seen, pose):
-    """Without fine iterations the candidates lie where they were picked, and a single coarse one leaves them spread."""
-    still = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
-    few = SolverOptions(iterations=1, reach=2.7, robust_first=2.0, robust_last=0.5, surface=0.2)
+    """Without further iterations the candidates lie where they were picked, and a single coarse one leaves them spread."""
+    few = SolverOptions(iterations=1, reach=1.2, robust_first=0.8, robust_last=0.3, surface=0.1)
     starts = [start(*pose, k, moved_m=(0.9 * k, 0.2 * k, 0.0)) for k in range(6)]
     for refined, apart_m in ((3, 0.5), (4, 1.0), (1, 0.5)):
-        settings = RegistrationSettings(fine=still, coarse=few, refined=refined, apart_m=apart_m)
+        settings = RegistrationSettings(fine=STILL, middle=STILL, coarse=few, refined=refined, apart_m=apart_m)
         found = register(surveyed, seen, starts, HEIGHT_M, settings)
         assert len(found) == refined
         for i, one in enumerate(found):
@@ -95,13 +96,123 @@ def test_the_starts_that_are_refined_stand_apart_and_are_few(surveyed, seen, pos
 
 def test_starts_are_offset_along_and_across_their_heading(surveyed, seen, pose):
     """Nothing moves: the candidates are the offset starts themselves."""
-    still = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
     offsets = ((0.0, 0.0), (2.0, 0.0), (0.0, 1.0))
-    settings = RegistrationSettings(coarse=still, fine=still, offsets_m=offsets)
+    settings = RegistrationSettings(**NOTHING_MOVES, offsets_m=offsets, kept_of_each=(3, 3))
     left = Start(rotation_z(np.pi / 2), pose[1], 0)
     found = register(surveyed, seen, [left], HEIGHT_M, settings)
     moved = sorted((np.round(each.camera_m - pose[1], 6) + 0.0).tolist() for each in found)
     assert moved == [[-1, 0, 0], [0, 0, 0], [0, 2, 0]]
+
+
+@pytest.mark.parametrize(("most_starts", "turns_deg"), [(6, [0, 10, -10]), (5, [0])])
+def test_starts_are_turned_too_where_they_do_not_become_too_many(surveyed, seen, pose, most_starts, turns_deg):
+    """Two offsets in three turns are six. A turn is about the level frame's own z axis, on a slope too."""
+    settings = RegistrationSettings(
+        **NOTHING_MOVES | {"turns_rad": tuple(np.deg2rad([10, -10]))}, most_starts=most_starts, offsets_m=((0.0, 0.0), (2.0, 0.0)),
+        kept_of_each=(9, 9), refined=9, apart_m=0.0,
+    )  # fmt: skip
+    leaning = Start(pose[0] @ rotation_y(0.2), pose[1], 0)
+    found = register(surveyed, seen, [leaning], HEIGHT_M, settings)
+    turned = [leaning.R_map_level.T @ each.R_map_level for each in found]
+    assert len(found) == 2 * len(turns_deg)
+    assert sorted(round(np.rad2deg(np.arctan2(R[1, 0], R[0, 0]))) for R in turned) == sorted(2 * turns_deg)
+    np.testing.assert_allclose([R[2, 2] for R in turned], 1)
+    for each in found:  # offset along the start's heading, whichever way it was turned afterwards
+        away = leaning.R_map_level.T @ (each.camera_m - pose[1])
+        assert min(np.linalg.norm(away), np.linalg.norm(away - [2, 0, 0])) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("options", "kept"),
+    [({"kept": 4, "kept_of_each": (1, 5)}, 2), ({"kept": 5, "kept_of_each": (1, 5)}, 2), ({"kept": 6, "kept_of_each": (1, 5)}, 3),
+     ({"kept": 2, "kept_of_each": (2, 5)}, 2), ({"kept": 40, "kept_of_each": (1, 4)}, 4)],
+)  # fmt: skip
+def test_so_many_starts_of_each_hypothesis_go_on_however_badly_another_fares(two_streets, seen, pose, options, kept):
+    """Nothing moves. Hypothesis 4 stands in the street, 9 in a field, where nothing is on the map."""
+    starts = [start(*pose, 4), start(*pose, 9, moved_m=(500.0, 0.0, 0.0))]
+    settings = RegistrationSettings(**NOTHING_MOVES, **options, refined=20)
+    found = register(two_streets, seen, starts, HEIGHT_M, settings)
+    assert sorted(each.hypothesis for each in found) == [4] * kept + [9] * kept
+    assert found[0].hypothesis == 4
+    np.testing.assert_allclose(found[0].camera_m, pose[1], atol=1e-9)  # the one start that is not offset
+    assert {each.inliers for each in found if each.hypothesis == 9} == {0.0}
+
+
+def test_the_starts_of_one_hypothesis_that_go_on_stand_apart(surveyed, seen, pose):
+    offsets = ((0.0, 0.0), (0.3, 0.0), (0.0, 0.3), (2.0, 0.0))
+    settings = RegistrationSettings(**NOTHING_MOVES, offsets_m=offsets, kept_of_each=(3, 3), apart_m=0.5)
+    found = register(surveyed, seen, [start(*pose, 0)], HEIGHT_M, settings)
+    away = sorted(round(float(np.linalg.norm(each.camera_m - pose[1])), 6) for each in found)
+    assert away == [0, 2]
+
+
+def test_hypotheses_that_meet_are_refined_once(surveyed, seen, pose):
+    """Two starts a metre apart both come to the true pose; one of them is carried to the end."""
+    starts = [start(*pose, 0, moved_m=(0.5, 0.0, 0.0)), start(*pose, 1, moved_m=(-0.5, 0.0, 0.0))]
+    settings = RegistrationSettings(offsets_m=((0.0, 0.0),), refined=4)
+    found = register(surveyed, seen, starts, HEIGHT_M, settings)
+    assert len(found) == 1
+    np.testing.assert_allclose(found[0].camera_m, pose[1], atol=0.03)
+
+
+@pytest.mark.parametrize(("true", "beside"), [(0, 1), (1, 0), (7, 3)])
+@pytest.mark.parametrize(("weight", "true_goes_on"), [(0.0, True), (0.5, True), (2.0, False)])
+def test_the_similarity_that_a_start_had_helps_to_choose_which_go_to_the_end(
+    two_streets, seen, pose, weight, true_goes_on, true, beside
+):
+    """Nothing moves. One stands where the query was taken; the other, 2.5 m beside, fits worse and is 0.5 more similar."""
+    starts = [
+        replace(start(*pose, true), similarity=0.4),
+        replace(start(*pose, beside, moved_m=(0.0, 2.5, 0.0)), similarity=0.9),
+    ]
+    settings = RegistrationSettings(**NOTHING_MOVES, offsets_m=((0.0, 0.0),), similarity_weight=weight, refined=1)
+    found = register(two_streets, seen, sorted(starts, key=lambda each: each.hypothesis), HEIGHT_M, settings)
+    assert [each.hypothesis for each in found] == [true if true_goes_on else beside]
+
+
+def test_the_middle_stage_moves_the_starts_by_its_own_options_and_points(surveyed, seen, pose, start_at):
+    """With nothing else moving, the candidate lies where the solver leaves the start on every so manyth point."""
+    options = SolverOptions(iterations=4, reach=1.2, robust_first=0.6, robust_last=0.1)
+    settings = RegistrationSettings(
+        **NOTHING_MOVES | {"middle": options}, offsets_m=((0.0, 0.0),), middle_points=101, coarse_points=7
+    )
+    moved = start(*pose, 0, moved_m=(0.3, 0.2, 0.0))
+    found = register(surveyed, seen, [moved], HEIGHT_M, settings)[0]
+    few = seen.subset(np.linspace(0, len(seen) - 1, 101).astype(np.intp))
+    state = start_at(moved.R_map_level, moved.camera_m - surveyed.origin_m)
+    align(surveyed.grid, surveyed.surfels, few, state, options)
+    np.testing.assert_allclose(found.camera_m - surveyed.origin_m, state["t"][0], atol=1e-12)
+    np.testing.assert_allclose(found.R_map_level, state["R"][0], atol=1e-12)
+    assert np.linalg.norm(found.camera_m - moved.camera_m) > 0.2
+
+
+def test_the_fine_stage_lets_no_point_weigh_too_little_but_the_score_is_by_their_own_weights(
+    surveyed, seen, pose, start_at
+):
+    """Nothing else moves. Every third point is trusted with a tenth only, until the end, when it weighs 0.7."""
+    options = SolverOptions(iterations=5, reach=1.2, robust_first=0.6, robust_last=0.1)
+    settings = RegistrationSettings(
+        **NOTHING_MOVES | {"fine": options}, offsets_m=((0.0, 0.0),), fine_weight=0.7, tolerance_m=0.12
+    )
+    trusted = np.where(np.arange(len(seen)) % 3 > 0, 2.0, 0.1).astype(np.float32)
+    points, raised = replace(seen, weight=trusted), replace(seen, weight=np.maximum(trusted, np.float32(0.7)))
+    moved = start(*pose, 0, moved_m=(0.3, 0.2, 0.0))
+    found = register(surveyed, points, [moved], HEIGHT_M, settings)[0]
+    state = start_at(moved.R_map_level, moved.camera_m - surveyed.origin_m)
+    align(surveyed.grid, surveyed.surfels, raised, state, options)
+    np.testing.assert_allclose(found.camera_m - surveyed.origin_m, state["t"][0], atol=1e-12)
+    np.testing.assert_allclose(found.information, state["information"][0], rtol=1e-9)
+    align(
+        surveyed.grid,
+        surveyed.surfels,
+        points,
+        state,
+        STILL,
+        tolerance_m=0.12,
+        height_min_m=settings.ground_m - HEIGHT_M,
+    )
+    assert found.inliers == pytest.approx(state["inliers"][0], abs=1e-12)
+    np.testing.assert_array_equal(points.weight, trusted)
 
 
 def test_points_of_the_ground_support_no_candidate(surveyed, seen, pose):

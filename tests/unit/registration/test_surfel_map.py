@@ -5,7 +5,7 @@ from service.errors import BundleError
 from service.registration.kernel import SURFEL, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 
-NAMES = ["origin", "surfels", "tiles", *(f"{g}_{a}" for g in ("coarse", "fine") for a in ("frame", "block", "nearest"))]
+NAMES = ["origin", "surfels", "tiles", *(f"grid_{array}" for array in ("frame", "block", "nearest"))]
 
 
 @pytest.fixture(scope="module")
@@ -42,23 +42,23 @@ def test_memory_mapped_arrays_register_like_those_in_memory(cloud, tmp_path, poi
         np.save(tmp_path / f"{name}.npy", array)
     mapped = SurfelMap.from_arrays({name: np.load(tmp_path / f"{name}.npy", mmap_mode="r") for name in NAMES})
     assert isinstance(mapped.surfels, np.memmap)
-    assert isinstance(mapped.fine.nearest, np.memmap)
+    assert isinstance(mapped.grid.nearest, np.memmap)
     points = points_at([[1.0, 1, -1.4], [-1, 1, -1.4], [0.5, -1, -1.4], [-1, -1, -1.4]])
     options = SolverOptions(iterations=5, reach=1.2, robust_first=1.0, robust_last=0.1)
     states = [start_at(np.eye(3), [1.5, 1.5, 1.6]) for _ in range(2)]
     for each, state in zip((cloud, mapped), states, strict=True):
-        align(each.fine, each.surfels, points, state, options)
+        align(each.grid, each.surfels, points, state, options)
     assert states[0].tobytes() == states[1].tobytes()
     assert states[0]["inliers"][0] > 0.9
 
 
-def test_the_coarse_grid_reaches_further_than_the_fine_one(cloud, points_at, start_at):
-    """2.7 and 1.2 m: a point that stands 2 m above the middle of a floor meets the coarse grid alone."""
+@pytest.mark.parametrize(("above_m", "seen"), [(1.0, 1), (1.6, 0), (-1.0, 1), (-1.6, 0)])
+def test_the_grid_reaches_12_decimetres_from_a_surface(cloud, points_at, start_at, above_m, seen):
+    """A cell of 0.4 m is in or out by its centre: 1.2 m, give or take half a cell."""
     once = SolverOptions(iterations=1, reach=5.0, robust_first=1.0, robust_last=1.0)
-    coarse, fine = (start_at(np.eye(3), [1.5, 1.5, 1.0]) for _ in range(2))
-    align(cloud.coarse, cloud.surfels, points_at([[0, 0, 1.0]]), coarse, once)
-    align(cloud.fine, cloud.surfels, points_at([[0, 0, 1.0]]), fine, once)
-    assert (coarse["seen"][0], fine["seen"][0]) == (1, 0)
+    state = start_at(np.eye(3), [1.5, 1.5, above_m - 1.0])
+    align(cloud.grid, cloud.surfels, points_at([[0, 0, 1.0]]), state, once)
+    assert state["seen"][0] == seen
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -73,7 +73,7 @@ def test_an_array_of_another_type_is_named(arrays, name):
     refused(arrays, name, "it holds float32")
 
 
-@pytest.mark.parametrize("name", ["origin", "coarse_frame", "fine_block", "fine_nearest"])
+@pytest.mark.parametrize("name", ["origin", "grid_frame", "grid_block", "grid_nearest"])
 def test_numbers_of_another_byte_order_are_refused(arrays, name):
     arrays[name] = arrays[name].astype(arrays[name].dtype.newbyteorder(">"))
     refused(arrays, name, "it holds")
@@ -82,21 +82,21 @@ def test_numbers_of_another_byte_order_are_refused(arrays, name):
 @pytest.mark.parametrize(
     ("name", "shape"),
     [("origin", (4,)), ("origin", (1, 3)), ("surfels", (2, 3)), ("tiles", (2, 3)), ("tiles", (8,)),
-     ("coarse_frame", (3,)), ("fine_frame", (5,)), ("coarse_block", (4, 4)), ("fine_block", (64,)),
-     ("coarse_nearest", (3, 511)), ("fine_nearest", (3, 8, 8, 8))],
+     ("grid_frame", (3,)), ("grid_frame", (5,)), ("grid_block", (4, 4)), ("grid_block", (64,)),
+     ("grid_nearest", (3, 511)), ("grid_nearest", (3, 8, 8, 8))],
 )  # fmt: skip
 def test_an_array_of_another_shape_is_named(arrays, name, shape):
     arrays[name] = np.zeros(shape, arrays[name].dtype)
     refused(arrays, name, "of shape")
 
 
-@pytest.mark.parametrize("name", ["tiles", "coarse_block", "fine_nearest"])
+@pytest.mark.parametrize("name", ["tiles", "grid_block", "grid_nearest"])
 def test_an_array_in_another_order_of_memory_is_named(arrays, name):
     arrays[name] = np.asfortranarray(arrays[name])
     refused(arrays, name, "of shape")
 
 
-@pytest.mark.parametrize("name", ["coarse_block", "coarse_nearest", "fine_block", "fine_nearest"])
+@pytest.mark.parametrize("name", ["grid_block", "grid_nearest"])
 @pytest.mark.parametrize("beyond", [True, False])
 def test_an_index_that_points_outside_is_named(arrays, name, beyond):
     among = arrays[name.replace("block", "nearest")] if "block" in name else arrays["surfels"]
@@ -117,11 +117,10 @@ def test_a_tile_of_senseless_numbers_is_refused(arrays, column, value):
     refused(arrays, "tiles", "makes no sense")
 
 
-@pytest.mark.parametrize("name", ["coarse_frame", "fine_frame"])
 @pytest.mark.parametrize(("entry", "value"), [(0, np.nan), (2, np.inf), (3, np.nan), (3, 0.0), (3, -0.4)])
-def test_a_frame_that_is_none_is_refused(arrays, name, entry, value):
-    arrays[name][entry] = value
-    refused(arrays, name, "it is no frame")
+def test_a_frame_that_is_none_is_refused(arrays, entry, value):
+    arrays["grid_frame"][entry] = value
+    refused(arrays, "grid_frame", "it is no frame")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -138,8 +137,8 @@ def test_other_numbers_that_are_none_are_refused(arrays, name, field):
 
 
 def test_who_trusts_the_files_may_skip_the_look_at_every_index(arrays):
-    arrays["fine_nearest"][0, 0] = 10**6
-    assert SurfelMap.from_arrays(arrays, verify=False).fine.nearest[0, 0] == 10**6
+    arrays["grid_nearest"][0, 0] = 10**6
+    assert SurfelMap.from_arrays(arrays, verify=False).grid.nearest[0, 0] == 10**6
     with pytest.raises(BundleError):
         SurfelMap.from_arrays(arrays, verify=False).require_consistent()
 

@@ -1,14 +1,19 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import faiss
+import numpy as np
 import pytest
 
-from service.errors import DecodeError, ImageSizeError, TooLargeError, UnknownMapError
+from service.errors import DecodeError, ImageSizeError, RequestError, TooLargeError, UnknownMapError
 from service.geometry.camera import PinholeCamera
-from service.runtime.engine import EncodedQuery, Engine
+from service.localization.prior import Prior
+from service.maps.reader import MapBundle
+from service.maps.writer import write_bundle
+from service.runtime.engine import EncodedQuery, Engine, _prior_in
 from service.runtime.settings import Limits, Settings
 
 Parts = Callable[..., dict[str, bytes]]
@@ -69,3 +74,58 @@ def test_every_worker_runs_native_code_on_one_thread(engine: Engine) -> None:
     faiss.omp_set_num_threads(2)
     assert engine.admission.submit(faiss.omp_get_max_threads).result(30) == 1
     assert cv2.getNumThreads() == 1
+
+
+@pytest.fixture
+def twins(twin_map: Path) -> Iterator[Engine]:
+    engine = Engine.open(Settings(maps=(twin_map,), threads=1))
+    yield engine
+    engine.close()
+
+
+@pytest.mark.parametrize("y", [0.0, 90.0])
+def test_a_prior_in_degrees_tells_two_streets_apart_like_one_in_metres(
+    twins: Engine, encoded: EncodedQuery, y: float
+) -> None:
+    earth = MapBundle.open(twins.registry.get(None).bundle.path).earth
+    assert earth is not None
+    known = (replace(encoded, prior=Prior(position_m=np.array([20.0, y]), position_std_m=10.0)),
+             replace(encoded, prior=Prior(position_std_m=10.0), prior_wgs84=earth.to_earth(np.array([20.0, y, 0.0]))[:2]))  # fmt: skip
+    in_metres, in_degrees = (twins.localize(each).answer for each in known)
+    np.testing.assert_allclose(in_metres.T_map_camera[:2, 3], [20, y], atol=0.3)
+    np.testing.assert_allclose(in_degrees.T_map_camera, in_metres.T_map_camera, atol=1e-6)
+
+
+def test_a_prior_in_degrees_keeps_what_else_is_known(twins: Engine, encoded: EncodedQuery) -> None:
+    """A hundredth of a degree north and east of Berlin's middle: 1112.7 m and 678.6 m."""
+    prior = Prior(position_std_m=7.0, heading_rad=1.25, heading_std_rad=0.5)
+    bundle = twins.registry.get(None).bundle
+    found = _prior_in(replace(encoded, prior=prior, prior_wgs84=(52.53, 13.415)), bundle)
+    assert found is not None
+    np.testing.assert_allclose(found.position_m, [678.6, 1112.7], atol=0.3)
+    assert (found.position_std_m, found.heading_rad, found.heading_std_rad) == (7.0, 1.25, 0.5)
+    assert _prior_in(replace(encoded, prior=prior), bundle) is prior
+    assert _prior_in(encoded, bundle) is None
+
+
+def test_a_prior_in_degrees_is_refused_where_the_map_does_not_know_where_it_lies(
+    engine: Engine, encoded: EncodedQuery
+) -> None:
+    asked = replace(encoded, prior=Prior(), prior_wgs84=(52.52, 13.405))
+    with pytest.raises(RequestError, match="the map 'tiny' is not georeferenced; send prior.position") as error:
+        engine.localize(asked)
+    assert error.value.field == "prior.wgs84"
+
+
+@pytest.mark.parametrize(("of_service", "of_query", "status"), [
+    (0.01, None, "LOCALIZED"), (0.001, None, "AMBIGUOUS"), (0.001, 0.01, "LOCALIZED"), (0.01, 0.001, "AMBIGUOUS"),
+])  # fmt: skip
+def test_the_services_rate_of_false_accepts_holds_where_a_query_names_none(
+    content_of: Callable[..., Any], calibration_json: Callable[..., Any], tmp_path: Path, encoded: EncodedQuery,
+    of_service: float, of_query: float | None, status: str,
+) -> None:  # fmt: skip
+    """Even odds whatever the evidence: enough for one in a hundred, not for one in a thousand."""
+    write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
+    engine = Engine.open(Settings(maps=(tmp_path / "m",), threads=1, false_accept_rate=of_service))
+    assert engine.localize(replace(encoded, false_accept_rate=of_query)).answer.status == status
+    engine.close()

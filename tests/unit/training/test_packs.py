@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 
@@ -6,6 +8,7 @@ pytest.importorskip("torch", reason="needs the extra `training`")
 from model_training.training import packs as module  # after the skip
 from model_training.training.packs import Pack, PackPlan, make_pack, make_packs, rows_seen_by
 from model_training.training.recipe import (
+    CALIBRATION_SEEDS,
     EVALUATION_SEEDS,
     TRAINING_SEEDS,
     WATCH_SEEDS,
@@ -94,11 +97,11 @@ def test_rows_with_hardly_a_measurement_are_not_seen():
     assert rows_seen_by(panoramas).tolist() == [False, False, True]
 
 
-def test_seeds_of_training_watching_and_evaluation_are_disjoint():
-    training, watch, evaluation = (set(seeds) for seeds in (TRAINING_SEEDS, WATCH_SEEDS, EVALUATION_SEEDS))
-    assert not training & watch
-    assert not training & evaluation
-    assert not watch & evaluation
+@pytest.mark.parametrize(
+    ("one", "other"), [*itertools.combinations([TRAINING_SEEDS, WATCH_SEEDS, CALIBRATION_SEEDS, EVALUATION_SEEDS], 2)]
+)
+def test_seeds_of_training_watching_calibration_and_evaluation_are_disjoint(one, other):
+    assert not set(one) & set(other)
 
 
 def test_the_stock_encoder_meets_no_city_that_a_bar_is_measured_on():

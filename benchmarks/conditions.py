@@ -1,0 +1,33 @@
+"""Hard conditions: each with the clear day's drive through the same city beside it."""
+
+from benchmarks.plans import hard_plan, lidar_16_plan, unseen_plan
+from benchmarks.report import Report
+from benchmarks.runs import Runs, share
+from benchmarks.sequences import ask_sequences
+from model_training.mapping.build import BuildSettings
+from model_training.simulation.hard import HARD, WEATHER_AND_LIGHT
+
+BARS = {"blocked_50": 0.75, "depth_15m": 0.88} | dict.fromkeys(WEATHER_AND_LIGHT, 0.97)
+BAR = 0.95
+
+
+def condition_rows(report: Report, runs: Runs) -> None:
+    """Every condition of the drive, of the survey, and depth that ends at 15 m with five frames."""
+    dataset = runs.dataset(hard_plan())
+    bundle = runs.bundle(runs.dataset(unseen_plan(0)))  # of the same city: hard_plan has its seed
+    for name in ("clear", *HARD):
+        figures = runs.figures(bundle, dataset, [f"{name}_precise"], refine=True)
+        bar = None if name == "clear" else BARS.get(name, BAR)
+        share(report, f"full.condition.{name}.within_1_m", figures, "within_1_m", bar)
+        forced = figures["predictions"][f"{name}_precise"]
+        share(report, f"full.condition.{name}.recall_at_10_5m", figures, "recall_at_10_5m")
+        report.row(
+            f"full.condition.{name}.forced_within_1_m", runs.forced_within(forced, 1.0), "share", n=figures["queries"]
+        )
+    sparse = runs.bundle(dataset, BuildSettings(name="hard-survey-5m", spacing_m=5.0))
+    beams = runs.dataset(lidar_16_plan())
+    for name, other, asked in (("survey_5m", sparse, dataset), ("lidar_16", runs.bundle(beams), beams)):
+        figures = runs.figures(other, asked, ["clear_precise"], refine=True)
+        share(report, f"full.condition.{name}.within_1_m", figures, "within_1_m", BAR)
+    found = ask_sequences(bundle, dataset, "depth_15m_sequence5_precise")
+    report.share("full.condition.depth_15m_sequence5.within_1_m", found.within_1_m, bar=0.99)

@@ -1,0 +1,215 @@
+"""Does confidence know what it does not know? Another city's queries, streets that the map lacks, pictures that show nothing."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.full import unseen_answers
+from benchmarks.plans import BOTH, hard_plan, more_plan, unseen_plan
+from benchmarks.report import Report
+from benchmarks.runs import Runs
+from model_training.calibration.fit import expected_calibration_error
+from model_training.datasets.without_streets import WithoutStreets
+from model_training.evaluation.predict import Predictions, joined
+from model_training.mapping.build import BuildSettings
+from model_training.simulation.hard import HARD
+from service.errors import NoDepthError
+from service.geometry.camera import PinholeCamera
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+
+RIGHT_M = 1.0
+#: Cities whose maps are built once more with every second street left out.
+PARTIAL = (0, 1)
+#: Draws one picture: depth (z, m, 0 for none) and grey.
+Picture = Callable[[np.random.Generator], tuple[NDArray[np.float64], NDArray[np.float64]]]
+FALSE_BARS = {("other_city", "precise"): 0.003, ("removed_streets", "precise"): 0.005,
+              ("other_city", "stereo"): 0.02, ("removed_streets", "stereo"): 0.03}  # fmt: skip
+
+
+def confidence_and_right(answers: Predictions) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Of every query; no answer is no confidence."""
+    distance = np.linalg.norm(answers.T_answer[:, :2, 3] - answers.T_true[:, :2, 3], axis=1)
+    return np.nan_to_num(answers.confidence), np.nan_to_num(distance, nan=np.inf) <= RIGHT_M
+
+
+def doubt_rows(report: Report, runs: Runs) -> None:
+    """False accepts by kind, calibration error, Brier score."""
+    inside: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = []
+    outside: list[NDArray[np.float64]] = []
+    accepted_at: dict[str, float] = {}
+    for preset in BOTH:
+        own = unseen_answers(runs, preset)
+        confidence, right = confidence_and_right(joined(own))
+        accepted_at[preset] = float(np.quantile(confidence[right], 0.05))
+        other = confidence_and_right(_of_another_city(runs, preset))[0]
+        _false_rows(report, f"doubt.other_city.{preset}", other, confidence, right, FALSE_BARS["other_city", preset])
+        away, near, near_right = _where_streets_are_missing(runs, preset)
+        _false_rows(report, f"doubt.removed_streets.{preset}", away, near, near_right, FALSE_BARS["removed_streets", preset])  # fmt: skip
+        take = np.random.default_rng(5).permutation(len(confidence))[: 1000 if preset == "stereo" else 500]
+        inside.append((confidence[take], right[take]))
+        outside += [other[:500], away[:500]]
+    inside.append(_hard(runs, 500))
+    confidence = np.concatenate([*(c for c, _ in inside), *outside])
+    right = np.concatenate([*(r for _, r in inside), *(np.zeros(len(c), bool) for c in outside)])
+    error = expected_calibration_error(confidence, right)
+    report.row("doubt.expected_calibration_error", error, "share", bar=0.02, better="lower", n=len(right))
+    report.row("doubt.brier_score", float(np.mean((confidence - right) ** 2)), "share", better="lower", n=len(right))
+    localizer = Localizer.open(runs.bundle(runs.dataset(unseen_plan(0))))
+    for kind, queries in nonsense(np.random.default_rng(6)).items():
+        found = np.array([_confidence_of(localizer, query) for query in queries])
+        for preset in BOTH:
+            accepted = float((found >= accepted_at[preset]).mean())
+            report.row(f"doubt.{kind}.{preset}.false_accepts_at_95", accepted, "share", better="lower", n=len(found))
+    _reliability(report, confidence, right)
+
+
+def _of_another_city(runs: Runs, preset: str) -> Predictions:
+    """The second city's queries, asked of the first one's map."""
+    bundle = runs.bundle(runs.dataset(unseen_plan(0)))
+    first = runs.figures(bundle, runs.dataset(unseen_plan(1)), [f"drive1_{preset}"], refine=True)["predictions"]
+    second = runs.figures(bundle, runs.dataset(more_plan(1)), [f"drive3_{preset}"], refine=True)["predictions"]
+    return joined([*first.values(), *second.values()])
+
+
+def _where_streets_are_missing(
+    runs: Runs, preset: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Confidence of the queries outside; confidence and rightness of those inside: maps with every second street."""
+    away, near, right = [], [], []
+    for index in PARTIAL:
+        dataset, more = runs.dataset(unseen_plan(index)), runs.dataset(more_plan(index))
+        partial = WithoutStreets(dataset.folder, each=2)
+        bundle = runs.bundle(partial, BuildSettings(name=f"{dataset.name}-without-streets"))
+        for asked, name in ((dataset, f"drive1_{preset}"), (more, f"drive3_{preset}")):
+            answers = runs.figures(bundle, asked, [name], refine=True)["predictions"][name]
+            outside = partial.is_outside(answers.T_true[:, :2, 3])
+            confidence, is_right = confidence_and_right(answers)
+            away.append(confidence[outside])
+            near.append(confidence[~outside])
+            right.append(is_right[~outside])
+    return np.concatenate(away), np.concatenate(near), np.concatenate(right)
+
+
+def _hard(runs: Runs, count: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    dataset = runs.dataset(hard_plan())
+    bundle = runs.bundle(runs.dataset(unseen_plan(0)))
+    names = [f"{name}_precise" for name in HARD]
+    answers = runs.figures(bundle, dataset, names, refine=True)["predictions"]
+    confidence, right = confidence_and_right(joined([answers[name] for name in names]))
+    take = np.linspace(0, len(right) - 1, count).astype(int)
+    return confidence[take], right[take]
+
+
+def _false_rows(
+    report: Report, row: str, negative: NDArray[np.float64], confidence: NDArray[np.float64], right: NDArray[np.bool_], bar: float
+) -> None:  # fmt: skip
+    level = float(np.quantile(confidence[right], 0.05))
+    report.share(f"{row}.false_accepts_at_95", negative >= level, bar=bar, better="lower")
+    report.row(f"{row}.average_precision", average_precision(confidence, right, negative), "share", n=len(negative))
+
+
+def average_precision(
+    confidence: NDArray[np.float64], right: NDArray[np.bool_], negative: NDArray[np.float64]
+) -> float:
+    """Area under precision over recall of true accepts, false ones being answers outside the map."""
+    score = np.concatenate([confidence[right], negative])
+    true = np.r_[np.ones(int(right.sum()), bool), np.zeros(len(negative), bool)]
+    true = true[np.argsort(-score, kind="stable")]
+    precision = np.cumsum(true) / np.arange(1, len(true) + 1)
+    return float(precision[true].mean())
+
+
+def _confidence_of(localizer: Localizer, query: Query) -> float:
+    try:
+        return localizer.localize(query).confidence or 0.0
+    except NoDepthError:
+        return 0.0
+
+
+def nonsense(rng: np.random.Generator, count: int = 100) -> dict[str, list[Query]]:
+    """Pictures that no street shows."""
+    return {
+        "indoor": list(_many(rng, count, _room)), "blank_wall": list(_many(rng, count, _wall)),
+        "covered_lens": list(_many(rng, count, _covered)), "sky": list(_many(rng, count, _sky)),
+        "noise": list(_many(rng, count, _noise)),
+    }  # fmt: skip
+
+
+_CAMERA = PinholeCamera(640, 480, 320.0, 320.0, 319.5, 239.5)
+
+
+def _many(rng: np.random.Generator, count: int, one: Picture) -> Iterator[Query]:
+    for _ in range(count):
+        z, grey = one(rng)
+        noisy = np.where(z > 0, 1 / np.maximum(1 / np.maximum(z, 1e-3) + rng.normal(0, 0.1 / 80, z.shape), 1e-3), 0)
+        rgb = np.repeat(np.clip(grey + rng.normal(0, 4, z.shape), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        yield Query(rgb=rgb, depth_m=noisy.astype(np.float32), camera=_CAMERA)
+
+
+def _rays() -> NDArray[np.float64]:
+    return _CAMERA.rays_of_pixels()
+
+
+def _box_depth(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depth of the inside of a box around the camera (optical frame)."""
+    rays = _rays()
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, high / rays, low / rays)
+    return np.where(np.isfinite(reach), reach, np.inf).min(axis=2)
+
+
+def _room(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A room or a corridor with some furniture."""
+    half, height = rng.uniform(1.2, 6.0), rng.uniform(2.4, 3.5)
+    low = np.array([-half * rng.uniform(0.4, 1), -(height - 1.5), -1.0])
+    high = np.array([half * rng.uniform(0.4, 1), 1.5, rng.uniform(3.0, 18.0)])
+    z = _box_depth(low, high)
+    for _ in range(int(rng.integers(2, 7))):
+        rays, x, depth = _rays(), rng.uniform(low[0], high[0]), rng.uniform(1.5, high[2])
+        width, top = rng.uniform(0.3, 1.5), rng.uniform(-0.5, 1.2)
+        hit = (
+            (np.abs(rays[..., 0] * depth - x) < width / 2) & (rays[..., 1] * depth > top) & (rays[..., 1] * depth < 1.5)
+        )
+        z = np.where(hit & (depth < z), depth, z)
+    return z, 60 + 20 * z
+
+
+def _wall(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A wall before the camera, turned a little."""
+    normal = np.array([np.sin(turn := rng.uniform(-0.6, 0.6)), 0.0, np.cos(turn)])
+    z = rng.uniform(1.0, 6.0) / np.maximum((_rays() @ normal), 0.05)
+    ground = np.where(_rays()[..., 1] > 1e-3, 1.5 / np.maximum(_rays()[..., 1], 1e-3), np.inf)
+    return np.minimum(z, ground).clip(max=40.0), np.full(z.shape, rng.uniform(60, 200))
+
+
+def _covered(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Something on the lens: no depth but some noise near by."""
+    z = np.where(rng.random((480, 640)) < 0.1, rng.uniform(0.2, 0.6, (480, 640)), 0.0)
+    return z, np.full(z.shape, rng.uniform(0, 30))
+
+
+def _sky(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Looking up: depth is invented here and there."""
+    z = np.where(rng.random((480, 640)) < 0.02, rng.uniform(5.0, 60.0, (480, 640)), 0.0)
+    return z, np.full(z.shape, rng.uniform(150, 250))
+
+
+def _noise(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depth without any surface."""
+    coarse = rng.uniform(1.0, 40.0, (30, 40))
+    return np.kron(coarse, np.ones((16, 16))), rng.uniform(0, 255, (480, 640))
+
+
+def _reliability(report: Report, confidence: NDArray[np.float64], right: NDArray[np.bool_]) -> None:
+    """The diagram's points, for the page of reports."""
+    order = np.argsort(confidence, kind="stable")
+    report.notes["reliability"] = [
+        {
+            "confidence": round(float(confidence[part].mean()), 4),
+            "right": round(float(right[part].mean()), 4),
+            "n": len(part),
+        }
+        for part in np.array_split(order, 15)
+    ]

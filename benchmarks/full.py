@@ -1,0 +1,133 @@
+"""The full answer: registration after retrieval, position, heading and covariance."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from benchmarks.plans import BOTH, more_plan, paper_plan, unseen_plan
+from benchmarks.report import Report
+from benchmarks.runs import Runs, share
+from model_training.evaluation.error_measures import distance_errors, heading_errors_deg
+from model_training.evaluation.measures import measure
+from model_training.evaluation.predict import Predictions, headings_of, joined
+from service.geometry.rigid import heading_of_camera
+
+COVERAGE_BAR = (0.90, 0.98)
+
+
+def full_paper_rows(report: Report, runs: Runs) -> None:
+    """The paper's city: five other drives with Table I's counts."""
+    dataset = runs.dataset(paper_plan())
+    bundle = runs.bundle(dataset)
+    for preset, street in (("precise", 0.998), ("stereo", 0.985)):
+        figures = runs.figures(bundle, dataset, [f"drive{k}_{preset}" for k in range(1, 6)], refine=True)
+        row, precise = f"full.paper_city.{preset}", preset == "precise"
+        share(report, f"{row}.street_accuracy", figures, "street_accuracy", street)
+        share(report, f"{row}.localized", figures, "localized", 0.99 if precise else None)
+        share(report, f"{row}.within_1_m", figures, "within_1_m")
+        forced = {f"forced_{key}": value for key, value in figures["forced"].items()}
+        bars = {"mean_distance_error_m": 0.05, "median_distance_error_m": 0.04, "forced_mean_distance_error_m": 0.15}
+        for key, bar in bars.items():
+            value = (figures | forced)[key]
+            report.row(f"{row}.{key}", value, "m", bar=bar if precise else None, better="lower", n=figures["queries"])
+
+
+def unseen_answers(runs: Runs, preset: str) -> list[Predictions]:
+    """Answers to 1,000 queries of each of the three unseen cities, by their own maps."""
+    found = []
+    for index in range(3):
+        dataset, more = runs.dataset(unseen_plan(index)), runs.dataset(more_plan(index))
+        bundle = runs.bundle(dataset)
+        first = runs.figures(bundle, dataset, [f"drive1_{preset}"], refine=True)["predictions"]
+        second = runs.figures(bundle, more, [f"drive3_{preset}"], refine=True)["predictions"]
+        found.append(joined([*first.values(), *second.values()]))
+    return found
+
+
+def full_unseen_rows(report: Report, runs: Runs) -> None:
+    """Three unseen cities: shares over all queries, medians over the accepted ones."""
+    headings = {"precise": 0.12, "stereo": 0.35}
+    coverage: dict[str, float] = {}
+    gaps: dict[str, float] = {}
+    for preset in BOTH:
+        cities = unseen_answers(runs, preset)
+        parts: list[dict[str, Any]] = [measure(each, _numbered(each)) for each in cities]
+        row = f"full.unseen.{preset}"
+        share(report, f"{row}.within_0_5_m", parts, "within_0_5_m", 0.998 if preset == "precise" else None)
+        share(report, f"{row}.within_1_m", parts, "within_1_m", 0.985 if preset == "stereo" else None)
+        share(report, f"{row}.localized", parts, "localized")
+        answers = joined(cities)
+        accepted = answers.localized
+        distance = distance_errors(answers.T_answer[:, :2, 3], answers.T_true[:, :2, 3])
+        forced = np.nan_to_num(distance, nan=np.inf)
+        report.row(f"{row}.forced_within_1_m", float((forced <= 1.0).mean()), "share", n=len(forced))
+        turned = heading_errors_deg(headings_of(answers.T_answer), headings_of(answers.T_true))
+        bar = 0.10 if preset == "stereo" else None
+        count, middle = int(accepted.sum()), float(np.median(distance[accepted]))
+        report.row(f"{row}.median_distance_error_m", middle, "m", bar=bar, better="lower", n=count)
+        middle = float(np.median(turned[accepted]))
+        report.row(f"{row}.median_heading_error_deg", middle, "deg", bar=headings[preset], better="lower", n=count)
+        near = accepted & (np.linalg.norm(answers.T_answer[:, :3, 3] - answers.T_true[:, :3, 3], axis=1) < 1.0)
+        errors, covariances = pose_errors(answers, near), answers.covariance[near]
+        for name, size in (("position", 3), ("full_pose", 6)):
+            coverage[f"{name}.{preset}"] = consistent(errors[:, :size], covariances[:, :size, :size])
+        gaps |= {f"{axis}.{preset}": gap for axis, gap in sigma_gaps(answers, near, errors, covariances).items()}
+        gross = int((accepted & ~near).sum())
+        report.row(f"doubt.gross_errors.{preset}", gross / max(1, count), "share", better="lower", n=count)
+    for name, value in coverage.items():
+        report.row(f"doubt.covariance_95_coverage.{name}", value, "share")
+    worst = max(coverage.values(), key=lambda value: abs(value - np.mean(COVERAGE_BAR)))
+    report.row("doubt.covariance_95_coverage", worst, "share", bar=COVERAGE_BAR, why="the worst of the four above")
+    for name, value in gaps.items():
+        report.row(f"doubt.sigma_coverage_gap.{name}", value, "share", better="lower")
+    report.row(
+        "doubt.sigma_coverage_gap",
+        max(gaps.values()),
+        "share",
+        bar=0.05,
+        better="lower",
+        why="the worst of those above",
+    )
+
+
+def _numbered(answers: Predictions) -> list[str]:
+    """Names for the streets, which are not shown."""
+    return [str(number) for number in range(1 + int(max(answers.street_true.max(), answers.street_answer.max())))]
+
+
+def pose_errors(answers: Predictions, rows: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Errors (n, 6) of translation (m) and rotation (rad), map axes, as the covariance counts them."""
+    T, truth = answers.T_answer[rows], answers.T_true[rows]
+    R = T[:, :3, :3] @ truth[:, :3, :3].transpose(0, 2, 1)
+    angle = np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
+    scale = angle / np.maximum(np.sin(angle), 1e-12)
+    return np.concatenate([T[:, :3, 3] - truth[:, :3, 3], axis * scale[:, None]], axis=1)
+
+
+def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> float:
+    """Share of normalised squared errors between the 2.5 % and 97.5 % quantiles of chi-square."""
+    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    low, high = chi2.ppf([0.025, 0.975], errors.shape[1])
+    return float(((squared >= low) & (squared <= high)).mean())
+
+
+def sigma_gaps(
+    answers: Predictions, rows: NDArray[np.bool_], errors: NDArray[np.float64], covariances: NDArray[np.float64]
+) -> dict[str, float]:
+    """Largest difference of 1, 2 and 3 sigma coverage from the normal distribution's, axis by axis.
+
+    A street's queries look along it, 15 degrees off at most: the camera's heading stands for the street's.
+    """
+    heading = np.array([heading_of_camera(T) for T in answers.T_true[rows]])
+    axes = np.zeros((4, len(heading), 6))
+    axes[0, :, 0], axes[0, :, 1] = np.cos(heading), np.sin(heading)
+    axes[1, :, 0], axes[1, :, 1] = -np.sin(heading), np.cos(heading)
+    axes[2, :, 2], axes[3, :, 5] = 1.0, 1.0
+    found = {}
+    for name, axis in zip(("along", "across", "up", "heading"), axes, strict=True):
+        sigmas = np.abs((axis * errors).sum(axis=1)) / np.sqrt(np.einsum("ni,nij,nj->n", axis, covariances, axis))
+        found[name] = max(abs(float((sigmas <= k).mean()) - p) for k, p in ((1, 0.683), (2, 0.954), (3, 0.997)))
+    return found

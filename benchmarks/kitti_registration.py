@@ -1,0 +1,73 @@
+"""Registration on real stereo frames, by the protocol of the data folder's README: 7 frames, 20 disturbed starts each."""
+
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.report import Report
+from benchmarks.runs import Runs
+from model_training.datasets.dataset import Dataset
+from model_training.datasets.kitti_object import import_kitti_object
+from model_training.mapping.build import BuildSettings
+from service.geometry.rigid import rotation_z, transform_from
+from service.imaging.level import level_camera
+from service.localization.refine import RefineSettings, settings_for_rig
+from service.registration.points import inverse_depth_noise, points_of
+from service.registration.register import Start, register
+
+STARTS, AWAY_M, TURN_DEG = 20, 2.0, 10.0
+FOCAL_BASELINE_PX_M = 721.5 * 0.54
+BARS = {"median_m": (0.08, "lower"), "p95_m": (0.15, "lower"), "within_1_m": (1.0, "higher")}
+
+
+def kitti_registration_rows(report: Report, runs: Runs, data: Path) -> None:
+    """Errors of the pose found; the rows stay, with a reason, where the recordings are not there."""
+    kitti = data / "kitti_stereo"
+    prefix = "real.kitti_stereo.registration"
+    if not kitti.exists():
+        for key, (bar, better) in BARS.items():
+            report.row(f"{prefix}.{key}", None, "m", bar=bar, better=better, why=f"no recordings at {data.name}")  # type: ignore[arg-type]
+        return
+    folder = runs.work / "kitti_sgbm"
+    if not folder.exists():
+        import_kitti_object(kitti, folder, depth="sgbm")
+    dataset = Dataset(folder)
+    settings = BuildSettings(name="kitti", expected_lidar_height_m=1.73)
+    errors = np.array(registration_errors(runs.bundle(dataset, settings).cloud, dataset))
+    found = {"median_m": np.median(errors), "p95_m": np.percentile(errors, 95), "within_1_m": (errors <= 1.0).mean()}
+    for key, value in found.items():
+        bar, better = BARS[key]
+        unit = "share" if key == "within_1_m" else "m"
+        report.row(f"{prefix}.{key}", float(value), unit, bar=bar, better=better, n=len(errors))  # type: ignore[arg-type]
+
+
+def registration_errors(cloud: object, dataset: Dataset) -> list[float]:
+    """Distance (m) between the pose found and the truth, of every start of every frame."""
+    refining = settings_for_rig(RefineSettings(), FOCAL_BASELINE_PX_M)
+    found = []
+    for frame in dataset.queries("frames"):
+        depth_m, camera, truth = frame.depth_m(), frame.camera.pinhole(), frame.T_map_camera
+        level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.65)
+        noise = inverse_depth_noise(depth_m)
+        points = points_of(
+            depth_m, camera, level.R_level_camera, level.height_m, refining.points, noise=noise, focal_baseline_px_m=FOCAL_BASELINE_PX_M
+        )  # fmt: skip
+        rng = np.random.default_rng([140, frame.number])
+        R_true = truth[:3, :3] @ level.R_level_camera.T
+        for _ in range(STARTS):
+            away = rng.uniform(0, AWAY_M) * _direction(rng.uniform(-np.pi, np.pi))
+            turn = np.deg2rad(rng.uniform(-TURN_DEG, TURN_DEG))
+            upright = _upright(R_true)
+            start = Start(rotation_z(turn) @ upright, truth[:3, 3] + away, 0)
+            best = register(cloud, points, [start], level.height_m, refining.registration)[0]  # type: ignore[arg-type]
+            found.append(float(np.linalg.norm(transform_from(best.R_map_level, best.camera_m)[:3, 3] - truth[:3, 3])))
+    return found
+
+
+def _direction(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+def _upright(R_map_level: np.ndarray) -> np.ndarray:
+    """The heading alone: how a camera leans against the map is not told beforehand."""
+    return rotation_z(float(np.arctan2(R_map_level[1, 0], R_map_level[0, 0])))

@@ -1,0 +1,56 @@
+"""What the accuracy report simulates: cities, drives and conditions by seeds that no training and no calibration uses."""
+
+from model_training.simulation.hard import HARD, hard_query
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.training.recipe import EVALUATION_SEEDS
+
+BOTH = ("precise", "stereo")
+HARD_COUNT, SEQUENCES, SEQUENCE = 300, 120, 5
+
+
+def paper_plan() -> SimulationPlan:
+    """The paper's city: five other drives with Table I's counts, and frames of the survey's own drive."""
+    drives = tuple(QueryPlan(name=f"drive{k}", traversal=k, per_class=True, depths=BOTH) for k in range(1, 6))
+    own = QueryPlan(name="survey_drive", traversal=0, count=500, on_track=True, depths=("precise",))
+    return SimulationPlan(name="paper-city", city="paper", seed=0, queries=(*drives, own))
+
+
+def unseen_plan(index: int) -> SimulationPlan:
+    """One of three cities that no encoder was trained on: 1,000 queries together, and as many blocked ones."""
+    count = (334, 333, 333)[index]
+    queries = (
+        QueryPlan(name="drive1", traversal=1, count=count, depths=BOTH),
+        QueryPlan(name="blocked25", traversal=2, count=count, depths=("precise",), blocked=0.25),
+    )
+    return SimulationPlan(name=f"unseen-{index + 1}", seed=EVALUATION_SEEDS[index + 1], queries=queries)
+
+
+def more_plan(index: int) -> SimulationPlan:
+    """2,000 further queries of the three unseen cities together, for registration; their maps are ``unseen_plan``'s."""
+    count = (666, 667, 667)[index]
+    queries = (QueryPlan(name="drive3", traversal=3, count=count, depths=BOTH),)
+    return SimulationPlan(name=f"unseen-{index + 1}-more", seed=EVALUATION_SEEDS[index + 1], queries=queries)
+
+
+def hard_plan() -> SimulationPlan:
+    """The first unseen city under every hard condition, a clear day's drive beside them."""
+    queries = [QueryPlan(name="clear", traversal=10, count=HARD_COUNT)]
+    queries += [hard_query(name, traversal=11 + k, count=HARD_COUNT) for k, name in enumerate(HARD)]
+    queries.append(
+        QueryPlan(
+            name="depth_15m_sequence5", traversal=40, count=SEQUENCES, max_depth_m=15.0, sequence=SEQUENCE, step_m=2.0
+        )
+    )
+    return SimulationPlan(name="hard", seed=EVALUATION_SEEDS[1], queries=tuple(queries))
+
+
+def lidar_16_plan() -> SimulationPlan:
+    """The same city and clear day's drive, surveyed with 16 beams."""
+    queries = (QueryPlan(name="clear", traversal=10, count=HARD_COUNT),)
+    return SimulationPlan(name="hard-lidar-16", seed=EVALUATION_SEEDS[1], lidar="vlp_16", queries=queries)
+
+
+def repeating_plan() -> SimulationPlan:
+    """A street of blocks that are all alike but for a landmark every few of them; sequences all along it."""
+    queries = (QueryPlan(name="sequences", traversal=1, count=SEQUENCES, sequence=SEQUENCE, step_m=3.0, aside_m=1.5),)
+    return SimulationPlan(name="repeating", city="repeating", seed=EVALUATION_SEEDS[20], queries=queries)

@@ -1,0 +1,36 @@
+"""What registration costs: all hypotheses and their verification, on one core."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.plans import BOTH, unseen_plan
+from benchmarks.report import Report
+from benchmarks.runs import Runs
+from service.localization.encoder import Encoder
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+
+QUERIES = 100
+BARS_MS = {"precise": 25.0, "stereo": 40.0}
+
+
+def speed_rows(report: Report, runs: Runs) -> None:
+    """Median processor time of the stage: of a query with registration less that of the same query without."""
+    dataset = runs.dataset(unseen_plan(0))
+    bundle = runs.bundle(dataset)
+    localizer = Localizer(bundle, Encoder.open(bundle.encoder_bytes(), threads=1))
+    for preset in BOTH:
+        times = []
+        for frame in list(dataset.queries(f"drive1_{preset}"))[:QUERIES]:
+            query = Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole())
+            times.append(_spent_ms(localizer, query) - _spent_ms(localizer, replace(query, refine=False)))
+        row = f"registration.cpu_ms_per_query.{preset}"
+        report.row(row, float(np.median(times)), "ms", bar=BARS_MS[preset], better="lower", n=len(times))
+
+
+def _spent_ms(localizer: Localizer, query: Query) -> float:
+    began = time.process_time()
+    localizer.localize(query)
+    return 1e3 * (time.process_time() - began)

@@ -1,0 +1,126 @@
+"""Fit ``Calibration`` to asked queries: logistic regression by Newton's method, thresholds from the queries outside the map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.maps.calibration import (
+    FEATURES,
+    RIVALRY,
+    Calibration,
+    Logistic,
+    Threshold,
+    expanded,
+    probability,
+)
+
+RIGHT_M = 1.0
+RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1)
+#: Strength of the ridge, in queries; the one that lost least when each city was predicted from the other.
+RIDGE = 3.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Queries with the truth about them.
+
+    Attributes:
+        evidence: (n, F); NaN where nothing was registered.
+        right: (n) whether the position was within 1 m.
+        known: (n) whether the query was taken in the map.
+        kind: (n) what sort of query it was, for thresholds and tables.
+    """
+
+    evidence: NDArray[np.float64]
+    right: NDArray[np.bool_]
+    known: NDArray[np.bool_]
+    kind: NDArray[np.str_]
+
+    def __len__(self) -> int:
+        return len(self.right)
+
+    def registered(self) -> "Asked":
+        """Those that have evidence; the others' confidence is 0 without any calibration."""
+        keep = np.isfinite(self.evidence).all(axis=1)
+        return Asked(self.evidence[keep], self.right[keep], self.known[keep], self.kind[keep])
+
+
+def pooled(parts: list[Asked]) -> Asked:
+    """Several as one."""
+    return Asked(*(np.concatenate([getattr(part, name) for part in parts]) for name in Asked.__dataclass_fields__))
+
+
+def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RIDGE) -> Calibration:
+    """Calibrate.
+
+    Queries in the map and outside it get the same weight in all, whatever their numbers.
+
+    Args:
+        asked: of calibration cities.
+        measured_on: for people.
+        ridge: strength of the penalty on weights.
+
+    Raises:
+        ValueError: one sort of queries is missing.
+    """
+    used = asked.registered()
+    if used.known.all() or not used.known.any() or used.right.all() or not used.right.any():
+        raise ValueError("calibration needs right and wrong answers, and queries in the map and outside it")
+    weight = np.where(used.known, 0.5 / used.known.mean(), 0.5 / (~used.known).mean())
+    mean, spread = used.evidence.mean(axis=0), used.evidence.std(axis=0) + 1e-9
+    right = _logistic(used.evidence, used.right, weight, mean, spread, ridge)
+    known = _logistic(used.evidence, used.known, weight, mean, spread, ridge, without=RIVALRY)
+    thresholds = _thresholds(asked, right)
+    return Calibration(
+        features=FEATURES, right=right, known=known, thresholds=thresholds, measured_on=measured_on | {"queries": len(asked)}
+    )  # fmt: skip
+
+
+def _logistic(
+    evidence: NDArray[np.float64], label: NDArray[np.bool_], weight: NDArray[np.float64], mean: NDArray[np.float64],
+    spread: NDArray[np.float64], ridge: float, *, without: tuple[str, ...] = (),
+) -> Logistic:  # fmt: skip
+    wide = expanded(evidence, tuple(mean), tuple(spread))
+    silent = np.tile([name in without for name in FEATURES], 3)
+    wide[:, silent] = 0.0
+    design = np.c_[wide, np.ones(len(wide))]
+    penalty = np.r_[np.full(wide.shape[1], ridge), 1e-6]
+    w = np.zeros(design.shape[1])
+    for _ in range(100):
+        p = probability(design @ w)
+        gradient = design.T @ (weight * (p - label)) + penalty * w
+        curvature = (design * (weight * p * (1 - p))[:, None]).T @ design + np.diag(penalty)
+        step = np.linalg.solve(curvature, gradient)
+        w -= step * min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-12))  # far from the end full steps overshoot
+        if np.abs(step).max() < 1e-9:
+            break
+    return Logistic(mean=tuple(mean), spread=tuple(spread), weights=tuple(w[:-1]), bias=float(w[-1]))
+
+
+def _thresholds(asked: Asked, right: Logistic) -> tuple[Threshold, ...]:
+    """The confidence that lets through no more than a rate of the queries outside the map, of the worst kind of them."""
+    outside = ~asked.known
+    confidence = np.zeros(len(asked))
+    has = np.isfinite(asked.evidence).all(axis=1)
+    confidence[has] = probability(right.log_odds(asked.evidence[has]))
+    found = []
+    for rate in RATES:
+        levels = [_level(confidence[outside & (asked.kind == kind)], rate) for kind in np.unique(asked.kind[outside])]
+        found.append(Threshold(false_accept_rate=rate, confidence=max(levels)))
+    return tuple(found)
+
+
+def _level(confidence: NDArray[np.float64], rate: float) -> float:
+    """The lowest confidence that at most ``rate`` of these reach."""
+    ranked = np.sort(confidence)[::-1]
+    allowed = int(rate * len(ranked))
+    return float(min(1.0, np.nextafter(ranked[allowed], 2.0)))
+
+
+def expected_calibration_error(confidence: NDArray[np.float64], right: NDArray[np.bool_], *, bins: int = 15) -> float:
+    """Mean distance of confidence and share right over bins of equal mass (Naeini, Cooper and Hauskrecht, AAAI 2015)."""
+    order = np.argsort(confidence, kind="stable")
+    parts = np.array_split(order, bins)
+    gaps = [len(part) * abs(confidence[part].mean() - right[part].mean()) for part in parts if len(part)]
+    return float(sum(gaps) / len(order))

@@ -1,0 +1,101 @@
+"""Ask the calibration cities' queries and fit; cities, maps and answers are kept and taken as they are the next time."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.calibration.collect import in_the_map, of_another_city, where_streets_are_missing
+from model_training.calibration.fit import Asked, expected_calibration_error, fit, pooled
+from model_training.calibration.plans import CITIES, calibration_plan
+from model_training.datasets.dataset import Dataset
+from model_training.datasets.without_streets import WithoutStreets
+from model_training.mapping.build import BuildSettings, build_map
+from model_training.simulation.simulate import simulate
+from service.localization.encoder import Encoder
+from service.localization.localizer import Localizer
+from service.maps.calibration import Calibration
+from service.maps.reader import MapBundle
+
+MISSING_SETS = ("clear_precise", "clear_stereo")
+Report = Callable[[str, int, int], None]
+
+
+def calibrate(
+    work: Path, encoder: Path, *, anew: bool = False, report: Report = lambda *_: None
+) -> tuple[Calibration, list[str]]:
+    """Fit confidence for an encoder.
+
+    Args:
+        work: where cities, maps and answers are kept; those of this encoder are taken as they are.
+        encoder: ONNX.
+        anew: ask the queries again, since the code that answers them has changed.
+        report: told after every frame, place and query.
+
+    Returns:
+        The calibration, and for people how well each city is predicted from the others.
+    """
+    cities = []
+    for index in range(CITIES):
+        plan = calibration_plan(index)
+        simulate(plan, work / plan.name, report=report)
+        cities.append(Dataset(work / plan.name))
+    parts = [_asked(work, encoder, cities, k, anew=anew, report=report) for k in range(CITIES)]
+    measured_on: dict[str, str | float] = {
+        "cities": ", ".join(f"seed {city.description.seed}" for city in cities),
+        "encoder_sha256": Encoder.open(encoder).sha256,
+    }
+    return fit(pooled(parts), measured_on=measured_on), cross_checks(parts)
+
+
+def _localizer(work: Path, encoder: Path, dataset: Dataset, name: str, report: Report) -> Localizer:
+    folder = work / "maps" / f"{name}-{Encoder.open(encoder).sha256[:12]}"
+    if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        build_map(dataset, encoder, folder, BuildSettings(name=name, calibration=None), report=report)
+    return Localizer.open(MapBundle.open(folder))
+
+
+def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew: bool, report: Report) -> Asked:
+    """All queries of one city: of its map, of the next city's map, of its map with a third of the streets left out."""
+    kept = work / f"asked-{cities[index].name}-{Encoder.open(encoder).sha256[:12]}.npz"
+    if kept.exists() and not anew:
+        with np.load(kept) as arrays:
+            return Asked(*(arrays[name] for name in Asked.__dataclass_fields__))
+    own, other = cities[index], cities[(index + 1) % len(cities)]
+    partial = WithoutStreets(own.folder)
+    found = in_the_map(_localizer(work, encoder, own, own.name, report), own, report)
+    found += of_another_city(_localizer(work, encoder, other, other.name, report), own, report)
+    without = _localizer(work, encoder, partial, f"{own.name}-without-streets", report)
+    found += where_streets_are_missing(without, own, list(MISSING_SETS), partial.is_outside, report)
+    asked = pooled(found)
+    np.savez_compressed(kept, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
+    return asked
+
+
+def cross_checks(parts: list[Asked]) -> list[str]:
+    """How well each city is predicted from the others: what calibration can be believed to do elsewhere."""
+    lines = []
+    for index, held_out in enumerate(parts):
+        calibration = fit(pooled([part for k, part in enumerate(parts) if k != index]), measured_on={})
+        confidence = confidences(calibration, held_out)
+        error = expected_calibration_error(confidence, held_out.right)
+        lines.append(f"city {index + 1} from the others: expected calibration error {error:.4f}")
+        for preset in ("precise", "stereo"):
+            inside = held_out.known & held_out.right & np.char.endswith(held_out.kind, preset)
+            accepted = np.quantile(confidence[inside], 0.05)
+            shares = (
+                f"{kind} {np.mean(confidence[held_out.kind == f'{kind}.{preset}'] >= accepted):.4f}"
+                for kind in ("other_city", "removed_streets")
+            )
+            lines.append(f"  {preset}: false accepts at 95 % of the true ones: {', '.join(shares)}")
+    return lines
+
+
+def confidences(calibration: Calibration, asked: Asked) -> NDArray[np.float64]:
+    """Of every row; 0 where nothing was registered."""
+    found = np.zeros(len(asked))
+    has = np.isfinite(asked.evidence).all(axis=1)
+    found[has] = calibration.confidence(asked.evidence[has])
+    return found

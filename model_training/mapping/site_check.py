@@ -1,0 +1,133 @@
+"""Does calibrated confidence hold on this site? Asked with depth drawn from the survey's own scans, each held out of the map.
+
+A scan that neither the index nor the cloud has seen is drawn as a camera would see it - range and grey from the beams, with a
+stereo camera's noise added - and the map without it is asked. All of these queries are in the map, so they can show that
+confidence is too high here, never that it is too low: the correction only ever lowers it.
+"""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+from service.imaging.view_grid import ViewGrid, panorama_from_points
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+from service.maps.calibration import Calibration, Site, probability
+from service.maps.content import BundleContent
+from service.maps.reader import MapBundle
+from service.maps.writer import write_bundle
+
+MOST, FEWEST = 60, 20
+#: One place in so many is held out, at most ``MOST``.
+_EACH = 25
+_CAMERA = PinholeCamera(320, 240, 160.0, 160.0, 159.5, 119.5)
+_NOISE_PX, _FOCAL_BASELINE = (0.1, 0.5), 80.0  # of the precise and the stereo preset, by turns
+_RIGHT_M = 1.0
+_PRIOR_OFFSET = 1.0  # standard deviation of the log odds' offset, before anything is asked
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldScan:
+    """A scan that was kept out of the map.
+
+    Attributes:
+        place: its number among the places.
+        points: level frame of the LiDAR, with intensity (n, 4).
+        T_map_level: pose of the levelled LiDAR.
+    """
+
+    place: int
+    points: NDArray[np.float32]
+    T_map_level: NDArray[np.float64]
+
+
+def held_out(places: int) -> set[int]:
+    """Numbers of the places that are kept out, evenly spread; none where there are too few for a figure."""
+    count = min(MOST, places // _EACH)
+    if count < FEWEST:
+        return set()
+    return set(np.linspace(0, places - 1, count + 2)[1:-1].astype(int).tolist())
+
+
+def site_of(
+    content: BundleContent, held: list[HeldScan], calibration: Calibration, report: Report = lambda *_: None
+) -> Site:
+    """Ask the map without the held scans where they were taken, and compare with the truth.
+
+    Args:
+        content: of the whole map, its cloud without the held scans.
+        held: the scans.
+        calibration: to be checked.
+        report: told after every query.
+    """
+    confidence, right = [], []
+    with tempfile.TemporaryDirectory(prefix="streetfix-site-") as folder:
+        write_bundle(Path(folder) / "map", _without(content, {scan.place for scan in held}))
+        localizer = Localizer.open(MapBundle.open(Path(folder) / "map", verify=False))
+        for number, scan in enumerate(held):
+            query, T_map_camera = _drawn(scan, content.grid, number)
+            answer = localizer.localize(query)
+            odds = None if answer.evidence is None else float(calibration.right.log_odds(answer.evidence))
+            confidence.append(-30.0 if odds is None else odds)
+            right.append(float(np.linalg.norm(answer.T_map_camera[:3, 3] - T_map_camera[:3, 3])) <= _RIGHT_M)
+            report("site check", number + 1, len(held))
+    odds_of, is_right = np.array(confidence), np.array(right)
+    offset = min(0.0, _offset(odds_of, is_right))
+    error = abs(float(probability(odds_of + offset).mean() - is_right.mean()))
+    return Site(offset=offset, queries=len(held), right=int(is_right.sum()), expected_calibration_error=error)
+
+
+def _offset(odds: NDArray[np.float64], right: NDArray[np.bool_]) -> float:
+    """The most probable offset of the log odds, under a prior that it is small (Newton's method)."""
+    offset = 0.0
+    for _ in range(50):
+        p = probability(odds + offset)
+        gradient = float((p - right).sum()) + offset / _PRIOR_OFFSET**2
+        step = gradient / (float((p * (1 - p)).sum()) + 1 / _PRIOR_OFFSET**2)
+        offset -= float(np.clip(step, -1.0, 1.0))
+    return offset
+
+
+def _without(content: BundleContent, places: set[int]) -> BundleContent:
+    keep = np.array([number not in places for number in range(len(content.T_map_place))])
+    views = keep[content.view_place]
+    return replace(
+        content, T_map_place=content.T_map_place[keep], place_street=content.place_street[keep],
+        view_place=np.repeat(np.arange(int(keep.sum()), dtype=np.int32), content.headings),
+        view_heading_rad=content.view_heading_rad[views], descriptors=content.descriptors[views],
+        calibration={"calibrated": False, "why": "asked to check the calibration"}, preview_webp=b"",
+    )  # fmt: skip
+
+
+def _drawn(scan: HeldScan, grid: ViewGrid, number: int) -> tuple[Query, NDArray[np.float64]]:
+    """A query as a camera in the LiDAR's place would take it, and its pose."""
+    rng = np.random.default_rng([2718, number])
+    R_level_camera = rotation_z(rng.uniform(-np.pi, np.pi)) @ R_BODY_OPTICAL
+    panorama = panorama_from_points(scan.points, grid)
+    rays = _CAMERA.rays_of_pixels() @ R_level_camera.T
+    azimuth, flat = np.arctan2(rays[..., 1], rays[..., 0]), np.hypot(rays[..., 0], rays[..., 1])
+    top, bottom = np.deg2rad(grid.elevation_top_deg), np.deg2rad(grid.elevation_bottom_deg)
+    row = np.rint((top - np.arctan2(rays[..., 2], flat)) / (top - bottom) * (grid.rows - 1)).astype(int)
+    column = np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(int) % grid.around
+    inside = (row >= 0) & (row < grid.rows)
+    cell = np.where(inside, row, 0), column
+    noise = (
+        _NOISE_PX[number % 2] / _FOCAL_BASELINE * np.sqrt(0.5)
+    )  # half of it from beam to beam, half from pixel to pixel
+    of_beam, of_pixel = rng.normal(0, noise, panorama[0].shape), rng.normal(0, noise, rays.shape[:2])
+    z = np.where(inside, panorama[0][cell], 0) / np.linalg.norm(rays, axis=-1)
+    inverse = np.where(z > 0, 1 / np.where(z > 0, z, 1) + of_beam[cell] + of_pixel, 0)
+    depth_m = np.where(inverse > 1 / 60.0, 1 / np.where(inverse > 0, inverse, 1), 0).astype(np.float32)
+    intensity = np.where(inside, panorama[1][cell], 0)
+    middle = float(np.median(intensity[intensity > 0])) if (intensity > 0).any() else 1.0
+    grey = np.clip(110 * intensity / middle, 0, 255)
+    rgb = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+    T_map_camera = scan.T_map_level @ transform_from(R_level_camera, np.zeros(3))
+    return Query(rgb=rgb, depth_m=depth_m, camera=_CAMERA, down_camera=-R_level_camera[2]), T_map_camera

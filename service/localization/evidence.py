@@ -1,0 +1,78 @@
+"""What an answer's confidence rests on, as one row of numbers with names."""
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.localization.frames import Frame
+from service.localization.hypotheses import Hypothesis
+from service.localization.refine import Candidate, Refined
+from service.localization.search import Neighbour
+from service.maps.calibration import FEATURES
+
+#: A rival stands further away than this, or looks another way: the next frame of the same street is none.
+RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
+#: Another place, for the margin of similarity; votes within VOTE_M of the answer count for it.
+OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
+_MOST_MARGIN = 12.0  # nats; where there is no rival at all, too
+
+
+def evidence_of(
+    frames: tuple[Frame, ...], refined: Refined, neighbours: tuple[Neighbour, ...], hypotheses: tuple[Hypothesis, ...]
+) -> Float64[NDArray[np.float64], " F"]:
+    """One number for each of ``service.maps.calibration.FEATURES``.
+
+    Args:
+        frames: the reference first.
+        refined: its candidates.
+        neighbours: distinct places, the most similar first; those of the reference.
+        hypotheses: clusters of the reference's most similar views.
+    """
+    best, reference = refined.best, frames[0]
+    xy = best.T_map_camera[:2, 3]
+    away = np.array([np.hypot(*(place.position_m[:2] - xy)) for place in neighbours])
+    similarities = np.array([place.similarity for place in neighbours])
+    elsewhere = similarities[away > OTHER_PLACE_M]
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(refined.covariance[:2, :2])[-1]))
+    weights = np.array([hypothesis.weight for hypothesis in hypotheses])
+    found = {
+        "margin": _margin(refined.candidates),
+        "inliers": best.registered.inliers,
+        "similarity": best.similarity,
+        "similarity_margin": best.similarity - (float(elsewhere.max()) if len(elsewhere) else 0.5),
+        "likelihood": best.agreement.likelihood,
+        "through": best.agreement.through,
+        "front": best.agreement.front,
+        "unmapped": best.agreement.unmapped,
+        "log_sigma": float(np.log(sigma_m)),
+        "scale": abs(float(np.log(best.registered.scale))) / 0.01,
+        "votes": float((away[:VOTERS] < VOTE_M).sum()) / min(VOTERS, len(away)),
+        "entropy": float(-(weights * np.log(np.maximum(weights, 1e-12))).sum()),
+        "log_noise": float(np.log(np.median([frame.noise for frame in frames]))),
+        "points": refined.points / 3000.0 / len(frames),
+        "measured": reference.views.measured_share,
+    }
+    return np.array([found[name] for name in FEATURES])
+
+
+def _margin(candidates: tuple[Candidate, ...]) -> float:
+    """Support of the best over its best rival, nats."""
+    best = candidates[0]
+    rivals = [candidate.support for candidate in candidates[1:] if is_rival(best, candidate)]
+    return min(best.support - max(rivals), _MOST_MARGIN) if rivals else _MOST_MARGIN
+
+
+def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
+    """Those that exclude each other, the best supported of each place."""
+    kept: list[Candidate] = []
+    for candidate in candidates:
+        if all(is_rival(other, candidate) for other in kept):
+            kept.append(candidate)
+    return tuple(kept)
+
+
+def is_rival(one: Candidate, other: Candidate) -> bool:
+    """Whether two candidates are answers that exclude each other."""
+    apart = np.linalg.norm(one.T_map_camera[:3, 3] - other.T_map_camera[:3, 3])
+    turned = np.trace(one.T_map_camera[:3, :3].T @ other.T_map_camera[:3, :3])
+    return bool(apart > RIVAL_M or turned < 1 + 2 * np.cos(RIVAL_RAD))

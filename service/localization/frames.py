@@ -1,0 +1,44 @@
+"""What one picture pair says before the map's cloud is asked: its views, their descriptors, the most similar places."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+from numpy.typing import NDArray
+
+from service.geometry.rigid import Rotation, Transform
+from service.imaging.query_view import QueryViews
+from service.localization.query import Query
+from service.localization.search import ViewMatches
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A picture pair that was looked up.
+
+    Attributes:
+        query: as it was asked.
+        T_reference_camera: where its camera stood against the frame whose pose is wanted; identity for that one.
+        views: of the view grid.
+        descriptors: of the views, a row a turn.
+        matches: the most similar views of the map, the best first.
+        noise: standard deviation of one pixel's inverse depth, 1/m.
+    """
+
+    query: Query
+    T_reference_camera: Transform
+    views: QueryViews
+    descriptors: Float32[NDArray[np.float32], "T D"]
+    matches: ViewMatches
+    noise: float
+
+    @property
+    def focal_px(self) -> float:
+        """Horizontal focal length of the depth picture."""
+        camera = self.query.camera
+        return float(camera.fx * self.query.depth_m.shape[1] / camera.width)
+
+    @property
+    def R_level_camera(self) -> Rotation:
+        """From the optical to the frame's level frame."""
+        return self.views.R_level_camera

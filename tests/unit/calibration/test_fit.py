@@ -1,0 +1,237 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model_training.calibration.fit import RATES, Asked, expected_calibration_error, fit, pooled
+from service.maps.calibration import FEATURES, RIVALRY, probability, read_calibration
+
+COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
+INLIERS, MARGIN = FEATURES.index("inliers"), FEATURES.index("margin")
+MEAN, SPREAD = 5.0, 2.0  # of every feature
+
+
+def evidence_of(rng, count):
+    """Uniform, so that no feature is ever cut off."""
+    return MEAN + SPREAD * rng.uniform(-np.sqrt(3), np.sqrt(3), (count, COUNT))
+
+
+def asked_of(evidence, right, known, kind=None):
+    kind = np.where(known, "clear", "other_city") if kind is None else np.array(kind)
+    return Asked(evidence, np.array(right, bool), np.array(known, bool), kind)
+
+
+def drawn(odds_right, odds_known, *, count=20_000, seed=1):
+    """Evidence, and what follows from it by chance with log odds that are functions of the features in deviations."""
+    rng = np.random.default_rng(seed)
+    evidence = evidence_of(rng, count)
+    z = (evidence - MEAN) / SPREAD
+    right, known = (rng.random(count) < probability(odds(z)) for odds in (odds_right, odds_known))
+    return asked_of(evidence, right, known)
+
+
+@pytest.fixture(scope="module")
+def asked():
+    """As many known as not, by a feature that is one of place; right by the margin, inliers squared, and inliers times noise."""
+    return drawn(
+        lambda z: 0.5 + 1.5 * z[:, MARGIN] - 0.8 * z[:, INLIERS] ** 2 + 0.7 * z[:, INLIERS] * z[:, NOISE],
+        lambda z: 1.2 * z[:, INLIERS],
+    )
+
+
+@pytest.fixture(scope="module")
+def calibration(asked):
+    return fit(asked, measured_on={})
+
+
+@pytest.fixture(scope="module")
+def few():
+    """2000 queries, right only where the place is known, a tenth of them without evidence; outside, two kinds."""
+    rng = np.random.default_rng(5)
+    evidence, known = evidence_of(rng, 2000), rng.random(2000) < 0.6
+    odds = (evidence[:, MARGIN] + evidence[:, INLIERS] - 2 * MEAN) / SPREAD
+    right = known & (rng.random(2000) < probability(3 * odds))
+    evidence[rng.random(2000) < 0.1, 3:] = np.nan
+    kind = np.where(known, "clear", np.where(rng.random(2000) < 0.3, "other_city", "removed_streets"))
+    evidence[kind == "removed_streets", MARGIN] += 1.0  # more like a place in the map than another city is
+    return asked_of(evidence, right, known, kind)
+
+
+def test_known_probabilities_are_recovered(asked, calibration):
+    """With weights that make both halves alike, which here they are to a percent."""
+    z = (asked.evidence - MEAN) / SPREAD
+    true = probability(0.5 + 1.5 * z[:, MARGIN] - 0.8 * z[:, INLIERS] ** 2 + 0.7 * z[:, INLIERS] * z[:, NOISE])
+    error = calibration.confidence(asked.evidence) - true
+    assert np.abs(error).mean() < 0.02
+    assert np.quantile(np.abs(error), 0.99) < 0.08
+
+
+def test_the_weights_are_those_of_the_features_their_squares_and_their_products_with_the_noise(calibration):
+    weights, expected = np.array(calibration.right.weights), np.zeros(3 * COUNT)
+    expected[[MARGIN, COUNT + INLIERS, 2 * COUNT + INLIERS]] = 1.5, -0.8, 0.7
+    np.testing.assert_allclose(weights, expected, atol=0.12)
+    assert calibration.right.bias == pytest.approx(0.5, abs=0.2)
+
+
+def test_whether_the_place_is_known_does_not_depend_on_rivals(asked, calibration):
+    rivalry = np.tile([name in RIVALRY for name in FEATURES], 3)
+    weights = np.array(calibration.known.weights)
+    assert (weights[rivalry] == 0).all()
+    assert weights[INLIERS] == pytest.approx(1.2, abs=0.1)
+    assert (np.array(calibration.right.weights)[rivalry] != 0).all()
+    rivals_differ = asked.evidence[:9].copy()
+    rivals_differ[:, [FEATURES.index(name) for name in RIVALRY]] = 1e3
+    known = calibration.known
+    np.testing.assert_array_equal(known.log_odds(rivals_differ), known.log_odds(asked.evidence[:9]))
+
+
+def test_features_are_told_in_their_own_means_and_deviations(asked, calibration):
+    for part in (calibration.right, calibration.known):
+        np.testing.assert_allclose(part.mean, asked.evidence.mean(axis=0))
+        np.testing.assert_allclose(part.spread, asked.evidence.std(axis=0), rtol=1e-6)
+
+
+def test_queries_in_the_map_and_outside_it_weigh_the_same_whatever_their_numbers(few):
+    """Those outside asked three times over change nothing, but for the ridge, which is left out here."""
+    used = few.registered()
+    outside = Asked(*(getattr(used, name)[~used.known] for name in ("evidence", "right", "known", "kind")))
+    one = fit(used, measured_on={}, ridge=1e-9)
+    other = fit(pooled([used, outside, outside]), measured_on={}, ridge=1e-9)
+    np.testing.assert_allclose(other.confidence(used.evidence), one.confidence(used.evidence), atol=1e-5)
+    known = [each.known.log_odds(used.evidence) for each in (one, other)]
+    np.testing.assert_allclose(probability(known[1]), probability(known[0]), atol=1e-5)
+
+
+def test_what_tells_nothing_leaves_the_share_that_is_right():
+    """A third of the known are right and none of the others, and both weigh the same: one in six."""
+    rng = np.random.default_rng(2)
+    evidence, known = evidence_of(rng, 6000), np.arange(6000) % 4 > 0
+    asked = asked_of(evidence, known & (np.arange(6000) % 9 < 3), known)
+    found = fit(asked, measured_on={}, ridge=1e6).confidence(evidence)
+    share = 0.5 * asked.right[known].mean()
+    np.testing.assert_allclose(found, share, atol=0.005)
+    assert share == pytest.approx(1 / 6, abs=0.005)
+
+
+def test_a_stronger_ridge_makes_smaller_weights(few):
+    sizes = [np.abs(fit(few, measured_on={}, ridge=ridge).right.weights).sum() for ridge in (0.1, 3.0, 1000.0)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[2] < 0.5 * sizes[0]
+
+
+def test_what_a_feature_tells_without_fail_still_gives_finite_weights():
+    rng = np.random.default_rng(3)
+    evidence = evidence_of(rng, 400)
+    sure = evidence[:, MARGIN] > MEAN
+    calibration = fit(asked_of(evidence, sure, sure), measured_on={})
+    assert np.isfinite(calibration.right.weights).all()
+    assert ((calibration.confidence(evidence) > 0.5) == sure).mean() > 0.97
+
+
+def test_a_feature_that_never_changes_does_no_harm(few):
+    evidence = few.evidence.copy()
+    evidence[:, FEATURES.index("scale")] = 0.3
+    asked = Asked(evidence, few.right, few.known, few.kind)
+    found = fit(asked, measured_on={}).confidence(asked.registered().evidence)
+    assert np.isfinite(found).all()
+    assert expected_calibration_error(found, asked.registered().right) < 0.1
+
+
+def confidences(calibration, asked):
+    found = np.zeros(len(asked))
+    has = np.isfinite(asked.evidence).all(axis=1)
+    found[has] = [float(calibration.confidence(row[None])[0]) for row in asked.evidence[has]]
+    return found
+
+
+def test_thresholds_let_no_more_through_than_their_rate_of_any_kind_outside_the_map(few):
+    """Those without evidence count among the queries, and never get through."""
+    calibration = fit(few, measured_on={})
+    confidence = confidences(calibration, few)
+    assert [each.false_accept_rate for each in calibration.thresholds] == list(RATES)
+    for threshold in calibration.thresholds:
+        for kind in ("other_city", "removed_streets"):
+            assert np.mean(confidence[few.kind == kind] > threshold.confidence + 1e-12) <= threshold.false_accept_rate
+
+
+def test_thresholds_are_no_higher_than_the_worst_kind_needs(few):
+    """Just below its threshold, one query more of that kind gets through than the rate allows."""
+    calibration = fit(few, measured_on={})
+    confidence = confidences(calibration, few)
+    for threshold in calibration.thresholds:
+        allowed = [
+            int(threshold.false_accept_rate * (few.kind == kind).sum()) for kind in ("other_city", "removed_streets")
+        ]
+        through = [
+            np.sum(confidence[few.kind == kind] > threshold.confidence - 1e-9)
+            for kind in ("other_city", "removed_streets")
+        ]
+        assert any(got > may for got, may in zip(through, allowed, strict=True))
+    levels = [threshold.confidence for threshold in calibration.thresholds]
+    assert levels == sorted(levels, reverse=True)
+    assert levels[0] > levels[-1]
+
+
+def test_of_a_kind_that_has_both_only_the_queries_outside_the_map_count_for_its_thresholds(few):
+    both = Asked(few.evidence, few.right, few.known, np.full(len(few), "mixed"))
+    calibration = fit(both, measured_on={})
+    outside = confidences(calibration, both)[~both.known]
+    for threshold in calibration.thresholds:
+        assert np.mean(outside > threshold.confidence + 1e-12) <= threshold.false_accept_rate
+        assert np.sum(outside > threshold.confidence - 1e-9) > int(threshold.false_accept_rate * len(outside))
+
+
+def test_what_was_fitted_can_be_written_and_read(few):
+    calibration = fit(few, measured_on={"cities": "a, b"})
+    assert read_calibration(calibration.model_dump_json().encode(), path="x") == calibration
+    assert calibration.measured_on == {"cities": "a, b", "queries": 2000}
+    assert calibration.site is None
+
+
+def test_only_queries_with_all_their_evidence_are_registered():
+    evidence = np.ones((4, COUNT))
+    evidence[1, 3], evidence[2] = np.nan, np.inf
+    found = asked_of(evidence, [1, 1, 1, 0], [1, 1, 1, 0], ["a", "b", "c", "d"]).registered()
+    assert (found.right.tolist(), found.known.tolist(), found.kind.tolist()) == (
+        [True, False],
+        [True, False],
+        ["a", "d"],
+    )
+    assert len(found) == len(found.evidence) == 2
+
+
+def test_pooled_queries_keep_their_order_and_their_kinds():
+    one, other = (
+        asked_of(np.zeros((2, COUNT)), [1, 0], [1, 1], ["a", "b"]),
+        asked_of(np.ones((1, COUNT)), [0], [0], ["longer"]),
+    )
+    found = pooled([one, other])
+    assert found.kind.tolist() == ["a", "b", "longer"]
+    assert found.evidence[:, 0].tolist() == [0, 0, 1]
+    assert (found.right.tolist(), found.known.tolist()) == ([True, False, False], [True, True, False])
+
+
+@pytest.mark.parametrize(
+    ("confidence", "right", "bins", "error"),
+    [
+        ([0.1, 0.2, 0.8, 0.9], [0, 0, 1, 1], 2, 0.15),
+        ([0.1, 0.2, 0.8, 0.9], [0, 0, 1, 1], 1, 0.0),
+        ([0.9, 0.1, 0.8, 0.2], [1, 0, 1, 0], 2, 0.15),  # in whatever order
+        ([0.1, 0.2, 0.8, 0.9], [1, 1, 0, 0], 2, 0.85),
+        ([0.1, 0.2, 0.8, 0.9], [0, 0, 1, 1], 15, 0.15),  # more bins than queries: each alone
+        ([0.2, 0.4, 0.9], [0, 1, 0], 2, (2 * 0.2 + 0.9) / 3),  # two and one
+        ([0.5] * 4, [1, 0, 1, 0], 1, 0.0),
+    ],
+)
+def test_expected_calibration_error_by_hand(confidence, right, bins, error):
+    found = expected_calibration_error(np.array(confidence), np.array(right, bool), bins=bins)
+    assert found == pytest.approx(error)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 200), st.integers(1, 20))
+@settings(max_examples=50, deadline=None)
+def test_the_calibration_error_lies_between_that_of_all_as_one_and_that_of_each_alone(seed, count, bins):
+    rng = np.random.default_rng(seed)
+    confidence, right = rng.random(count), rng.random(count) < 0.5
+    found = expected_calibration_error(confidence, right, bins=bins)
+    assert abs(confidence.mean() - right.mean()) - 1e-12 <= found <= np.abs(confidence - right).mean() + 1e-12

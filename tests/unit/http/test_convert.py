@@ -1,0 +1,160 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.errors import RequestError
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+from service.http.convert import answer_from, query_from_parts
+from service.localization.localizer import Localizer
+from service.localization.prior import Prior
+from service.localization.query import Query
+from service.localization.refine import Candidate
+from service.maps.reader import MapBundle
+from service.registration.register import Registered
+from service.registration.rendered import Agreement
+from service.runtime.engine import Located
+
+BOTH = {"position": {"x": 1, "y": 2}, "wgs84": {"latitude_deg": 0, "longitude_deg": 0}}
+
+
+@pytest.fixture
+def prior_of(parts_of):
+    """The prior that a request's JSON asks for, and its degrees."""
+
+    def made(prior):
+        encoded = query_from_parts(parts_of(prior=prior))
+        return encoded.prior, encoded.prior_wgs84
+
+    return made
+
+
+def test_a_request_without_a_prior_has_none(parts_of):
+    encoded = query_from_parts(parts_of())
+    assert (encoded.prior, encoded.prior_wgs84, encoded.false_accept_rate) == (None, None, None)
+
+
+def test_a_position_and_a_heading_are_taken_in_metres_and_radians(prior_of):
+    prior, wgs84 = prior_of(
+        {"position": {"x": 12, "y": -40, "std_m": 5}, "heading_deg": 90, "heading_std_deg": 18},
+    )
+    np.testing.assert_array_equal(prior.position_m, [12, -40])
+    assert (prior.position_std_m, prior.heading_rad, prior.heading_std_rad) == pytest.approx((5, np.pi / 2, np.pi / 10))
+    assert wgs84 is None
+
+
+@pytest.mark.parametrize("given", [{"position": {"x": 1, "y": 2}}, {"heading_deg": 0}])
+def test_what_a_prior_does_not_say_is_the_cores_default(prior_of, given):
+    prior, _ = prior_of(given)
+    unsaid = Prior()
+    assert (prior.position_std_m, prior.heading_std_rad) == pytest.approx(
+        (unsaid.position_std_m, unsaid.heading_std_rad)
+    )
+    assert (prior.position_m is None) == ("position" not in given)
+    assert (prior.heading_rad is None) == ("heading_deg" not in given)
+
+
+def test_degrees_on_the_earth_wait_for_the_map(prior_of):
+    prior, wgs84 = prior_of({"wgs84": {"latitude_deg": 52.5, "longitude_deg": 13.25, "std_m": 3}, "heading_deg": 180})
+    assert wgs84 == (52.5, 13.25)
+    assert (prior.position_m, prior.position_std_m, prior.heading_rad) == (None, 3.0, np.pi)
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (BOTH, "prior: position and wgs84 say the same thing; send one of them"),
+        (BOTH | {"heading_deg": 0}, "prior: position and wgs84 say the same thing; send one of them"),
+        ({}, "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out"),
+        ({"heading_std_deg": 3}, "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out"),
+        (
+            {"position": None, "heading_deg": None},
+            "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out",
+        ),
+    ],
+)
+def test_a_prior_that_says_too_much_or_nothing_is_refused(prior_of, prior, message):
+    with pytest.raises(RequestError) as error:
+        prior_of(prior)
+    assert (error.value.message, error.value.field) == (message, "prior")
+
+
+def test_a_rate_of_false_accepts_is_passed_on(parts_of):
+    assert query_from_parts(parts_of(options={"false_accept_rate": 0.02})).false_accept_rate == 0.02
+
+
+@pytest.fixture(scope="module")
+def localized(bundle_path, pictures):
+    bundle = MapBundle.open(bundle_path)
+    rgb, depth_m, camera = pictures
+    return Located(Localizer.open(bundle).localize(Query(rgb=rgb, depth_m=depth_m, camera=camera)), bundle)
+
+
+def candidate(support, *, xyz, heading_deg=0.0):
+    R, at = rotation_z(np.deg2rad(heading_deg)), np.array(xyz, np.float64)
+    registered = Registered(R, at, 1.0, 0.0, 0.7, np.eye(8), 0)
+    return Candidate(transform_from(R @ R_BODY_OPTICAL, at), registered, 0.8, Agreement(-1.5, 0.0, 0.0, 0.0), support)
+
+
+def hypotheses_of(localized, *candidates):
+    answer = replace(localized.answer, candidates=candidates or None)
+    return answer_from(replace(localized, answer=answer)).hypotheses
+
+
+def test_shares_follow_from_the_supports(localized):
+    """Supports log 5 and log 3 and log 2, whatever is added to all of them: half, three tenths, a fifth."""
+    for added in (0.0, -700.0, 1e4):
+        several = [candidate(np.log(k) + added, xyz=(100 * k, 0, 1.5)) for k in (5, 3, 2)]
+        found = hypotheses_of(localized, *several)
+        assert [each.share for each in found] == pytest.approx([0.5, 0.3, 0.2])
+        assert [each.pose.position.x for each in found] == [500, 300, 200]
+
+
+def test_a_hypothesis_is_told_as_it_was_registered(localized):
+    (found,) = hypotheses_of(localized, candidate(3.0, xyz=(1, 2, 1.5), heading_deg=-90))
+    assert (found.share, found.inliers, found.similarity) == (1.0, 0.7, 0.8)
+    assert found.pose.heading_deg == pytest.approx(-90)
+    assert found.pose.covariance is None
+
+
+def test_candidates_of_one_place_are_one_hypothesis_the_best_supported_of_it(localized):
+    """2.9 m and 29 degrees from the best is the same place, 2.9 m further is another: as far from the best as from its like."""
+    several = [candidate(9.0, xyz=(0, 0, 1.5)), candidate(8.9, xyz=(2.9, 0, 1.5), heading_deg=29), candidate(8.0, xyz=(5.8, 0, 1.5)),
+               candidate(7.5, xyz=(6.0, 0, 1.5)), candidate(7.0, xyz=(0, 0, 1.5), heading_deg=180)]  # fmt: skip
+    found = hypotheses_of(localized, *several)
+    assert [(each.pose.position.x, round(each.pose.heading_deg)) for each in found] == [(0, 0), (5.8, 0), (0, 180)]
+    weights = np.exp([9.0, 8.0, 7.0])
+    assert [each.share for each in found] == pytest.approx((weights / weights.sum()).tolist())
+
+
+def test_without_registration_there_are_no_hypotheses(localized):
+    assert hypotheses_of(localized) == []
+
+
+def test_of_an_answer_the_first_hypothesis_is_its_pose_and_the_shares_are_one(localized):
+    answer = answer_from(localized)
+    assert answer.hypotheses[0].pose == answer.pose.model_copy(update={"covariance": None})
+    shares = [each.share for each in answer.hypotheses]
+    assert sum(shares) == pytest.approx(1)
+    assert shares == sorted(shares, reverse=True)
+
+
+def test_two_streets_that_look_alike_are_two_hypotheses_of_the_same_share_until_one_is_known(twin_map: Path, pictures):
+    """A prior that rules the other street out leaves it no more than the share of doubt, e^-5 against one."""
+    rgb, depth_m, camera = pictures
+    bundle = MapBundle.open(twin_map)
+    localizer, query = Localizer.open(bundle), Query(rgb=rgb, depth_m=depth_m, camera=camera)
+    alone = answer_from(Located(localizer.localize(query), bundle)).hypotheses
+    assert sorted(round(each.pose.position.y / 90) for each in alone[:2]) == [0, 1]
+    assert [each.share for each in alone[:2]] == pytest.approx([0.5, 0.5], abs=0.1)
+    known = replace(query, prior=Prior(position_m=np.array([20.0, 90.0]), position_std_m=10.0))
+    told = answer_from(Located(localizer.localize(known), bundle)).hypotheses
+    assert told[0].pose.position.y == pytest.approx(90, abs=0.3)
+    elsewhere = sum(each.share for each in told if each.pose.position.y < 45)
+    assert elsewhere <= 1.5 * np.exp(-5)
+
+
+def test_an_answer_is_json(localized):
+    assert json.loads(answer_from(localized).model_dump_json(by_alias=True))["hypotheses"][0]["share"] <= 1

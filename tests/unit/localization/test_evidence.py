@@ -1,0 +1,167 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
+from service.localization.evidence import evidence_of, is_rival
+from service.localization.hypotheses import Hypothesis
+from service.localization.refine import Candidate, Refined
+from service.localization.search import Neighbour
+from service.maps.calibration import FEATURES
+from service.registration.register import Registered
+from service.registration.rendered import Agreement
+
+
+def candidate(support=0.0, *, xyz=(0.0, 0.0, 1.5), heading_deg=0.0, scale=1.0):
+    R = rotation_z(np.deg2rad(heading_deg))
+    registered = Registered(R, np.array(xyz, np.float64), scale, 0.0, 0.7, np.eye(8), 0)
+    T_map_camera = transform_from(R @ R_BODY_OPTICAL, np.array(xyz, np.float64))
+    return Candidate(T_map_camera, registered, 0.8, Agreement(-1.5, 0.02, 0.2, 0.1), support)
+
+
+def refined(*candidates, covariance=None, points=1500):
+    return Refined(candidates, np.eye(6) if covariance is None else covariance, points)
+
+
+def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):
+    return Neighbour(0, similarity, 0.0, -1, np.array([x, y, z], np.float64), 0.0)
+
+
+def hypothesis(weight):
+    return Hypothesis(weight, np.zeros(3), 0.0, np.array([0.0, 0.0, 1.0]), 0, -1, 0.5, 1)
+
+
+@pytest.fixture(scope="module")
+def frame(frame_with, matches_at):
+    return frame_with(matches_at([(0, 0, 2)], [0], [0.9]))
+
+
+@pytest.fixture(scope="module")
+def weighed(frame):
+    """The evidence by name; whatever a test does not say is one candidate, one neighbour, one hypothesis, one frame."""
+
+    def weigh(*, candidates=None, neighbours=None, weights=(1.0,), frames=None, **options):
+        found = evidence_of(
+            frames or (frame,), refined(*(candidates or [candidate()]), **options), tuple(neighbours or [neighbour(0)]),
+            tuple(hypothesis(weight) for weight in weights),
+        )  # fmt: skip
+        assert found.shape == (len(FEATURES),)
+        return dict(zip(FEATURES, found.tolist(), strict=True))
+
+    return weigh
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("inliers", 0.7), ("similarity", 0.8), ("likelihood", -1.5), ("through", 0.02), ("front", 0.2), ("unmapped", 0.1),
+     ("measured", 0.75)],
+)  # fmt: skip
+def test_what_is_known_of_the_best_candidate_is_told_as_it_is(weighed, name, expected):
+    other = replace(candidate(-1.0, xyz=(50, 0, 1.5)), similarity=0.1, agreement=Agreement(-9.0, 0.9, 0.9, 0.9))
+    assert weighed(candidates=(candidate(), other))[name] == expected
+
+
+@pytest.mark.parametrize(
+    ("rivals", "margin"),
+    [
+        ([(4.0, (10, 0, 1.5), 0)], 6.0),
+        ([(4.0, (10, 0, 1.5), 0), (7.5, (0, 90, 1.5), 0)], 2.5),  # the best rival counts, wherever it comes
+        ([(9.9, (1, 0, 1.5), 0), (4.0, (10, 0, 1.5), 0)], 6.0),  # the next frame of the same street is none
+        ([(9.0, (0, 0, 1.5), 180)], 1.0),  # the other way round is one
+        ([(9.0, (3.1, 0, 1.5), 0)], 1.0),
+        ([(9.0, (2.9, 0, 1.5), 29)], 12.0),
+        ([(-50.0, (10, 0, 1.5), 0)], 12.0),  # more than 12 nats say no more
+        ([], 12.0),
+    ],
+)
+def test_the_margin_is_the_support_over_the_best_rival(weighed, rivals, margin):
+    others = [candidate(support, xyz=xyz, heading_deg=degrees) for support, xyz, degrees in rivals]
+    assert weighed(candidates=(candidate(10.0), *others))["margin"] == pytest.approx(margin)
+
+
+@pytest.mark.parametrize(
+    ("xyz", "heading_deg", "rival"),
+    [((2.9, 0, 1.5), 0, False), ((0, -3.1, 1.5), 0, True), ((2, 2, 3.0), 0, True), ((2, 2, 1.5), 0, False), ((0, 0, 1.5), 29, False),
+     ((0, 0, 1.5), -29, False), ((0, 0, 1.5), 31, True), ((0, 0, 1.5), -31, True), ((0, 0, 1.5), 359, False), ((0, 0, 1.5), 180, True)],
+)  # fmt: skip
+def test_a_rival_stands_three_metres_away_or_looks_thirty_degrees_aside(xyz, heading_deg, rival):
+    here, there = candidate(), candidate(xyz=xyz, heading_deg=heading_deg)
+    assert is_rival(here, there) == is_rival(there, here) == rival
+
+
+@given(st.floats(-180, 180), st.floats(-0.5, 0.5), st.floats(-29.5, 29.5))
+def test_whether_it_is_a_rival_does_not_depend_on_how_both_stand(heading_deg, lean_rad, apart_deg):
+    def leaning(degrees):
+        R = rotation_z(np.deg2rad(degrees)) @ rotation_y(lean_rad)
+        return replace(candidate(), T_map_camera=transform_from(R @ R_BODY_OPTICAL, np.zeros(3)))
+
+    assert not is_rival(leaning(heading_deg), leaning(heading_deg + apart_deg))
+
+
+def test_the_similarity_is_told_against_the_best_place_that_is_another(weighed):
+    """10.1 m along or across is another place, 9.9 m is not; height does not make one."""
+    places = [
+        neighbour(0, 0.95),
+        neighbour(9.9, 0.9),
+        neighbour(0, 0.85, z=50),
+        neighbour(0, 0.6, y=-10.1),
+        neighbour(90, 0.55),
+    ]
+    assert weighed(neighbours=places)["similarity_margin"] == pytest.approx(0.8 - 0.6)
+
+
+def test_where_no_other_place_was_found_half_is_taken_for_its_similarity(weighed):
+    assert weighed(neighbours=[neighbour(0, 0.95), neighbour(5, 0.9)])["similarity_margin"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "votes"),
+    [
+        ([0], 1.0),
+        ([0, 4.9, 5.1, -4.9], 0.75),
+        ([50] * 20, 0.0),
+        ([0] * 5 + [50] * 15 + [0] * 20, 0.25),
+        ([0] * 40, 1.0),
+    ],
+)
+def test_votes_are_the_share_of_the_first_twenty_places_that_lie_around_the_answer(weighed, x_m, votes):
+    assert weighed(neighbours=[neighbour(x) for x in x_m])["votes"] == votes
+
+
+@pytest.mark.parametrize(
+    ("weights", "entropy"), [([1.0], 0.0), ([0.25] * 4, np.log(4)), ([0.5, 0.5], np.log(2)), ([1.0, 0.0], 0.0)]
+)
+def test_entropy_tells_among_how_many_clusters_the_weight_is_spread(weighed, weights, entropy):
+    assert weighed(weights=weights)["entropy"] == pytest.approx(entropy, abs=1e-9)
+
+
+def test_sigma_is_that_of_the_worst_horizontal_direction(weighed):
+    """0.3 m along a street that runs at 30 degrees, 0.1 m across; 2 m of height do not count."""
+    R = rotation_z(np.deg2rad(30))
+    covariance = np.eye(6)
+    covariance[:3, :3] = R @ np.diag([0.09, 0.01, 4.0]) @ R.T
+    assert weighed(covariance=covariance)["log_sigma"] == pytest.approx(np.log(0.3))
+
+
+@pytest.mark.parametrize("scale", [1.02, 1 / 1.02])
+def test_scale_is_told_in_hundredths_whichever_way_it_is_off(weighed, scale):
+    assert weighed(candidates=(candidate(scale=scale),))["scale"] == pytest.approx(100 * np.log(1.02))
+
+
+def test_the_noise_is_the_median_of_the_frames_and_points_are_counted_a_frame(weighed, frame):
+    frames = tuple(replace(frame, noise=noise) for noise in (1e-3, 1e-4, 5e-4))
+    found = weighed(frames=frames, points=4500)
+    assert found["log_noise"] == pytest.approx(np.log(5e-4))
+    assert found["points"] == pytest.approx(0.5)
+    assert weighed(points=4500)["points"] == pytest.approx(1.5)
+
+
+def test_distances_are_from_the_best_candidate(weighed):
+    there = candidate(10.0, xyz=(100, 0, 1.5))
+    places = [neighbour(0, 0.9), neighbour(100, 0.7)]
+    found = weighed(candidates=(there, candidate(1.0)), neighbours=places)
+    assert found["votes"] == 0.5
+    assert found["similarity_margin"] == pytest.approx(0.8 - 0.9)

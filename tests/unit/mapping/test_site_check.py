@@ -1,0 +1,233 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from model_training.mapping import site_check
+from model_training.mapping.site_check import FEWEST, MOST, HeldScan, held_out, site_of
+from service.geometry.rigid import rotation_z, transform_from, transform_points
+from service.imaging.view_grid import ViewGrid, panorama_from_points
+from service.localization.evidence import evidence_of  # noqa: F401  # what the odds rest on
+from service.maps.calibration import FEATURES, probability
+
+GRID = ViewGrid(rows=64, columns=256)
+
+
+@pytest.mark.parametrize(
+    ("places", "count"),
+    [(0, 0), (1, 0), (499, 0), (500, 20), (524, 20), (525, 21), (1499, 59), (1500, 60), (100_000, 60)],
+)
+def test_one_place_in_twenty_five_is_held_out_from_500_places_on_and_never_more_than_60(places, count):
+    assert (MOST, FEWEST) == (60, 20)
+    assert len(held_out(places)) == count
+
+
+@given(st.integers(500, 20_000))
+def test_held_out_places_are_spread_evenly_and_never_the_first_or_the_last(places):
+    numbers = np.array(sorted(held_out(places)))
+    assert 0 < numbers[0] <= numbers[-1] < places - 1
+    steps = np.diff(np.r_[0, numbers, places - 1])
+    assert steps.max() - steps.min() <= 1
+
+
+odds = st.lists(st.floats(-20, 20), min_size=1, max_size=40).map(np.array)
+
+
+def test_the_offset_by_hand():
+    """One answer at even odds that was wrong: p(x) + x = 0 under a prior of one, at -0.401; right, the same upwards."""
+    wrong = site_check._offset(np.zeros(1), np.array([False]))
+    assert wrong == pytest.approx(-0.40105, abs=1e-4)
+    assert probability(np.array([wrong]))[0] + wrong == pytest.approx(0, abs=1e-9)
+    assert site_check._offset(np.zeros(1), np.array([True])) == pytest.approx(-wrong)
+
+
+def test_where_as_many_are_right_as_was_said_there_is_no_offset():
+    """Three of four at log 3, three quarters; and one of two at even odds."""
+    assert site_check._offset(np.full(4, np.log(3)), np.array([1, 1, 1, 0], bool)) == pytest.approx(0, abs=1e-9)
+    assert site_check._offset(np.zeros(2), np.array([1, 0], bool)) == pytest.approx(0, abs=1e-9)
+
+
+def test_many_answers_overrule_the_prior():
+    """Nine in ten was said, one in two was right: log 9 too much."""
+    count = 20_000
+    found = site_check._offset(np.full(count, np.log(9)), np.arange(count) % 2 == 0)
+    assert found == pytest.approx(-np.log(9), abs=0.002)
+
+
+@given(odds, st.integers(0, 2**40))
+def test_the_offset_is_where_errors_and_prior_balance(odds_of, bits):
+    right = np.array([bits >> k & 1 for k in range(len(odds_of))], bool)
+    found = site_check._offset(odds_of, right)
+    assert float((probability(odds_of + found) - right).sum()) + found == pytest.approx(0, abs=1e-6)
+
+
+def test_without_some_places_their_views_are_gone_and_the_others_are_renumbered(content):
+    left = site_check._without(content, {0, 7})
+    kept = [1, 2, 3, 4, 5, 6, 8, 9, 10, 11]
+    np.testing.assert_array_equal(left.T_map_place, content.T_map_place[kept])
+    np.testing.assert_array_equal(left.place_street, content.place_street[kept])
+    views = [4 * place + k for place in kept for k in range(4)]
+    np.testing.assert_array_equal(left.descriptors, content.descriptors[views])
+    np.testing.assert_array_equal(left.view_heading_rad, content.view_heading_rad[views])
+    np.testing.assert_array_equal(left.view_place, np.repeat(np.arange(10), 4))
+    assert left.calibration["calibrated"] is False
+    assert left.cloud is content.cloud
+    assert len(content.T_map_place) == 12
+
+
+def sphere(radius_m, *, intensity=40.0, seed=0, count=200_000):
+    """Points all round, so that every cell of the grid is measured."""
+    directions = np.random.default_rng(seed).normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.c_[directions * radius_m, np.full(count, intensity)].astype(np.float32)
+
+
+@pytest.fixture
+def noiseless(monkeypatch):
+    monkeypatch.setattr(site_check, "_NOISE_PX", (0.0, 0.0))
+
+
+def drawn(points, number, T_map_level=None):
+    scan = HeldScan(0, points, np.eye(4) if T_map_level is None else T_map_level)
+    return site_check._drawn(scan, GRID, number)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_a_picture_drawn_inside_a_sphere_sees_its_radius_along_every_ray(noiseless, number):
+    query, T_map_camera = drawn(sphere(12.0), number)
+    ranges = query.depth_m * np.linalg.norm(query.camera.rays_of_pixels(), axis=-1)
+    elevation = np.rad2deg(np.arcsin((query.camera.rays_of_pixels() @ T_map_camera[:3, :3].T)[..., 2] / np.linalg.norm(query.camera.rays_of_pixels(), axis=-1)))  # fmt: skip
+    covered = (elevation < GRID.elevation_top_deg) & (elevation > GRID.elevation_bottom_deg)
+    assert covered.mean() > 0.3
+    np.testing.assert_allclose(ranges[covered], 12.0, rtol=1e-3)
+    assert not ranges[(elevation > GRID.elevation_top_deg + 2) | (elevation < GRID.elevation_bottom_deg - 2)].any()
+
+
+def test_a_picture_sees_what_the_scan_measured_where_it_looks(noiseless):
+    """Ranges that differ all round: each pixel's is that of the panorama's cell that its ray meets."""
+    points = sphere(1.0)
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    points[:, :3] *= (8.0 + 4.0 * np.sin(2 * azimuth))[:, None]
+    query, T_map_camera = drawn(points, 5)
+    rays = query.camera.rays_of_pixels() @ T_map_camera[:3, :3].T
+    expected = 8.0 + 4.0 * np.sin(2 * np.arctan2(rays[..., 1], rays[..., 0]))
+    found = query.depth_m * np.linalg.norm(query.camera.rays_of_pixels(), axis=-1)
+    seen = found > 0
+    assert seen.mean() > 0.3
+    assert np.abs(found - expected)[seen].max() < 0.3  # a cell is 1.4 degrees wide
+    assert np.median((found - expected)[seen]) == pytest.approx(0, abs=0.05)
+
+
+def test_the_pose_is_the_scans_in_the_map_and_gravity_is_told():
+    T_map_level = transform_from(rotation_z(1.0), np.array([100.0, -50.0, 3.0]))
+    query, T_map_camera = drawn(sphere(10.0), 3, T_map_level)
+    np.testing.assert_allclose(T_map_camera[:3, 3], [100, -50, 3])
+    np.testing.assert_allclose(T_map_camera[:3, :3] @ query.down_camera, [0, 0, -1], atol=1e-12)
+    _, unturned = drawn(sphere(10.0), 3)
+    np.testing.assert_allclose(T_map_camera, T_map_level @ unturned, atol=1e-12)
+
+
+def test_headings_differ_from_scan_to_scan_and_are_the_same_the_next_time():
+    axes = [drawn(sphere(10.0), number)[1][:3, 2] for number in range(6)]
+    assert len({tuple(np.round(axis, 6)) for axis in axes}) == 6
+    np.testing.assert_array_equal(drawn(sphere(10.0), 2)[0].depth_m, drawn(sphere(10.0), 2)[0].depth_m)
+
+
+@pytest.mark.parametrize(("number", "noise_px"), [(0, 0.1), (1, 0.5)])
+def test_the_noise_is_that_of_the_presets_by_turns(number, noise_px):
+    """Inverse depth errs by noise / 80 px m, on a sphere of 5 m; half of the variance is shared by a cell's pixels."""
+    clean_z = 5.0 / np.linalg.norm(site_check._CAMERA.rays_of_pixels(), axis=-1)
+    depth_m = drawn(sphere(5.0), number)[0].depth_m
+    error = (1 / depth_m - 1 / clean_z)[depth_m > 0]
+    assert error.std() == pytest.approx(noise_px / 80.0, rel=0.1)
+
+
+def test_grey_follows_the_intensity_and_its_median_is_110(noiseless):
+    points = sphere(10.0, intensity=40.0)
+    points[points[:, 1] > 0, 3] = 80.0
+    for number in range(3):
+        query, T_map_camera = drawn(points, number)
+        rays = query.camera.rays_of_pixels() @ T_map_camera[:3, :3].T
+        seen = query.depth_m > 0
+        greys = {tuple(np.unique(query.rgb[seen & (side * rays[..., 1] > 0.05)]).tolist()) for side in (-1, 1)}
+        assert greys <= {(110,), (220,), (55,), ()}
+        np.testing.assert_array_equal(query.rgb[..., 0], query.rgb[..., 2])
+
+
+def test_nothing_beyond_60_metres_is_drawn(noiseless):
+    panorama = panorama_from_points(sphere(59.0), GRID)[0]
+    assert panorama.max() == pytest.approx(59.0, abs=0.1)
+    assert (drawn(sphere(50.0), 0)[0].depth_m > 0).any()
+    assert not (drawn(sphere(90.0), 0)[0].depth_m > 0).any()
+
+
+@pytest.fixture(scope="module")
+def scan_of_pictures(pictures):
+    """What a LiDAR in the camera's place would have measured of ``pictures``, its place in the map."""
+    _, depth_m, camera = pictures
+    R_level_camera = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
+    points = transform_points(transform_from(R_level_camera, np.zeros(3)), (camera.rays_of_pixels() * depth_m[..., None]).reshape(-1, 3))  # fmt: skip
+    scan = np.c_[points, np.full(len(points), 30.0)].astype(np.float32)
+    return HeldScan(8, scan, transform_from(rotation_z(np.pi / 2), np.array([20.0, 100.0, 1.7])))
+
+
+def asked(content, calibration, scan, *, right, bias, count=30, monkeypatch):
+    """The check with odds of one's own: each query is answered in its place, or 5 m beside it."""
+    number = iter(range(count))
+
+    class Answering:
+        @staticmethod
+        def open(_bundle):
+            return Answering()
+
+        def localize(self, _query):
+            T_map_camera = truth.copy()
+            T_map_camera[0, 3] += 0.5 if next(number) < right else 5.0
+            return type("Answer", (), {"T_map_camera": T_map_camera, "evidence": np.zeros(len(FEATURES))})
+
+    truth = scan.T_map_level
+    monkeypatch.setattr(site_check, "Localizer", Answering)
+    monkeypatch.setattr(site_check, "_drawn", lambda *_: (None, truth))
+    return site_of(content, [scan] * count, calibration(right=bias))
+
+
+@pytest.fixture
+def calibrated_at(calibration_of, calibration_json):
+    """Whatever the evidence, the same odds of being right."""
+    return lambda *, right: calibration_of(right=calibration_json()["right"] | {"bias": float(right)})
+
+
+@pytest.mark.parametrize(("right", "said"), [(27, 0.5), (30, 0.5), (29, 0.9), (15, 0.5)])
+def test_confidence_that_was_too_low_is_left_as_it_is(
+    content, calibrated_at, scan_of_pictures, monkeypatch, right, said
+):
+    """All of these queries are in the map: they cannot show that an answer deserves more belief."""
+    found = asked(
+        content, calibrated_at, scan_of_pictures, right=right, bias=np.log(said / (1 - said)), monkeypatch=monkeypatch
+    )
+    assert (found.offset, found.queries, found.right) == (0.0, 30, right)
+    assert found.expected_calibration_error == pytest.approx(abs(right / 30 - said))
+
+
+def test_confidence_that_was_too_high_is_lowered(content, calibrated_at, scan_of_pictures, monkeypatch):
+    """Nine in ten was said, half was right."""
+    found = asked(content, calibrated_at, scan_of_pictures, right=15, bias=np.log(9), monkeypatch=monkeypatch)
+    assert -np.log(9) < found.offset < -1.0
+    assert found.right == 15
+    lowered = float(probability(np.array([np.log(9) + found.offset]))[0])
+    assert found.expected_calibration_error == pytest.approx(lowered - 0.5)
+    assert lowered < 0.75
+
+
+def test_a_real_map_is_asked_without_what_was_held_out(content, calibrated_at, scan_of_pictures):
+    """The tiny map, its true place held out: what is asked is the rest, where the pictures resemble nothing."""
+    told = []
+    calibration = calibrated_at(right=np.log(3))
+    found = site_of(content, [scan_of_pictures], calibration, lambda *event: told.append(event))
+    assert told == [("site check", 1, 1)]
+    assert found.queries == 1
+    assert found.offset <= 0
+    assert len(content.T_map_place) == 12
+    assert replace(content).calibration == content.calibration

@@ -1,0 +1,101 @@
+"""The kernel looks points up 32 at a time: nothing it finds may depend on where one batch ends and the next begins."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.geometry.rigid import rotation_z
+from service.registration.kernel import QueryPoints, SolverOptions, align
+
+AROUND_A_BATCH = [0, 1, 2, 31, 32, 33, 63, 64, 65, 96, 97]
+SOLVE = SolverOptions(iterations=8, reach=1.2, robust_first=0.8, robust_last=0.1, free_offset=True)
+ONE_STEP = SolverOptions(iterations=1, reach=1.2, robust_first=0.5, robust_last=0.5, free_offset=True)
+STILL = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
+SUM = {"rtol": 1e-9, "atol": 1e-6}  # sums of up to 1e6 in another order
+
+
+def joined(*parts):
+    return QueryPoints(*(np.concatenate([getattr(each, f.name) for each in parts]) for f in fields(QueryPoints)))
+
+
+@pytest.fixture(scope="module")
+def mixed(seen):
+    """Points of the street in no order, of differing weight and certainty, a tenth of them where the map is empty."""
+    rng = np.random.default_rng(4)
+    rows = rng.permutation(len(seen))[:400]
+    some = seen.subset(rows)
+    xyz = np.where(rng.random((400, 1)) < 0.1, some.xyz + np.float32(700), some.xyz)
+    sigma, weight = rng.uniform(0.01, 0.3, 400), rng.uniform(0.2, 3.0, 400)
+    return QueryPoints(xyz, some.ray, sigma.astype(np.float32), weight.astype(np.float32), some.q)
+
+
+@pytest.fixture(scope="module")
+def solved(street_map, pose, start_at):
+    """What the solver makes of points from a start a little off, all of its state; the score is of points above the ground."""
+
+    def solve(points, options):
+        state = start_at(rotation_z(0.03) @ pose[0], pose[1] + [0.2, -0.1, 0.05], log_scale=0.002, offset=0.05)
+        align(street_map.grid, street_map.surfels, points, state, options, tolerance_m=0.15, height_min_m=-1.2)
+        return state[0]
+
+    return solve
+
+
+@pytest.mark.parametrize("before", AROUND_A_BATCH)
+@pytest.mark.parametrize("count", [1, 31, 32, 33, 64, 65])
+def test_points_that_weigh_nothing_only_move_the_bounds_of_batches_and_change_no_bit(mixed, solved, before, count):
+    points, nothing = mixed.subset(np.arange(count)), mixed.subset(np.arange(before))
+    nothing = QueryPoints(nothing.xyz, nothing.ray, nothing.sigma, np.zeros(before, np.float32), nothing.q)
+    assert solved(joined(nothing, points), SOLVE).tobytes() == solved(points, SOLVE).tobytes()
+
+
+@given(first=st.integers(0, 130), second=st.integers(0, 130), seed=st.integers(0, 10**6))
+@settings(max_examples=60)
+def test_a_set_of_points_says_what_its_parts_say_together(mixed, solved, first, second, seed):
+    """Information and what was met are sums over the parts, the score is their mean by weight."""
+    rows = np.random.default_rng(seed).permutation(len(mixed))
+    parts = [mixed.subset(rows[:first]), mixed.subset(rows[first : first + second])]
+    whole, (one, other) = solved(joined(*parts), ONE_STEP), (solved(part, ONE_STEP) for part in parts)
+    np.testing.assert_allclose(whole["information"], one["information"] + other["information"], **SUM)
+    assert whole["seen"] == pytest.approx(one["seen"] + other["seen"])
+    whole, (one, other) = solved(joined(*parts), STILL), (solved(part, STILL) for part in parts)
+    assert whole["weight"] == pytest.approx(one["weight"] + other["weight"])
+    together = one["inliers"] * one["weight"] + other["inliers"] * other["weight"]
+    assert whole["inliers"] * whole["weight"] == pytest.approx(together)
+
+
+@pytest.mark.parametrize("count", AROUND_A_BATCH[1:])
+def test_points_together_say_what_they_say_one_by_one(mixed, solved, count):
+    alone = [solved(mixed.subset(np.array([k])), ONE_STEP) for k in range(count)]
+    whole = solved(mixed.subset(np.arange(count)), ONE_STEP)
+    np.testing.assert_allclose(whole["information"], np.sum([each["information"] for each in alone], axis=0), **SUM)
+    assert whole["seen"] == pytest.approx(sum(each["seen"] for each in alone))
+    alone = [solved(mixed.subset(np.array([k])), STILL) for k in range(count)]
+    whole = solved(mixed.subset(np.arange(count)), STILL)
+    assert whole["weight"] == pytest.approx(sum(each["weight"] for each in alone))
+    assert whole["inliers"] * whole["weight"] == pytest.approx(sum(each["inliers"] * each["weight"] for each in alone))
+
+
+@given(seed=st.integers(0, 10**6), count=st.sampled_from(AROUND_A_BATCH[3:]))
+@settings(max_examples=25)
+def test_the_order_of_the_points_does_not_move_the_pose(mixed, solved, seed, count):
+    rows = np.arange(count)
+    found, other = (solved(mixed.subset(each), SOLVE) for each in (rows, np.random.default_rng(seed).permutation(rows)))
+    np.testing.assert_allclose(other["t"], found["t"], atol=1e-7)
+    np.testing.assert_allclose(other["R"], found["R"], atol=1e-8)
+    assert other["inliers"] == pytest.approx(found["inliers"], abs=1e-7)
+
+
+@pytest.mark.parametrize("far", [1e3, -1e3, 1e9, -1e9, 1e20, -1e20, np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("at", [0, 31, 32, 40])
+def test_a_point_that_lies_nowhere_near_the_map_meets_nothing_wherever_it_stands(mixed, solved, far, at):
+    """Its place in the batch is that of a point that weighs nothing, so that all others keep theirs."""
+    found = mixed.subset(np.arange(64))
+    found.weight[at] = 0
+    expected = solved(found, ONE_STEP)["seen"], solved(found, STILL)["inliers"]
+    found.xyz[at] = far
+    with np.errstate(invalid="ignore"):
+        assert (solved(found, ONE_STEP)["seen"], solved(found, STILL)["inliers"]) == expected

@@ -1,0 +1,239 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z, transform_from
+from service.registration import rendered
+from service.registration.register import Registered
+from service.registration.rendered import Agreement, agreement
+from service.registration.surfel_map import SurfelMap
+
+#: Off the middle, and larger than what is drawn: 4 pixels of it are one of the drawn ones.
+CAMERA = PinholeCamera(320, 240, 200.0, 200.0, 139.5, 129.5)
+ORIGIN = np.array([100.0, -50.0, 7.0])
+AT_ORIGIN = Registered(np.eye(3), ORIGIN, 1.0, 0.0, 0.9, np.eye(8), 0)
+WALL = ((10, -30, -30), (0, 60, 0), (0, 0, 60))  # 10 m ahead of the origin
+
+
+@pytest.fixture(autouse=True)
+def counted(monkeypatch):
+    """What these tests count on."""
+    numbers = {"_HIT": 0.6, "_NEW": 0.25, "_GONE": 0.02, "_ANY": 0.05, "_ROUGH_M": 0.15, "_SPAN_M": 40.0, "_CERTAIN": 3.0,
+               "_MARGIN_M": 0.25, "WIDTH": 80, "SURFEL_M": 0.4, "REACH_M": 45.0}  # fmt: skip
+    for name, value in numbers.items():
+        monkeypatch.setattr(rendered, name, value)
+
+
+@pytest.fixture(scope="module")
+def map_of(scene_of):
+    """Surfels every 0.3 m on some rectangles, in one tile; the rectangles are told from ``ORIGIN``."""
+
+    def made(*rectangles):
+        surfels = scene_of(*rectangles).surfels()
+        return SurfelMap.prepare(ORIGIN, surfels, np.array([[10.0, 0.0, 0.0, len(surfels)]]))
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def wall(map_of):
+    return map_of(WALL)
+
+
+@pytest.fixture(scope="module")
+def seeing(points_at):
+    """Points of depth ``z_m`` (a number, or one a point) where a camera's rays (x, y, 1) meet it."""
+
+    def made(z_m, rays=None, *, sigma=0.1, R_level_camera=R_BODY_OPTICAL, **options):
+        if rays is None:
+            x, y = np.meshgrid(np.linspace(-0.6, 0.6, 21), np.linspace(-0.5, 0.4, 21))
+            rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+        in_camera = np.array(rays, np.float64) * np.broadcast_to(z_m, len(rays))[:, None]
+        return points_at(in_camera @ R_level_camera.T, sigma=sigma, **options)
+
+    return made
+
+
+def agreed(cloud, points, pose=AT_ORIGIN, *, R_level_camera=R_BODY_OPTICAL):
+    return agreement(cloud, points, CAMERA, R_level_camera, pose)
+
+
+def shares(found):
+    return found.through, found.front, found.unmapped
+
+
+def moved(x, y=0.0, z=0.0, *, R=None):
+    return replace(AT_ORIGIN, camera_m=ORIGIN + [x, y, z], R_map_level=np.eye(3) if R is None else R)
+
+
+def test_who_sees_the_mapped_wall_agrees_with_it(wall, seeing):
+    """Density of the hit, 0.6 / (sqrt(2 pi) hypot(0.1, 0.15)), and of anything, 0.05 / 40; 0.25 / 10 where just before it."""
+    points = seeing(10.0, [(0, 0, 1)])
+    found = agreed(wall, points)
+    assert shares(found) == (0, 0, 0)
+    hit = 0.6 / (np.sqrt(2 * np.pi) * np.hypot(0.1, 0.15))
+    assert np.log(hit + 0.00125) - 1e-4 <= found.likelihood <= np.log(hit + 0.00125 + 0.025) + 1e-4
+
+
+@pytest.mark.parametrize(
+    ("z_m", "density"),
+    [(7.0, 0.25 / 10 + 0.05 / 40), (13.0, (0.02 + 0.05) / 40),
+     (9.8, 0.6 / (np.sqrt(2 * np.pi) * 0.15) * np.exp(-0.5 * (0.2 / 0.15) ** 2) + 0.25 / 10 + 0.05 / 40),
+     (10.2, 0.6 / (np.sqrt(2 * np.pi) * 0.15) * np.exp(-0.5 * (0.2 / 0.15) ** 2) + 0.07 / 40)],
+)  # fmt: skip
+def test_the_likelihood_by_hand(wall, seeing, z_m, density):
+    """Points that are known exactly, before and behind a wall at 10 m that is 0.15 m rough."""
+    assert agreed(wall, seeing(z_m, sigma=0.0)).likelihood == pytest.approx(np.log(density), abs=1e-3)
+
+
+def test_the_likelihood_is_the_mean_over_the_points(wall, seeing):
+    one, other = agreed(wall, seeing(7.0)).likelihood, agreed(wall, seeing(13.0)).likelihood
+    both = agreed(wall, seeing([7.0, 13.0, 13.0, 13.0], [(0, 0, 1), (0.1, 0, 1), (0.1, 0.2, 1), (-0.3, 0.1, 1)]))
+    assert both.likelihood == pytest.approx((one + 3 * other) / 4, abs=1e-3)
+
+
+def test_the_likelihood_is_best_at_the_true_depth_and_falls_to_either_side(wall, seeing):
+    offsets = [0.0, 0.1, 0.2, 0.4, 0.8]
+    before, behind = ([agreed(wall, seeing(10.0 + sign * d)).likelihood for d in offsets] for sign in (-1, 1))
+    assert before == sorted(before, reverse=True)
+    assert behind == sorted(behind, reverse=True)
+    assert min(before[0], behind[0]) > max(before[1], behind[1])
+
+
+@given(st.floats(0.3, 5.0))
+def test_to_look_through_a_wall_is_less_likely_than_to_see_something_as_far_before_it(wall, seeing, away_m):
+    before, behind = (agreed(wall, seeing(10.0 + sign * away_m)) for sign in (-1, 1))
+    assert behind.likelihood < before.likelihood
+
+
+@pytest.mark.parametrize(
+    ("z_m", "expected"),
+    [(14.0, (1, 0, 0)), (10.6, (1, 0, 0)), (10.5, (0, 0, 0)), (9.5, (0, 0, 0)), (9.4, (0, 1, 0)), (3.0, (0, 1, 0))],
+)
+def test_points_behind_the_wall_are_seen_through_it_and_points_before_it_stand_in_front(wall, seeing, z_m, expected):
+    """Known to 0.1 m: further off than three times that and 0.25 m."""
+    points = seeing(z_m, [(0, 0, 1)])
+    assert shares(agreed(wall, points)) == expected
+
+
+def test_shares_are_of_the_points(wall, seeing):
+    z = [14.0] * 3 + [10.0] * 5 + [5.0] * 2
+    rays = [(0.1 * k - 0.4, 0.05 * k - 0.2, 1) for k in range(10)]
+    assert shares(agreed(wall, seeing(z, rays))) == pytest.approx((0.3, 0.2, 0))
+
+
+@pytest.mark.parametrize(("sigma", "through"), [(0.1, 1), (1.2, 1), (1.3, 0)])
+def test_a_point_that_is_hardly_known_is_not_held_against_the_wall(wall, seeing, sigma, through):
+    """4 m behind it."""
+    assert agreed(wall, seeing(14.0, [(0, 0, 1)], sigma=sigma)).through == through
+
+
+@pytest.mark.parametrize(
+    ("z_m", "expected"), [(12.6, (0, 0, 0)), (12.7, (1, 0, 0)), (7.4, (0, 0, 0)), (7.3, (0, 1, 0))]
+)
+def test_the_uncertainty_along_a_slanted_ray_counts_as_far_as_it_points_ahead(map_of, seeing, z_m, expected):
+    """The ray (3, 0, 4) / 5: 1 m along it is 0.8 m ahead, so 2.65 m are allowed, not 3.25."""
+    wide = map_of(WALL)
+    assert shares(agreed(wide, seeing(z_m, [(0.75, 0, 1)], sigma=1.0))) == expected
+
+
+def test_where_the_map_shows_nothing_points_are_unmapped_and_neither_before_nor_behind(map_of, seeing):
+    """A wall that is out of reach, and one behind the camera; the points may be as far as they like."""
+    for x in (46, -10):
+        nothing = map_of(((x, -30, -30), (0, 60, 0), (0, 0, 60)))
+        for z_m in (1.0, 10.0, 59.0, 61.0, 200.0):
+            assert shares(agreed(nothing, seeing(z_m))) == (0, 0, 1)
+    assert shares(agreed(map_of(((44, -30, -30), (0, 60, 0), (0, 0, 60))), seeing(10.0, [(0, 0, 1)]))) == (0, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("ray", "unmapped"),
+    [((-0.3, 0, 1), 0), ((0.3, 0, 1), 1), ((-0.3, -0.3, 1), 0), ((-0.3, 0.3, 1), 1), ((0.3, -0.3, 1), 1), ((-0.05, -0.05, 1), 0)],
+)  # fmt: skip
+def test_each_point_is_compared_with_the_wall_where_it_is_seen(map_of, seeing, ray, unmapped):
+    """A wall of the left and upper quarter of the view: x right, y down in the camera, y left, z up in the map."""
+    quarter = map_of(((10, 0, 0), (0, 30, 0), (0, 0, 30)))
+    assert shares(agreed(quarter, seeing(10.0, [ray]))) == (0, 0, unmapped)
+
+
+def test_pictures_edges_are_as_good_as_their_middle(wall, seeing):
+    """The outermost pixels, and points that are rounded beyond them."""
+    u, v = np.meshgrid([-0.5, 0, 160, 319, 319.5], [-0.5, 0, 120, 239, 239.5])
+    rays = np.stack([(u.ravel() - 139.5) / 200, (v.ravel() - 129.5) / 200, np.ones(25)], axis=1)
+    assert shares(agreed(wall, seeing(10.0, rays))) == (0, 0, 0)
+
+
+def test_beside_an_edge_both_depths_agree(map_of, seeing):
+    """A pole 5 m ahead before the wall: what is seen a pixel beside its edge, at either depth, is no contradiction."""
+    poled = map_of(WALL, ((5, -0.5, -9), (0, 1, 0), (0, 0, 18)))
+    edge = [(side * (0.1 + d), 0.02 * k, 1) for side in (-1, 1) for d in (-0.01, 0.0, 0.01) for k in range(-5, 5)]
+    for z_m in (5.0, 10.0):
+        assert shares(agreed(poled, seeing(z_m, edge))) == (0, 0, 0)
+    middle, beside = [(0, 0, 1)], [(0.3, 0, 1)]
+    assert shares(agreed(poled, seeing(10.0, middle))) == (1, 0, 0)
+    assert shares(agreed(poled, seeing(5.0, beside))) == (0, 1, 0)
+
+
+def test_the_depths_scale_is_taken_into_account(wall, seeing):
+    points = seeing(10.0 / 1.1)
+    assert agreed(wall, points).front == 1
+    scaled = agreed(wall, points, replace(AT_ORIGIN, scale=1.1))
+    assert shares(scaled) == (0, 0, 0)
+    assert scaled.likelihood == pytest.approx(agreed(wall, seeing(10.0)).likelihood, abs=0.02)
+
+
+def test_the_disparity_offset_is_taken_into_account(wall, seeing):
+    """A rig of 80 px m sees the wall at 8 px; one that reads 10 px sees it at 8 m, and is 2 px off."""
+    points = seeing(8.0, focal_baseline_px_m=80.0)
+    assert agreed(wall, points).front == 1
+    corrected = agreed(wall, points, replace(AT_ORIGIN, offset=-2.0))
+    assert shares(corrected) == (0, 0, 0)
+    assert corrected.likelihood == pytest.approx(agreed(wall, seeing(10.0)).likelihood, abs=0.02)
+    assert agreed(wall, points, replace(AT_ORIGIN, offset=2.0)).front == 1
+    without_rig = seeing(8.0)
+    assert agreed(wall, without_rig, replace(AT_ORIGIN, offset=-2.0)) == agreed(wall, without_rig)
+
+
+def test_scale_and_offset_correct_together(wall, seeing):
+    """8 m are 10 px, which should be 8.8 px by the offset: 9.0909 m, and 1.1 times that are 10 m."""
+    found = agreed(wall, seeing(8.0, focal_baseline_px_m=80.0), replace(AT_ORIGIN, scale=1.1, offset=-1.2))
+    assert found.likelihood == pytest.approx(agreed(wall, seeing(10.0)).likelihood, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("pose", "expected"), [(moved(1.0), (1, 0, 0)), (moved(-1.0), (0, 1, 0)), (moved(0, 3.0, -2.0), (0, 0, 0))]
+)
+def test_the_map_is_drawn_where_the_candidate_stands(wall, seeing, pose, expected):
+    """A metre too far ahead, the wall is drawn at 9 m and the points lie behind it; beside and below it looks the same."""
+    assert shares(agreed(wall, seeing(10.0), pose)) == expected
+
+
+def test_a_candidate_that_looks_away_sees_nothing_of_the_wall(wall, seeing):
+    assert shares(agreed(wall, seeing(10.0), moved(0, R=rotation_z(np.pi)))) == (0, 0, 1)
+
+
+turn = st.floats(-0.35, 0.35)
+
+
+@given(yaw=turn, pitch=st.floats(-0.2, 0.2), roll=st.floats(-0.2, 0.2), x=st.floats(-2, 2), y=st.floats(-2, 2))
+def test_a_camera_that_leans_and_turns_agrees_with_what_it_truly_sees(
+    wall, scene_of, points_at, yaw, pitch, roll, x, y
+):
+    """Depths of a faultless picture at every 8th pixel; the level frame and the camera lean against each other."""
+    R_level_camera = rotation_y(pitch) @ rotation_x(roll) @ R_BODY_OPTICAL
+    pose = moved(x, y, R=rotation_z(yaw))
+    T = transform_from(pose.R_map_level @ R_level_camera, pose.camera_m - ORIGIN)
+    z = scene_of(WALL).depth(CAMERA, T)[4::8, 4::8]
+    in_camera = (CAMERA.rays_of_pixels()[4::8, 4::8] * z[..., None])[z > 0]
+    found = agreed(wall, points_at(in_camera @ R_level_camera.T, sigma=0.1), pose, R_level_camera=R_level_camera)
+    assert shares(found) == (0, 0, 0)
+    assert found.likelihood > 0
+
+
+def test_the_mean_of_several_pictures():
+    mean = Agreement.mean([Agreement(-1.0, 0.1, 0.2, 0.3), Agreement(-3.0, 0.3, 0.4, 0.9)])
+    assert (mean.likelihood, mean.through, mean.front, mean.unmapped) == pytest.approx((-2.0, 0.2, 0.3, 0.6))
