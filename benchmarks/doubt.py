@@ -116,7 +116,7 @@ def average_precision(
     """Area under precision over recall of true accepts, false ones being answers outside the map."""
     score = np.concatenate([confidence[right], negative])
     true = np.r_[np.ones(int(right.sum()), bool), np.zeros(len(negative), bool)]
-    true = true[np.argsort(-score, kind="stable")]
+    true = true[np.lexsort((true, -score))]  # of equal ones the false come first
     precision = np.cumsum(true) / np.arange(1, len(true) + 1)
     return float(precision[true].mean())
 

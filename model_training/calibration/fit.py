@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import DatasetError
 from service.maps.calibration import (
     FEATURES,
     RIVALRY,
@@ -62,11 +63,13 @@ def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RID
         ridge: strength of the penalty on weights.
 
     Raises:
-        ValueError: one sort of queries is missing.
+        DatasetError: one sort of queries is missing.
     """
     used = asked.registered()
     if used.known.all() or not used.known.any() or used.right.all() or not used.right.any():
-        raise ValueError("calibration needs right and wrong answers, and queries in the map and outside it")
+        raise DatasetError(
+            "calibration needs right and wrong answers, and queries in the map and outside it; ask more queries", field="queries"
+        )  # fmt: skip
     weight = np.where(used.known, 0.5 / used.known.mean(), 0.5 / (~used.known).mean())
     mean, spread = used.evidence.mean(axis=0), used.evidence.std(axis=0) + 1e-9
     right = _logistic(used.evidence, used.right, weight, mean, spread, ridge)

@@ -33,9 +33,14 @@ def calibrate(
         anew: ask the queries again, since the code that answers them has changed.
         report: told after every frame, place and query.
 
+    Raises:
+        EncoderError: the encoder cannot be used.
+        DatasetError: the cities' queries are all of one sort, so there is nothing to fit.
+
     Returns:
         The calibration, and for people how well each city is predicted from the others.
     """
+    sha256 = Encoder.open(encoder).sha256  # said before the work, not after it
     cities = []
     for index in range(CITIES):
         plan = calibration_plan(index)
@@ -44,7 +49,7 @@ def calibrate(
     parts = [_asked(work, encoder, cities, k, anew=anew, report=report) for k in range(CITIES)]
     measured_on: dict[str, str | float] = {
         "cities": ", ".join(f"seed {city.description.seed}" for city in cities),
-        "encoder_sha256": Encoder.open(encoder).sha256,
+        "encoder_sha256": sha256,
     }
     return fit(pooled(parts), measured_on=measured_on), cross_checks(parts)
 

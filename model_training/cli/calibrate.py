@@ -9,6 +9,7 @@ from rich.console import Console
 from model_training.calibration.make import calibrate
 from model_training.cli.progress import bars
 from model_training.stock import CALIBRATION, ENCODER
+from service.errors import DatasetError
 
 
 def command(
@@ -26,6 +27,8 @@ def command(
       streetfix calibrate --encoder runs/mine/encoder.onnx --out runs/mine/calibration.json
       streetfix build-map data/site --encoder runs/mine/encoder.onnx --calibration runs/mine/calibration.json --out maps/site
     """
+    if not out.parent.is_dir():  # said before the work, not after it
+        raise DatasetError(f"--out: there is no folder {out.parent}; make it first", field="out")
     console = Console(highlight=False)
     with bars() as report:
         calibration, checks = calibrate(work, encoder, anew=anew, report=report)

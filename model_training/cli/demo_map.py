@@ -124,7 +124,9 @@ def _build(
     not leave the map of another plan to the next one.
     """
     settings, note = BuildSettings(name=name), bundle.with_name("map.made_from.json")
-    wanted = {"made_from": made_from, "encoder_sha256": sha256_of(encoder), "settings": asdict(settings)}
+    calibration = None if settings.calibration is None else sha256_of(settings.calibration)
+    built = asdict(settings) | {"calibration": calibration}
+    wanted = {"made_from": made_from, "encoder_sha256": sha256_of(encoder), "settings": built}
     if new or not _is_noted(note, wanted, bundle):
         version = build_map(dataset, encoder, bundle, settings, overwrite=True, report=report).version
         note.write_text(json.dumps(wanted | {"map_version": version}, indent=1) + "\n")

@@ -33,7 +33,8 @@ class RepeatingCity(City):
     def __init__(self, *, seed: int) -> None:  # not City's: nothing here is drawn along streets
         self.seed, self.name = seed, "repeating"
         half_m = BLOCKS * BLOCK_M / 2
-        line = np.stack([np.linspace(-half_m, half_m, 2 * BLOCKS + 1), np.zeros(2 * BLOCKS + 1)], axis=1)
+        points = 3 * BLOCKS + 1  # every third piece is marked: one a block, in the same place
+        line = np.stack([np.linspace(-half_m, half_m, points), np.zeros(points)], axis=1)
         self.streets = [Street("1", (line,), _HALF_WIDTH_M, True)]
         self.half_size_m = (half_m + 20.0, 60.0)
         self.terrain = Terrain(np.zeros((1, 4)))

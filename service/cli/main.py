@@ -19,6 +19,7 @@ _KNOWN = {
     "simulate": ("Make a city by seed and drive through it: survey and queries.", "mapping"),
     "import": ("Bring recorded data into the dataset folder.", "mapping"),
     "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
+    "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
     "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
     "demo": ("Map streets, serve the map, ask it where pictures were taken.", "mapping"),
     "train": ("Train an encoder on simulated cities.", "training"),

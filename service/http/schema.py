@@ -227,7 +227,7 @@ class LocalizeAnswer(BaseModel):
     street: Street | None = Field(description="null where the map has no streets, or the neighbours lie in none")
     pose: Pose = Field(description="T_map_camera")
     vehicle_pose: Pose | None = Field(description="T_map_vehicle, where T_vehicle_camera was sent")
-    geopose: dict[str, Any] | None = Field(description="null: the map is not georeferenced")
+    geopose: dict[str, Any] | None = Field(description="null in this release; OGC GeoPose follows")
     hypotheses: list[HypothesisOfPose] = Field(
         description="distinct poses that were registered, the best supported first; empty without registration"
     )

@@ -56,7 +56,8 @@ def starts_from(
     if prior is not None:
         order = np.argsort(-similarity, kind="stable")
         kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, kept, settings.most, settings)
-    return [Start(poses[k, :3, :3], poses[k, :3, 3], number, float(rank[k])) for number, k in enumerate(kept)]
+    # Without the prior: it is weighed at the end, when rivals have been registered too.
+    return [Start(poses[k, :3, :3], poses[k, :3, 3], number, float(similarity[k])) for number, k in enumerate(kept)]
 
 
 def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:

@@ -2,8 +2,9 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
@@ -146,7 +147,7 @@ def _require_consistent(path: Path, manifest: Manifest) -> None:
         what = "the limits of the view grid are the wrong way round"
     elif "lidar_height_m" not in manifest.parameters:
         what = "parameters lacks lidar_height_m"
-    elif wrong := _not_on_earth(manifest.georeference):
+    elif wrong := not_on_earth(manifest.georeference):
         what = f"georeference: {wrong}"
     elif bad := [name for name in manifest.files if not is_confined(name)]:
         what = f"the file {bad[0]!r} would lie outside the bundle"
@@ -155,8 +156,8 @@ def _require_consistent(path: Path, manifest: Manifest) -> None:
     raise BundleError(f"{path}: {what}; copy or build the bundle again", field=FILE)
 
 
-def _not_on_earth(georeference: dict[str, float] | None) -> str | None:
-    """What is wrong with it, if anything."""
+def not_on_earth(georeference: Mapping[str, Any] | None) -> str | None:
+    """What is wrong with a georeference, if anything."""
     try:
         if georeference is not None:
             Georeference(**georeference)

@@ -143,6 +143,8 @@ def _require_valid(content: BundleContent) -> None:
         what = f"a place lies in a street that is not among the {named} of streets.geojson"
     elif not np.isfinite(content.descriptors).all() or not np.isfinite(content.T_map_place).all():
         what = "a descriptor or a pose is not finite"
+    elif wrong := manifest.not_on_earth(content.georeference):
+        what = f"georeference: {wrong}"
     elif "lidar_height_m" not in content.parameters:
         what = "parameters lacks lidar_height_m"
     else:

@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model_training.calibration.fit import RATES, Asked, expected_calibration_error, fit, pooled
+from service.errors import DatasetError
 from service.maps.calibration import FEATURES, RIVALRY, probability, read_calibration
 
 COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
@@ -235,3 +236,20 @@ def test_the_calibration_error_lies_between_that_of_all_as_one_and_that_of_each_
     confidence, right = rng.random(count), rng.random(count) < 0.5
     found = expected_calibration_error(confidence, right, bins=bins)
     assert abs(confidence.mean() - right.mean()) - 1e-12 <= found <= np.abs(confidence - right).mean() + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("right", "known"),
+    [([1, 1, 1, 1], [1, 1, 0, 0]), ([0, 0, 0, 0], [1, 1, 0, 0]), ([1, 0, 1, 0], [1, 1, 1, 1]), ([1, 0, 0, 0], [0, 0, 0, 0])],
+)  # fmt: skip
+def test_queries_of_one_sort_alone_are_refused(right, known):
+    asked = asked_of(evidence_of(np.random.default_rng(0), 4), right, known)
+    with pytest.raises(DatasetError, match="needs right and wrong answers, and queries in the map and outside it"):
+        fit(asked, measured_on={})
+
+
+def test_sorts_without_evidence_do_not_count():
+    evidence = evidence_of(np.random.default_rng(0), 4)
+    evidence[3] = np.nan  # the only query outside
+    with pytest.raises(DatasetError, match="queries in the map and outside it"):
+        fit(asked_of(evidence, [1, 0, 1, 0], [1, 1, 1, 0]), measured_on={})

@@ -112,7 +112,7 @@ def test_a_prior_in_degrees_is_refused_where_the_map_does_not_know_where_it_lies
     engine: Engine, encoded: EncodedQuery
 ) -> None:
     asked = replace(encoded, prior=Prior(), prior_wgs84=(52.52, 13.405))
-    with pytest.raises(RequestError, match="the map 'tiny' is not georeferenced; send prior.position") as error:
+    with pytest.raises(RequestError, match=r"the map 'tiny' is not georeferenced; send prior\.position") as error:
         engine.localize(asked)
     assert error.value.field == "prior.wgs84"
 

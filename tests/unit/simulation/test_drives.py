@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from model_training.simulation.drives import driven, query_candidates, survey_of
+from model_training.simulation.drives import driven, followed, query_candidates, survey_of
 from model_training.simulation.plan import QueryPlan
 from model_training.simulation.traversal import stations, stations_along, survey_error
 from service.errors import DatasetError
@@ -161,3 +161,36 @@ def test_written_poses_are_the_true_ones_without_the_error(city, plan):
 def test_a_street_that_is_not_there_is_refused_with_those_that_are(city, plan):
     with pytest.raises(DatasetError, match=r"no street 'x' here; there are: 1, 2"):
         driven(city, plan.model_copy(update={"streets": ("x",)}), 1.0)
+
+
+@pytest.mark.parametrize(("step_m", "expected_m"), [(None, 2.0), (3.5, 3.5)])
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, -30.0])
+def test_frames_of_a_sequence_follow_a_straight_line_to_the_pose_that_was_drawn(
+    city, plan, step_m, expected_m, turn_deg
+):
+    """Two metres apart unless told otherwise; the vehicle drives where it heads, wherever the camera looks."""
+    query = QUERY.model_copy(update={"sequence": 4, "step_m": step_m, "turn_deg": turn_deg})
+    poses = query_candidates(city, plan, query, survey_of(city, plan))[:25]
+    frames = followed(city, query, poses).reshape(25, 4, 4, 4)
+    np.testing.assert_array_equal(frames[:, 3], poses)
+    steps = np.diff(frames[:, :, :2, 3], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=2), expected_m, atol=1e-9)
+    np.testing.assert_allclose(steps, np.repeat(steps[:, :1], 3, axis=1), atol=1e-9)
+    driven_rad = np.arctan2(steps[:, 0, 1], steps[:, 0, 0])
+    looked_rad = np.array([heading_of_camera(T) for T in poses])
+    np.testing.assert_allclose(np.angle(np.exp(1j * (looked_rad - driven_rad - np.deg2rad(turn_deg)))), 0, atol=1e-9)
+
+
+def test_the_camera_keeps_its_angles_and_its_height_above_the_ground(city, plan):
+    query = QUERY.model_copy(update={"sequence": 3, "step_m": 5.0})
+    poses = query_candidates(city, plan, query, survey_of(city, plan))[:25]
+    frames = followed(city, query, poses).reshape(25, 3, 4, 4)
+    np.testing.assert_array_equal(frames[:, :, :3, :3], np.repeat(poses[:, None, :3, :3], 3, axis=1))
+    above = [[T[2, 3] - city.height(T[0, 3], T[1, 3]) for T in frames_of_one] for frames_of_one in frames]
+    np.testing.assert_allclose(above, np.repeat(np.array(above)[:, 2:], 3, axis=1), atol=1e-9)
+    assert np.ptp(frames[:, :, 2, 3], axis=1).max() > 0.05  # it is no plain
+
+
+def test_single_pictures_are_followed_by_themselves(city, plan):
+    poses = query_candidates(city, plan, QUERY, survey_of(city, plan))
+    assert followed(city, QUERY, poses) is poses

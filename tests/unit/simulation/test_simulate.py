@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -221,6 +222,10 @@ def test_more_queries_than_room_are_refused_with_both_counts(plan_of, tmp_path, 
         ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, aside_m=1.0),)}, "aside_m: 1 would do nothing"),
         ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, heading_deg=0),)}, "heading_deg: 0 would"),
         ({"queries": (QueryPlan(name="a", traversal=0, parked_changed=1.0),)}, "parked_changed: 1 would do nothing"),
+        (
+            {"queries": (QueryPlan(name="a", traversal=1, step_m=3.0),)},
+            "step_m: 3 would do nothing, since 'a' has no sequence",
+        ),
     ],
 )
 def test_a_plan_that_names_what_is_not_there_is_refused(plan_of, tmp_path, changed, message):
@@ -262,3 +267,44 @@ def test_the_streets_of_the_dataset_are_those_of_its_city(tiny_dataset):
     features = json.loads((tiny_dataset / "streets.geojson").read_text())["features"]
     names = [class_name(f["properties"]["street"], f["properties"]["section"]) for f in features]
     assert [f["properties"]["name"] for f in features] == names
+
+
+def test_a_plan_with_a_sequence_says_so_and_is_read_again():
+    plan = SimulationPlan(name="x", queries=(QueryPlan(name="a", traversal=1, sequence=5),))
+    assert '"sequence":5' in plan.model_dump_json()
+    assert "step_m" not in plan.model_dump_json()
+    assert SimulationPlan.model_validate_json(plan.model_dump_json()) == plan.checked()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("sequence", 1), ("sequence", 21), ("step_m", 0.0), ("step_m", 11.0), ("step_m", np.nan)]
+)
+def test_a_sequence_out_of_bounds_is_refused(field, value):
+    with pytest.raises(ValidationError, match=field):
+        QueryPlan(**({"name": "a", "traversal": 1, "sequence": 3} | {field: value}))
+
+
+def test_sequences_are_written_frame_by_frame_and_as_many_as_asked_for(plan_of, tmp_path):
+    """Two sequences of three frames are six, each with its pose; the last of each is where a single picture would be."""
+    alone, sequence = (
+        QueryPlan(name="a", traversal=1, count=2),
+        QueryPlan(name="a", traversal=1, count=2, sequence=3, step_m=0.5),
+    )
+    told = []
+    simulate(plan_of(spacing_m=30.0, queries=(alone,)), tmp_path / "alone", workers=1)
+    simulate(
+        plan_of(spacing_m=30.0, queries=(sequence,)),
+        tmp_path / "seq",
+        workers=1,
+        report=lambda *event: told.append(event),
+    )
+    frames, last = (list(Dataset(tmp_path / name).queries("a_precise")) for name in ("seq", "alone"))
+    assert [frame.number for frame in frames] == list(range(6))
+    assert told[-1] == ("queries a", 6, 6)
+    truth = np.array([frame.T_map_camera for frame in frames])
+    steps = np.linalg.norm(np.diff(truth[:, :2, 3], axis=0), axis=1)
+    np.testing.assert_allclose(steps[[0, 1, 3, 4]], 0.5, atol=1e-6)
+    for frame, single in zip(frames[2::3], last, strict=True):
+        np.testing.assert_allclose(frame.T_map_camera, single.T_map_camera, atol=1e-9)
+    pictures = [frame.depth_m() for frame in frames]
+    assert all(np.abs(one - other).max() > 0.1 for one, other in itertools.pairwise(pictures))

@@ -1,0 +1,70 @@
+import pytest
+
+pytest.importorskip("torch", reason="needs the extra `training`")
+
+from benchmarks.plans import (  # after the skip
+    SEQUENCE,
+    hard_plan,
+    lidar_16_plan,
+    more_plan,
+    paper_plan,
+    repeating_plan,
+    unseen_plan,
+)
+from benchmarks.runs import pooled
+from model_training.simulation.drives import driven
+from model_training.simulation.hard import HARD
+from model_training.simulation.simulate import _city
+from model_training.training.recipe import EVALUATION_SEEDS
+
+OWN = (
+    [unseen_plan(k) for k in range(3)]
+    + [more_plan(k) for k in range(3)]
+    + [hard_plan(), lidar_16_plan(), repeating_plan()]
+)
+
+
+@pytest.mark.parametrize("plan", [*OWN, paper_plan()], ids=lambda plan: plan.name)
+def test_every_plan_can_be_simulated_and_every_drive_is_one_of_its_own(plan):
+    plan.checked()
+    drives = [query.traversal for query in plan.queries]
+    assert len(set(drives)) == len(drives)
+
+
+def test_cities_are_of_seeds_that_nothing_else_uses_and_names_are_told_apart():
+    assert {plan.seed for plan in OWN} <= set(EVALUATION_SEEDS)
+    assert len({plan.seed for plan in OWN[:3]}) == 3
+    names = [plan.name for plan in OWN]
+    assert len(set(names)) == len(names)
+
+
+def test_a_thousand_queries_of_each_unseen_city_and_both_plans_are_of_one_city():
+    first, more = ([plan(k) for k in range(3)] for plan in (unseen_plan, more_plan))
+    assert sum(plan.queries[0].count for plan in first) == 1000
+    assert [a.queries[0].count + b.queries[0].count for a, b in zip(first, more, strict=True)] == [1000] * 3
+    for one, other in zip(first, more, strict=True):
+        assert one.model_dump(exclude={"name", "queries"}) == other.model_dump(exclude={"name", "queries"})
+        assert not {query.traversal for query in one.queries} & {query.traversal for query in other.queries}
+
+
+def test_every_hard_condition_stands_beside_a_clear_day():
+    plan = hard_plan()
+    assert [query.name for query in plan.queries] == ["clear", *HARD, "depth_15m_sequence5"]
+    assert {query.count for query in plan.queries[:-1]} == {300}
+    assert plan.queries[-1].sequence == SEQUENCE
+    assert lidar_16_plan().queries[0] == plan.queries[0]
+
+
+def test_the_repeating_street_has_room_for_its_sequences():
+    plan = repeating_plan()
+    assert plan.queries[0].sequence == SEQUENCE
+    assert len(driven(_city(plan), plan, plan.spacing_m)) > 5 * plan.queries[0].count
+
+
+def test_shares_of_several_cities_are_pooled_by_their_queries():
+    parts = [{"queries": 100, "street_queries": 10, "localized": 0.5, "street_accuracy": 1.0},
+             {"queries": 300, "street_queries": 30, "localized": 0.9, "street_accuracy": 0.5}]  # fmt: skip
+    value, count, (low, high) = pooled(parts, "localized")
+    assert (value, count) == (0.8, 400)
+    assert low < 0.8 < high
+    assert pooled(parts, "street_accuracy")[:2] == (0.625, 40)
