@@ -34,12 +34,14 @@ def evidence_of(
     similarities = np.array([place.similarity for place in neighbours])
     elsewhere = similarities[away > OTHER_PLACE_M]
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(refined.covariance[:2, :2])[-1]))
+    # What several frames agree on is surer than one frame's: the noise of their mean falls with the root of their number.
+    several = float(np.sqrt(len(frames)))
     weights = np.array([hypothesis.weight for hypothesis in hypotheses])
     found = {
-        "margin": _margin(refined.candidates),
+        "margin": min(several * _margin(refined.candidates), _MOST_MARGIN),
         "inliers": best.registered.inliers,
         "similarity": best.similarity,
-        "similarity_margin": best.similarity - (float(elsewhere.max()) if len(elsewhere) else 0.5),
+        "similarity_margin": several * (best.similarity - (float(elsewhere.max()) if len(elsewhere) else 0.5)),
         "likelihood": best.agreement.likelihood,
         "through": best.agreement.through,
         "front": best.agreement.front,

@@ -165,3 +165,14 @@ def test_distances_are_from_the_best_candidate(weighed):
     found = weighed(candidates=(there, candidate(1.0)), neighbours=places)
     assert found["votes"] == 0.5
     assert found["similarity_margin"] == pytest.approx(0.8 - 0.9)
+
+
+def test_margins_of_several_frames_count_by_the_root_of_their_number(weighed, frame):
+    asked = {
+        "candidates": (candidate(10.0), candidate(7.0, xyz=(20, 0, 1.5))),
+        "neighbours": [neighbour(0), neighbour(30)],
+    }
+    one, four = weighed(**asked), weighed(**asked, frames=(frame,) * 4)
+    assert one["margin"] == pytest.approx(3.0)
+    assert four["margin"] == pytest.approx(6.0)
+    assert four["similarity_margin"] == pytest.approx(2 * one["similarity_margin"])
