@@ -18,7 +18,11 @@ _MOST_MARGIN = 12.0  # nats; where there is no rival at all, too
 
 
 def evidence_of(
-    frames: tuple[Frame, ...], refined: Refined, neighbours: tuple[Neighbour, ...], hypotheses: tuple[Hypothesis, ...]
+    frames: tuple[Frame, ...],
+    refined: Refined,
+    neighbours: tuple[Neighbour, ...],
+    hypotheses: tuple[Hypothesis, ...],
+    places_m: Float64[NDArray[np.float64], "P 2"],
 ) -> Float64[NDArray[np.float64], " F"]:
     """One number for each of ``service.maps.calibration.FEATURES``.
 
@@ -27,6 +31,7 @@ def evidence_of(
         refined: its candidates.
         neighbours: distinct places, the most similar first; those of the reference.
         hypotheses: clusters of the reference's most similar views.
+        places_m: x, y of all places of the map.
     """
     best, reference = refined.best, frames[0]
     xy = best.T_map_camera[:2, 3]
@@ -34,6 +39,8 @@ def evidence_of(
     similarities = np.array([place.similarity for place in neighbours])
     elsewhere = similarities[away > OTHER_PLACE_M]
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(refined.covariance[:2, :2])[-1]))
+    # Of the places that are there: a sparse survey has fewer of them, but no less to say.
+    there = float(np.clip((np.hypot(*(places_m - xy).T) < VOTE_M).sum(), 1, VOTERS))
     # What several frames agree on is surer than one frame's: the noise of their mean falls with the root of their number.
     several = float(np.sqrt(len(frames)))
     weights = np.array([hypothesis.weight for hypothesis in hypotheses])
@@ -48,7 +55,7 @@ def evidence_of(
         "unmapped": best.agreement.unmapped,
         "log_sigma": float(np.log(sigma_m)),
         "scale": abs(float(np.log(best.registered.scale))) / 0.01,
-        "votes": float((away[:VOTERS] < VOTE_M).sum()) / min(VOTERS, len(away)),
+        "votes": float((away[:VOTERS] < VOTE_M).sum()) / there,
         "entropy": float(-(weights * np.log(np.maximum(weights, 1e-12))).sum()),
         "log_noise": float(np.log(np.median([frame.noise for frame in frames]))),
         "points": refined.points / 3000.0 / len(frames),

@@ -103,7 +103,11 @@ class Localizer:
         registers = query.refine and self.bundle.cloud is not None
         if query.refine and self.bundle.cloud is not None:
             refined = refine(self.bundle, self.bundle.cloud, frames, query.prior, self.refining)
-            evidence = None if refined is None else evidence_of(frames, refined, neighbours, hypotheses)
+            evidence = (
+                None
+                if refined is None
+                else evidence_of(frames, refined, neighbours, hypotheses, self.bundle.T_map_place[:, :2, 3])
+            )
         decision = None
         if registers and self.bundle.calibration is not None:
             decision = decide(self.bundle.calibration, evidence, query.false_accept_rate)

@@ -43,10 +43,12 @@ def frame(frame_with, matches_at):
 def weighed(frame):
     """The evidence by name; whatever a test does not say is one candidate, one neighbour, one hypothesis, one frame."""
 
-    def weigh(*, candidates=None, neighbours=None, weights=(1.0,), frames=None, **options):
+    def weigh(*, candidates=None, neighbours=None, weights=(1.0,), frames=None, places=None, **options):
+        neighbours = neighbours or [neighbour(0)]
+        there = np.array(places or [each.position_m[:2] for each in neighbours], np.float64)
         found = evidence_of(
-            frames or (frame,), refined(*(candidates or [candidate()]), **options), tuple(neighbours or [neighbour(0)]),
-            tuple(hypothesis(weight) for weight in weights),
+            frames or (frame,), refined(*(candidates or [candidate()]), **options), tuple(neighbours),
+            tuple(hypothesis(weight) for weight in weights), there,
         )  # fmt: skip
         assert found.shape == (len(FEATURES),)
         return dict(zip(FEATURES, found.tolist(), strict=True))
@@ -121,14 +123,21 @@ def test_where_no_other_place_was_found_half_is_taken_for_its_similarity(weighed
     ("x_m", "votes"),
     [
         ([0], 1.0),
-        ([0, 4.9, 5.1, -4.9], 0.75),
+        ([0, 4.9, 5.1, -4.9], 1.0),  # all that are there
         ([50] * 20, 0.0),
         ([0] * 5 + [50] * 15 + [0] * 20, 0.25),
         ([0] * 40, 1.0),
     ],
 )
-def test_votes_are_the_share_of_the_first_twenty_places_that_lie_around_the_answer(weighed, x_m, votes):
+def test_votes_are_the_first_twenty_places_that_lie_around_the_answer_of_those_that_do(weighed, x_m, votes):
     assert weighed(neighbours=[neighbour(x) for x in x_m])["votes"] == votes
+
+
+def test_a_sparse_survey_has_fewer_places_to_vote_but_no_smaller_a_share(weighed):
+    voters = [neighbour(x) for x in (0, 50, 60, 70)]
+    dense, sparse = [(float(x), 0.0) for x in range(-4, 5)], [(0.0, 0.0), (10.0, 0.0)]
+    assert weighed(neighbours=voters, places=sparse)["votes"] == 1.0
+    assert weighed(neighbours=voters, places=dense)["votes"] == pytest.approx(1 / 9)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +171,8 @@ def test_the_noise_is_the_median_of_the_frames_and_points_are_counted_a_frame(we
 def test_distances_are_from_the_best_candidate(weighed):
     there = candidate(10.0, xyz=(100, 0, 1.5))
     places = [neighbour(0, 0.9), neighbour(100, 0.7)]
-    found = weighed(candidates=(there, candidate(1.0)), neighbours=places)
+    map_places = [(0.0, 0.0), (98.0, 0.0), (100.0, 0.0)]
+    found = weighed(candidates=(there, candidate(1.0)), neighbours=places, places=map_places)
     assert found["votes"] == 0.5
     assert found["similarity_margin"] == pytest.approx(0.8 - 0.9)
 
