@@ -15,6 +15,7 @@ from service.localization.refine import RefineSettings, settings_for_rig
 from service.registration.points import inverse_depth_noise, points_of
 from service.registration.register import Start, register
 
+IN_SIGHT = "not held out: turned starts and the last stage's weights were chosen with these frames in sight"
 STARTS, AWAY_M, TURN_DEG = 20, 2.0, 10.0
 FOCAL_BASELINE_PX_M = 721.5 * 0.54
 BARS = {"median_m": (0.08, "lower"), "p95_m": (0.15, "lower"), "within_1_m": (1.0, "higher")}
@@ -38,7 +39,7 @@ def kitti_registration_rows(report: Report, runs: Runs, data: Path) -> None:
     for key, value in found.items():
         bar, better = BARS[key]
         unit = "share" if key == "within_1_m" else "m"
-        report.row(f"{prefix}.{key}", float(value), unit, bar=bar, better=better, n=len(errors))  # type: ignore[arg-type]
+        report.row(f"{prefix}.{key}", float(value), unit, bar=bar, better=better, n=len(errors), why=IN_SIGHT)  # type: ignore[arg-type]
 
 
 def registration_errors(cloud: object, dataset: Dataset) -> list[float]:
