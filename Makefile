@@ -4,8 +4,9 @@
 PYTHON ?= python3
 # The CPU build where pip is offered one; `make TORCH="torch==2.13.0 --index-url ..." test` takes another.
 TORCH ?= torch==2.13.0
-# Optimiser steps of the stock encoder.
+# Optimiser steps of the stock encoder, and of its second round at half the rate.
 STEPS ?= 4200
+SECOND_STEPS ?= 2600
 # Further steps on the paper's city, for the encoder that stands beside it in the report.
 PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.
@@ -53,8 +54,10 @@ format: .venv/.torch ## put the code in shape
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-generate: .venv/.torch ## write openapi/openapi.json from the code
+generate: .venv/.torch ## write openapi/openapi.json from the code, and the gRPC code from proto/
 	$(BIN)/python -m service.http.openapi
+	$(BIN)/python -m grpc_tools.protoc -I service/grpc/generated=proto --python_out=. --pyi_out=. --grpc_python_out=. \
+		service/grpc/generated/streetfix/v1/localization.proto
 
 lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
 	$(COMPILE) --extra dev --group oracle $(ARGS) --output-file locks/dev.txt
@@ -72,13 +75,14 @@ reports: .venv/.torch ## all reports as one page with plots
 
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS)
-	$(BIN)/streetfix export runs/stock --out model_training/stock/encoder.onnx
+	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --start-from runs/stock
+	$(BIN)/streetfix export runs/second --out model_training/stock/encoder.onnx
 
 calibration: .venv/.torch ## ask calibration cities and fit confidence anew, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)
 
 paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there
-	$(BIN)/streetfix train --recipe paper --start-from runs/stock --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper
+	$(BIN)/streetfix train --recipe paper --start-from runs/second --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper
 	$(BIN)/streetfix export runs/paper --out runs/paper/encoder.onnx
 
 install-demo: .venv/.mapping ## what the demo needs, and no more

@@ -31,16 +31,17 @@ RAW_EVERY = 3  # each third query of a set is asked of the raw image too: it is 
 
 
 @cache
-def code_hash(*folders: str) -> str:
-    """Short hash of the Python and C files of folders of the repository."""
+def code_hash(*names: str) -> str:
+    """Short hash of files of the repository, and of the Python and C files of folders."""
     digest = hashlib.sha256()
-    for folder in folders:
-        for path in sorted(p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".c")):
+    for name in names:
+        inside = [ROOT / name] if (ROOT / name).is_file() else (ROOT / name).rglob("*")
+        for path in sorted(p for p in inside if p.suffix in (".py", ".c")):
             digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:8]
 
 
-SIMULATION = ("model_training/simulation", "service/geometry")
+SIMULATION = ("model_training/simulation", "service/geometry/camera.py", "service/geometry/rigid.py")
 ANSWERING = ("service/imaging", "service/geometry", "service/maps", "service/registration", "service/localization")
 MAPPING = ("model_training/mapping", "model_training/datasets", *ANSWERING)  # it asks its own map to check confidence
 

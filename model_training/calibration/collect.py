@@ -1,6 +1,6 @@
-"""Ask calibration queries: of their own city's map, of another city's, and of one that left some streets out."""
+"""Ask calibration queries: of their own city's map, of another city's, of sparse ones, and of one that left some streets out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -12,19 +12,19 @@ from service.localization.localizer import Localizer
 Report = Callable[[str, int, int], None]
 
 
-def in_the_map(localizer: Localizer, dataset: Dataset, report: Report) -> list[Asked]:
-    """Every query set of the map's own city."""
+def in_the_map(localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = ()) -> list[Asked]:
+    """Query sets of the map's own city; all of them, where none are named."""
     return [
         asked_of(predict(localizer, dataset, name, report=report), name, known=True)
-        for name in dataset.query_sets(with_truth=True)
+        for name in names or dataset.query_sets(with_truth=True)
     ]
 
 
-def of_another_city(localizer: Localizer, dataset: Dataset, report: Report) -> list[Asked]:
-    """Every query set of a city that the map does not show."""
+def of_another_city(localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = ()) -> list[Asked]:
+    """Query sets of a city that the map does not show; all of them, where none are named."""
     return [
         asked_of(predict(localizer, dataset, name, report=report), f"other_city.{preset_of(name)}", known=False)
-        for name in dataset.query_sets(with_truth=True)
+        for name in names or dataset.query_sets(with_truth=True)
     ]
 
 

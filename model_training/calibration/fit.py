@@ -102,23 +102,25 @@ def _logistic(
 
 
 def _thresholds(asked: Asked, right: Logistic) -> tuple[Threshold, ...]:
-    """The confidence that lets through no more than a rate of the queries outside the map, of the worst kind of them."""
-    outside = ~asked.known
+    """For each rate the confidence that no more than this share of the queries outside the map reach, every kind weighing alike.
+
+    What is true of a user's robot is one camera and one map; which kind is the worst differs between cities by more than between
+    kinds, so the worst kind's threshold would only be the highest of four noisy ones (decision log).
+    """
     confidence = np.zeros(len(asked))
     has = np.isfinite(asked.evidence).all(axis=1)
     confidence[has] = probability(right.log_odds(asked.evidence[has]))
+    outside = ~asked.known
+    kinds, number, counts = np.unique(asked.kind[outside], return_inverse=True, return_counts=True)
+    weight = 1.0 / (len(kinds) * counts[number])
+    order = np.argsort(-confidence[outside], kind="stable")
+    ranked, passed = confidence[outside][order], np.cumsum(weight[order])
     found = []
     for rate in RATES:
-        levels = [_level(confidence[outside & (asked.kind == kind)], rate) for kind in np.unique(asked.kind[outside])]
-        found.append(Threshold(false_accept_rate=rate, confidence=max(levels)))
+        first_refused = min(int(np.searchsorted(passed, rate * (1 + 1e-9), side="right")), len(ranked) - 1)
+        level = float(min(1.0, np.nextafter(ranked[first_refused], 2.0)))
+        found.append(Threshold(false_accept_rate=rate, confidence=level))
     return tuple(found)
-
-
-def _level(confidence: NDArray[np.float64], rate: float) -> float:
-    """The lowest confidence that at most ``rate`` of these reach."""
-    ranked = np.sort(confidence)[::-1]
-    allowed = int(rate * len(ranked))
-    return float(min(1.0, np.nextafter(ranked[allowed], 2.0)))
 
 
 def expected_calibration_error(confidence: NDArray[np.float64], right: NDArray[np.bool_], *, bins: int = 15) -> float:

@@ -18,7 +18,9 @@ from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration
 from service.maps.reader import MapBundle
 
-MISSING_SETS = ("clear_precise", "clear_stereo")
+CLEAR_SETS = ("clear_precise", "clear_stereo")
+#: Distance of a map's places; and of a sparse survey's, whose queries look less alike, and must not be taken for strangers.
+PLACES_M, SPARSE_M = 1.0, 5.0
 Report = Callable[[str, int, int], None]
 
 
@@ -54,16 +56,24 @@ def calibrate(
     return fit(pooled(parts), measured_on=measured_on), cross_checks(parts)
 
 
-def _localizer(work: Path, encoder: Path, dataset: Dataset, name: str, report: Report) -> Localizer:
+def _localizer(
+    work: Path, encoder: Path, dataset: Dataset, name: str, report: Report, *, spacing_m: float = PLACES_M
+) -> Localizer:
     folder = work / "maps" / f"{name}-{Encoder.open(encoder).sha256[:12]}"
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
-        build_map(dataset, encoder, folder, BuildSettings(name=name, calibration=None), report=report)
+        build_map(
+            dataset, encoder, folder, BuildSettings(name=name, calibration=None, spacing_m=spacing_m), report=report
+        )
     return Localizer.open(MapBundle.open(folder))
 
 
+def _sparse(work: Path, encoder: Path, dataset: Dataset, report: Report) -> Localizer:
+    return _localizer(work, encoder, dataset, f"{dataset.name}-sparse", report, spacing_m=SPARSE_M)
+
+
 def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew: bool, report: Report) -> Asked:
-    """All queries of one city: of its map, of the next city's map, of its map with a third of the streets left out."""
+    """All queries of one city: of its map, of the next city's, of sparse ones of both, of its map with a third of the streets left out."""
     kept = work / f"asked-{cities[index].name}-{Encoder.open(encoder).sha256[:12]}.npz"
     if kept.exists() and not anew:
         with np.load(kept) as arrays:
@@ -72,8 +82,10 @@ def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew
     partial = WithoutStreets(own.folder)
     found = in_the_map(_localizer(work, encoder, own, own.name, report), own, report)
     found += of_another_city(_localizer(work, encoder, other, other.name, report), own, report)
+    found += in_the_map(_sparse(work, encoder, own, report), own, report, CLEAR_SETS)
+    found += of_another_city(_sparse(work, encoder, other, report), own, report, CLEAR_SETS)
     without = _localizer(work, encoder, partial, f"{own.name}-without-streets", report)
-    found += where_streets_are_missing(without, own, list(MISSING_SETS), partial.is_outside, report)
+    found += where_streets_are_missing(without, own, list(CLEAR_SETS), partial.is_outside, report)
     asked = pooled(found)
     np.savez_compressed(kept, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
     return asked

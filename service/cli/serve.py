@@ -1,7 +1,10 @@
 """``streetfix serve``: open the maps, listen, answer until told to stop."""
 
+import math
 import signal
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +13,9 @@ import typer
 from service.errors import AddressError, BundleError
 
 if TYPE_CHECKING:
+    from service.cli.certificates import Certificates
+    from service.runtime.engine import Engine
+    from service.runtime.keys import KeyRing
     from service.runtime.map_registry import MapRegistry
     from service.runtime.settings import Settings
 
@@ -23,18 +29,21 @@ def command(
     ] = None,
     host: Annotated[str | None, typer.Option(help="Address to listen on.  [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(help="0 lets the system choose.  [default: 8000]")] = None,
+    grpc_port: Annotated[
+        int | None, typer.Option(help="Serve gRPC too, on this port.  [default: no gRPC]", show_default=False)
+    ] = None,
     threads: Annotated[int | None, typer.Option(help="Requests worked on at once.  [default: the cores]")] = None,
     queue: Annotated[int | None, typer.Option(help="Requests that may wait before 503.  [default: 64]")] = None,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.01]"),
+        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
     ] = None,
 ) -> None:
-    """Serve maps over HTTP; loopback only, unless told otherwise.
+    """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
 
     Every option can be set as STREETFIX_HOST, STREETFIX_PORT and so on, the maps as STREETFIX_MAPS (':' between).
 
-    Example: streetfix serve maps/paper-city --port 8000
+    Example: streetfix serve maps/paper-city --port 8000 --grpc-port 50051
     """
     from service.runtime.threads import limit_pools_before_import
 
@@ -43,7 +52,8 @@ def command(
 
     serve(
         load_settings(
-            maps=tuple(maps) if maps else None, host=host, port=port, threads=threads, queue=queue, false_accept_rate=false_accept_rate
+            maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
+            false_accept_rate=false_accept_rate,
         )
     )  # fmt: skip
 
@@ -59,25 +69,51 @@ def serve(settings: "Settings") -> None:
 
     import uvicorn
 
+    from service.cli.certificates import Certificates
     from service.http.app import create_app
     from service.runtime.engine import Engine
+    from service.runtime.keys import KeyRing
 
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    keys = None if settings.api_keys is None else KeyRing.open(settings.api_keys)
+    tls = None if settings.tls_certificate is None else Certificates.read(settings)
     engine = Engine.open(settings)
     try:
         with _listen(settings.host, settings.port) as listener:
-            config = uvicorn.Config(create_app(engine), log_config=None, access_log=False, lifespan="off")
+            config = uvicorn.Config(
+                create_app(engine, keys), log_config=None, access_log=False, lifespan="off",
+                timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
+            )  # fmt: skip
             server = uvicorn.Server(config)
             # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, server.handle_exit)
-            _say_where(engine.registry, listener)
-            server.run(sockets=[listener])
+            with _grpc(engine, keys, tls) as grpc_port:
+                _say_where(engine.registry, listener, grpc_port, "http" if tls is None else "https")
+                server.run(sockets=[listener])
     finally:
         engine.close()
     typer.echo("stopped")
+
+
+@contextmanager
+def _grpc(engine: "Engine", keys: "KeyRing | None", tls: "Certificates | None") -> Iterator[int | None]:
+    """Serve gRPC inside, where the settings want it; its port."""
+    settings = engine.settings
+    if settings.grpc_port is None:
+        yield None
+        return
+    from service.grpc.server import GrpcServer
+
+    credentials = None if tls is None else tls.for_grpc()
+    server = GrpcServer(engine, host=settings.host, port=settings.grpc_port, keys=keys, credentials=credentials)
+    server.start()
+    try:
+        yield server.port
+    finally:
+        server.stop(grace_s=settings.grace_s)
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -90,7 +126,7 @@ def _listen(host: str, port: int) -> socket.socket:
         ) from error
 
 
-def _say_where(registry: "MapRegistry", listener: socket.socket) -> None:
+def _say_where(registry: "MapRegistry", listener: socket.socket, grpc_port: int | None, scheme: str) -> None:
     host, port = listener.getsockname()[:2]
     for localizer in registry:
         manifest = localizer.bundle.manifest
@@ -98,4 +134,6 @@ def _say_where(registry: "MapRegistry", listener: socket.socket) -> None:
             f"map {manifest.name} {manifest.version}: {manifest.counts.places} places, {manifest.counts.views} views"
         )
     shown = f"[{host}]" if ":" in host else host
-    typer.echo(f"serving at http://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")
+    if grpc_port is not None:
+        typer.echo(f"serving gRPC at {shown}:{grpc_port} (what it can do: proto/, or by reflection)")
+    typer.echo(f"serving at {scheme}://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")

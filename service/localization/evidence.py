@@ -15,6 +15,7 @@ RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
 #: Another place, for the margin of similarity; votes within VOTE_M of the answer count for it.
 OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
 _MOST_MARGIN = 12.0  # nats; where there is no rival at all, too
+_MOST_PLACE_M = 10.0
 
 
 def evidence_of(
@@ -60,6 +61,7 @@ def evidence_of(
         "log_noise": float(np.log(np.median([frame.noise for frame in frames]))),
         "points": refined.points / 3000.0 / len(frames),
         "measured": reference.views.measured_share,
+        "place_m": min(best.place_m, _MOST_PLACE_M),
     }
     return np.array([found[name] for name in FEATURES])
 

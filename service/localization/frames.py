@@ -23,6 +23,9 @@ class Frame:
         descriptors: of the views, a row a turn.
         matches: the most similar views of the map, the best first.
         noise: standard deviation of one pixel's inverse depth, 1/m.
+        fuse_s: seconds that its views took;
+        encode_s: their descriptors;
+        search_s: and their neighbours.
     """
 
     query: Query
@@ -31,6 +34,9 @@ class Frame:
     descriptors: Float32[NDArray[np.float32], "T D"]
     matches: ViewMatches
     noise: float
+    fuse_s: float = 0.0
+    encode_s: float = 0.0
+    search_s: float = 0.0
 
     @property
     def focal_px(self) -> float:

@@ -1,5 +1,6 @@
 """One query against one map: fuse, encode, search, cluster and vote as the paper does; then register on the cloud."""
 
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -83,16 +84,41 @@ class Localizer:
         Raises:
             NoDepthError: a depth picture holds no measurement within the view grid.
         """
+        pairs = zip(queries, T_reference_camera, strict=True)
+        return self.answer(tuple(replace(self.look_up(query), T_reference_camera=T) for query, T in pairs))
+
+    def look_up(self, query: Query) -> Frame:
+        """What one picture pair says before the cloud is asked, as the reference of an answer.
+
+        Raises:
+            NoDepthError: the depth picture holds no measurement within the view grid.
+        """
         started = perf_counter()
-        query = queries[0]
-        fused, encoded, looked_up = 0.0, 0.0, []
-        wanted = max(query.neighbours, query.ranked, RANKED)
-        for each, T in zip(queries, T_reference_camera, strict=True):
-            frame, fuse_s, encode_s = self._look_up(each, T, wanted)
-            looked_up.append(frame)
-            fused, encoded = fused + fuse_s, encoded + encode_s
-        frames = tuple(looked_up)
-        matches = frames[0].matches
+        views = query_views(
+            query.rgb, query.depth_m, query.camera, turns_rad=self.turns_rad,
+            grid=self.bundle.grid, rows_seen=self.bundle.rows_seen, down_camera=query.down_camera,
+        )  # fmt: skip
+        fused = perf_counter()
+        descriptors = self.encoder.encode(views.planes, side="query")
+        encoded = perf_counter()
+        matches = search_views(
+            self.bundle, descriptors, turns_rad=views.turns_rad, places=_places_of(query), fewest=self.clusters.views
+        )
+        noise = inverse_depth_noise(query.depth_m)
+        return Frame(
+            query, np.eye(4), views, descriptors, matches, noise,
+            fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,
+        )  # fmt: skip
+
+    def answer(self, frames: tuple[Frame, ...]) -> Answer:
+        """Answer frames that were looked up.
+
+        Args:
+            frames: the reference first, as in ``localize_frames``.
+        """
+        started = perf_counter()
+        query, matches = frames[0].query, frames[0].matches
+        wanted = _places_of(query)
         neighbours = distinct_places(matches, wanted)
         hypotheses = cluster(matches, self.clusters)
         streets = (
@@ -112,6 +138,9 @@ class Localizer:
         if registers and self.bundle.calibration is not None:
             decision = decide(self.bundle.calibration, evidence, query.false_accept_rate)
         done = perf_counter()
+        fused, encoded, searched = (
+            sum(getattr(frame, name) for frame in frames) for name in ("fuse_s", "encode_s", "search_s")
+        )
         T_map_camera = self._pose_of(hypotheses[0], frames[0].views) if refined is None else refined.best.T_map_camera
         return Answer(
             status="LOCALIZED" if decision is None else decision.status,
@@ -130,28 +159,11 @@ class Localizer:
             timings=Timings(
                 fuse_ms=1e3 * fused,
                 encode_ms=1e3 * encoded,
-                search_ms=1e3 * (found - started - fused - encoded),
+                search_ms=1e3 * (searched + found - started),
                 register_ms=0.0 if refined is None else 1e3 * (done - found),
-                total_ms=1e3 * (done - started),
+                total_ms=1e3 * (done - started + fused + encoded + searched),
             ),
         )
-
-    def _look_up(self, query: Query, T_reference_camera: Transform, places: int) -> tuple[Frame, float, float]:
-        """A frame with its most similar views, and the seconds that fusing and encoding took."""
-        started = perf_counter()
-        views = query_views(
-            query.rgb, query.depth_m, query.camera, turns_rad=self.turns_rad,
-            grid=self.bundle.grid, rows_seen=self.bundle.rows_seen, down_camera=query.down_camera,
-        )  # fmt: skip
-        fused = perf_counter()
-        descriptors = self.encoder.encode(views.planes, side="query")
-        encoded = perf_counter()
-        matches = search_views(
-            self.bundle, descriptors, turns_rad=views.turns_rad, places=places, fewest=self.clusters.views
-        )
-        noise = inverse_depth_noise(query.depth_m)
-        frame = Frame(query, T_reference_camera, views, descriptors, matches, noise)
-        return frame, fused - started, encoded - fused
 
     def _street_of(self, T_map_camera: Transform, voted: StreetVote | None, *, registered: bool) -> int:
         """A metric position says which street it lies in; a cluster of places does not know better than their vote."""
@@ -164,3 +176,7 @@ class Localizer:
         above_lidar_m = view.height_m - self.bundle.manifest.lidar_height_m
         position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])
         return transform_from(hypothesis.R_map_level @ view.R_level_camera, position_m)
+
+
+def _places_of(query: Query) -> int:
+    return max(query.neighbours, query.ranked, RANKED)

@@ -16,7 +16,8 @@ from service.registration.covariance import covariance_of
 from service.registration.kernel import QueryPoints
 from service.registration.points import PointSettings, points_of
 from service.registration.register import Registered, RegistrationSettings, register
-from service.registration.rendered import Agreement, agreement
+from service.registration.rendered import Agreement, Seen, agreement, seen_by
+from service.registration.scatter import scatter_of
 from service.registration.surfel_map import SurfelMap
 
 
@@ -70,6 +71,7 @@ class Candidate:
         T_map_camera: of the reference camera.
         registered: as the solver left it.
         similarity: to the places around the pose, mean over the frames.
+        place_m: how far those places are, mean over the frames.
         agreement: with the map as drawn at the pose, mean over the frames.
         support: logarithm, against the other candidates.
     """
@@ -77,6 +79,7 @@ class Candidate:
     T_map_camera: Transform
     registered: Registered
     similarity: float
+    place_m: float
     agreement: Agreement
     support: float
 
@@ -112,14 +115,19 @@ def refine(
         settings = settings_for_rig(settings, reference.focal_px * reference.query.baseline_m)
     each = [_points(frame, settings) for frame in frames]
     merged = each[0] if len(each) == 1 else _merged(frames, each)
+    seen = [
+        seen_by(points, frame.query.camera, frame.R_level_camera) for frame, points in zip(frames, each, strict=True)
+    ]
     if len(merged) < settings.fewest_points:
         return None
     starts = starts_from(frames, prior, lidar_height_m=bundle.manifest.lidar_height_m, settings=settings.starts)
     found = register(cloud, merged, starts, reference.views.height_m, settings.registration)
-    candidates = [_candidate(bundle, cloud, frames, each, pose, prior, settings.support) for pose in found]
+    candidates = [_candidate(bundle, cloud, frames, seen, pose, prior, settings.support) for pose in found]
     noise = float(np.median([frame.noise for frame in frames]))
     candidates.sort(key=lambda candidate: -candidate.support)
-    return Refined(tuple(candidates), covariance_of(candidates[0].registered.information, noise), len(merged))
+    best = candidates[0].registered
+    scatter = scatter_of(cloud, merged, best, settings.registration)
+    return Refined(tuple(candidates), covariance_of(best.information, scatter, noise), len(merged))
 
 
 def _points(frame: Frame, settings: RefineSettings) -> QueryPoints:
@@ -147,24 +155,26 @@ def _merged(frames: tuple[Frame, ...], each: list[QueryPoints]) -> QueryPoints:
 
 
 def _candidate(
-    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], each: list[QueryPoints], pose: Registered,
+    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], seen: list[Seen], pose: Registered,
     prior: Prior | None, weights: SupportWeights,
 ) -> Candidate:  # fmt: skip
-    similarities, agreements = [], []
-    for frame, points in zip(frames, each, strict=True):
+    similarities, places_m, agreements = [], [], []
+    for frame, points in zip(frames, seen, strict=True):
         own = pose if frame is frames[0] else _seen_from(frame, frames[0], pose)
-        similarities.append(
-            similarity_at(bundle, frame.descriptors, R_map_level=own.R_map_level, camera_m=own.camera_m)
+        similarity, place_m = similarity_at(
+            bundle, frame.descriptors, R_map_level=own.R_map_level, camera_m=own.camera_m
         )
+        similarities.append(similarity)
+        places_m.append(place_m)
         if len(points):
-            agreements.append(agreement(cloud, points, frame.query.camera, frame.R_level_camera, own))
+            agreements.append(agreement(cloud, points, own))
     similarity, agreed = float(np.mean(similarities)), Agreement.mean(agreements)
     support = weights.inliers * pose.inliers + weights.similarity * similarity + weights.likelihood * agreed.likelihood
     if prior is not None:
         heading = np.arctan2(pose.R_map_level[1, 0], pose.R_map_level[0, 0])
         support += float(prior.log_weight(pose.camera_m[None, :2], np.array([heading]))[0])
     T_map_camera = transform_from(pose.R_map_level @ frames[0].R_level_camera, pose.camera_m)
-    return Candidate(T_map_camera, pose, similarity, agreed, support)
+    return Candidate(T_map_camera, pose, similarity, float(np.mean(places_m)), agreed, support)
 
 
 def _seen_from(frame: Frame, reference: Frame, pose: Registered) -> Registered:

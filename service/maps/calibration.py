@@ -13,7 +13,7 @@ from service.errors import BundleError
 #: What an answer's confidence rests on, in this order (``service.localization.evidence``).
 FEATURES = (
     "margin", "inliers", "similarity", "similarity_margin", "likelihood", "through", "front", "unmapped", "log_sigma", "scale", "votes",
-    "entropy", "log_noise", "points", "measured",
+    "entropy", "log_noise", "points", "measured", "place_m",
 )  # fmt: skip
 #: The features that say what rivals there are; whether the place is in the map at all does not depend on them.
 RIVALRY = ("margin", "similarity_margin", "votes", "entropy")

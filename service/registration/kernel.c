@@ -172,38 +172,50 @@ static void add_priors(const Options *o, const State *s, double n, double H[UNKN
         }
 }
 
+/* What one point tells: its residual's gradient, the residual r itself, its weight; 0 where no surface is within reach. */
+static inline int term(const Query *q, const Options *o, const State *s, double robust, int64_t i, const double y[3],
+                       const double at[3], double stretch, double e_scale, const Surfel *m, double gr[UNKNOWNS], double *r_out,
+                       double *w_out)
+{
+    if (!m) return 0;
+    double dx = at[0] - m->x, dy = at[1] - m->y, dz = at[2] - m->z;
+    if (dx * dx + dy * dy + dz * dz > o->reach * o->reach) return 0;
+    double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
+    for (int k = 0; k < 3; k++)
+        c += (&m->nx)[k] * (s->R[3 * k] * q->ray[3 * i] + s->R[3 * k + 1] * q->ray[3 * i + 1] + s->R[3 * k + 2] * q->ray[3 * i + 2]);
+    gr[0] = m->nx, gr[1] = m->ny, gr[2] = m->nz;
+    gr[3] = y[1] * m->nz - y[2] * m->ny;
+    gr[4] = y[2] * m->nx - y[0] * m->nz;
+    gr[5] = y[0] * m->ny - y[1] * m->nx;
+    gr[6] = y[0] * m->nx + y[1] * m->ny + y[2] * m->nz;
+    gr[7] = -gr[6] * q->q[i] * stretch / e_scale;
+    /* A triangulating camera errs evenly in 1 / range. Its noise must be told from the range where the ray meets the surface:
+     * by the measured one, what is seen too near counts as well measured and pulls everything its way. */
+    double ratio = gr[6] != 0 ? 1 - r / gr[6] : 1;
+    ratio = ratio < 0.5 ? 0.5 : ratio > 2 ? 2 : ratio;
+    double along = q->sigma[i] * c;
+    double variance = along * along * ratio * ratio * ratio + o->surface * o->surface + (double)m->thickness * m->thickness;
+    double k2 = 4 * variance + robust * robust, damp = k2 / (k2 + r * r);
+    *r_out = r;
+    *w_out = q->weight[i] * damp * damp / variance;
+    return 1;
+}
+
 static void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, State *s)
 {
-    double reach2 = o->reach * o->reach, known = 0;
+    double known = 0;
     for (int64_t i = 0; i < q->count; i++) known += q->weight[i];
     for (int64_t it = 0; it < o->iterations; it++) {
         double share = o->iterations > 1 ? (double)it / (double)(o->iterations - 1) : 1.0;
         double robust = o->robust_first * pow(o->robust_last / o->robust_first, share);
-        double H[UNKNOWNS][UNKNOWNS] = {{0}}, b[UNKNOWNS] = {0}, gr[UNKNOWNS], e_scale = exp(s->log_scale);
+        double H[UNKNOWNS][UNKNOWNS] = {{0}}, b[UNKNOWNS] = {0}, gr[UNKNOWNS], r, w, e_scale = exp(s->log_scale);
         double total = 0, batch_y[AHEAD][3], batch_w[AHEAD][3], batch_stretch[AHEAD];
         const Surfel *batch_found[AHEAD];
         for (int64_t i = 0; i < q->count; i++) {
             int64_t in = i % AHEAD, left = q->count - i;
             if (in == 0)
                 look_up(g, surfels, q, s, e_scale, i, left < AHEAD ? left : AHEAD, batch_y, batch_w, batch_stretch, batch_found);
-            const double *y = batch_y[in], stretch = batch_stretch[in];
-            const Surfel *m = batch_found[in];
-            if (!m) continue;
-            double dx = batch_w[in][0] - m->x, dy = batch_w[in][1] - m->y, dz = batch_w[in][2] - m->z;
-            if (dx * dx + dy * dy + dz * dz > reach2) continue;
-            double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
-            for (int k = 0; k < 3; k++)
-                c += (&m->nx)[k] * (s->R[3 * k] * q->ray[3 * i] + s->R[3 * k + 1] * q->ray[3 * i + 1] + s->R[3 * k + 2] * q->ray[3 * i + 2]);
-            double along = q->sigma[i] * c;
-            double variance = along * along + o->surface * o->surface + (double)m->thickness * m->thickness;
-            double k2 = 4 * variance + robust * robust, damp = k2 / (k2 + r * r);
-            double w = q->weight[i] * damp * damp / variance;
-            gr[0] = m->nx, gr[1] = m->ny, gr[2] = m->nz;
-            gr[3] = y[1] * m->nz - y[2] * m->ny;
-            gr[4] = y[2] * m->nx - y[0] * m->nz;
-            gr[5] = y[0] * m->ny - y[1] * m->nx;
-            gr[6] = y[0] * m->nx + y[1] * m->ny + y[2] * m->nz;
-            gr[7] = -gr[6] * q->q[i] * stretch / e_scale;
+            if (!term(q, o, s, robust, i, batch_y[in], batch_w[in], batch_stretch[in], e_scale, batch_found[in], gr, &r, &w)) continue;
             for (int a = 0; a < UNKNOWNS; a++) {
                 double wa = w * gr[a];
                 b[a] -= wa * r;
@@ -259,6 +271,21 @@ void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const
     for (int64_t k = 0; k < count; k++) {
         if (o->iterations > 0) align_one(g, surfels, q, o, states + k);
         score_one(g, surfels, q, tolerance, height_min, states + k);
+    }
+}
+
+/* The pull (weight times residual times gradient) of each patch of the picture at a pose, summed: (patches, 8), zero at first. */
+void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch, double *pulls)
+{
+    double e_scale = exp(s->log_scale), gr[UNKNOWNS], r, w;
+    double batch_y[AHEAD][3], batch_w[AHEAD][3], batch_stretch[AHEAD];
+    const Surfel *batch_found[AHEAD];
+    for (int64_t i = 0; i < q->count; i++) {
+        int64_t in = i % AHEAD, left = q->count - i;
+        if (in == 0)
+            look_up(g, surfels, q, s, e_scale, i, left < AHEAD ? left : AHEAD, batch_y, batch_w, batch_stretch, batch_found);
+        if (!term(q, o, s, o->robust_last, i, batch_y[in], batch_w[in], batch_stretch[in], e_scale, batch_found[in], gr, &r, &w)) continue;
+        for (int a = 0; a < UNKNOWNS; a++) pulls[UNKNOWNS * patch[i] + a] += w * r * gr[a];
     }
 }
 

@@ -70,13 +70,16 @@ def _library() -> ctypes.CDLL:
     library.streetfix_align.argtypes = [
         POINTER(_Grid), c_void_p, POINTER(_Query), POINTER(_Options), c_double, c_double, c_int64, c_void_p,
     ]  # fmt: skip
+    library.streetfix_pulls.argtypes = [
+        POINTER(_Grid), c_void_p, POINTER(_Query), POINTER(_Options), c_void_p, c_void_p, c_void_p,
+    ]  # fmt: skip
     library.streetfix_mark.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p]
     library.streetfix_fill.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p, c_void_p]
     library.streetfix_render.argtypes = [
         c_void_p, c_void_p, c_int64, c_double, c_void_p, c_void_p, c_double, c_double, c_double, c_double, c_int64, c_int64,
         c_double, c_double, c_void_p,
     ]  # fmt: skip
-    for name in ("streetfix_align", "streetfix_mark", "streetfix_fill", "streetfix_render"):
+    for name in ("streetfix_align", "streetfix_pulls", "streetfix_mark", "streetfix_fill", "streetfix_render"):
         getattr(library, name).restype = None
     return library
 
@@ -136,12 +139,37 @@ def align(
     tolerance_m: float = 0.1, height_min_m: float = -1e9,
 ) -> None:  # fmt: skip
     """Move every start (``STATE``, in place) onto the map and score it; ``iterations`` 0 scores alone."""
-    names = [field[0] for field in _Options._fields_]
-    given = _Options(**{name: getattr(options, name) for name in names})
-    points = _Query(len(query), *(getattr(query, name).ctypes.data for name in ("xyz", "ray", "sigma", "weight", "q")))
+    points, given = _as_c(query, options)
     _library().streetfix_align(
         byref(grid._as_c()), surfels.ctypes.data, byref(points), byref(given), tolerance_m, height_min_m, len(states), states.ctypes.data
     )  # fmt: skip
+
+
+def pulls(
+    grid: NearestGrid, surfels: NDArray[Any], query: QueryPoints, state: NDArray[Any], options: SolverOptions,
+    patch: Int32[NDArray[np.int32], " n"],
+) -> Float64[NDArray[np.float64], "B 8"]:  # fmt: skip
+    """Which way each patch of a picture would move a pose: gradients of its points, each by its residual and weight, summed.
+
+    Args:
+        grid: of the map.
+        surfels: of the map.
+        query: its points.
+        state: one ``STATE``.
+        options: as in the last iteration.
+        patch: of each point, from 0 without gaps.
+    """
+    found = np.zeros((int(patch.max(initial=-1)) + 1, UNKNOWNS))
+    points, given = _as_c(query, options)
+    _library().streetfix_pulls(
+        byref(grid._as_c()), surfels.ctypes.data, byref(points), byref(given), state.ctypes.data, patch.ctypes.data, found.ctypes.data
+    )  # fmt: skip
+    return found
+
+
+def _as_c(query: QueryPoints, options: SolverOptions) -> tuple[_Query, _Options]:
+    given = _Options(**{field[0]: getattr(options, field[0]) for field in _Options._fields_})
+    return _Query(len(query), *(getattr(query, name).ctypes.data for name in QueryPoints.__slots__)), given
 
 
 def nearest_grid(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> NearestGrid:

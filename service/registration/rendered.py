@@ -49,47 +49,80 @@ class Agreement:
         return Agreement(*(float(np.mean([getattr(each, name) for each in of])) for name in Agreement.__slots__))
 
 
-def agreement(
-    cloud: SurfelMap, points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation, candidate: Registered
-) -> Agreement:
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Points of a query as pixels of the small picture that the map is drawn on; the same for every pose.
+
+    Attributes:
+        camera: of the small picture.
+        R_level_camera: of the query's level.
+        row: of each point.
+        column: of each point.
+        z: depth of each, metres, as measured.
+        sigma: its standard deviation, metres.
+        q: as in ``QueryPoints``.
+    """
+
+    camera: PinholeCamera
+    R_level_camera: Rotation
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+    z: Float64[NDArray[np.float64], " n"]
+    sigma: Float64[NDArray[np.float64], " n"]
+    q: Float32[NDArray[np.float32], " n"]
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+def seen_by(points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation) -> Seen:
+    """Prepare a query for ``agreement``.
+
+    Args:
+        points: of the query, its level frame.
+        camera: of the query.
+        R_level_camera: of the query's level.
+    """
+    small = camera.scaled_to(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
+    optical: Float64[NDArray[np.float64], "n 3"] = points.xyz @ R_level_camera
+    z = optical[:, 2]
+    column = np.rint(optical[:, 0] / z * small.fx + small.cx).astype(np.intp).clip(0, small.width - 1)
+    row = np.rint(optical[:, 1] / z * small.fy + small.cy).astype(np.intp).clip(0, small.height - 1)
+    return Seen(small, R_level_camera, row, column, z, points.sigma * (points.ray @ R_level_camera[:, 2]), points.q)
+
+
+def agreement(cloud: SurfelMap, seen: Seen, candidate: Registered) -> Agreement:
     """Draw the map at a candidate's pose and compare.
 
     Args:
         cloud: the map's.
-        points: of the query, its level frame.
-        camera: of the query.
-        R_level_camera: of the query's level.
+        seen: the query.
         candidate: the pose.
     """
-    small = camera.scaled_to(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
-    T = transform_from(candidate.R_map_level @ R_level_camera, candidate.camera_m - cloud.origin_m)
+    T = transform_from(candidate.R_map_level @ seen.R_level_camera, candidate.camera_m - cloud.origin_m)
     drawn = render(
-        cloud.surfels, cloud.tiles, tile_m=TILE_M, T_map_camera=T, camera=small, size_m=SURFEL_M, reach_m=REACH_M
+        cloud.surfels, cloud.tiles, tile_m=TILE_M, T_map_camera=T, camera=seen.camera, size_m=SURFEL_M, reach_m=REACH_M
     )
-    optical: Float64[NDArray[np.float64], "n 3"] = points.xyz @ R_level_camera
-    z = optical[:, 2] * candidate.scale / (1.0 + candidate.offset * points.q)
-    sigma = points.sigma * (points.ray @ R_level_camera[:, 2])
-    nearest, mapped, furthest = _seen_at(drawn, optical, small)
+    z = seen.z * candidate.scale / (1.0 + candidate.offset * seen.q)
+    nearest, mapped, furthest = (each[seen.row, seen.column] for each in _around(drawn))
     unmapped = nearest >= _NOTHING_M
-    spread = np.hypot(sigma, _ROUGH_M)
+    spread = np.hypot(seen.sigma, _ROUGH_M)
     hit = np.exp(-0.5 * ((z - mapped) / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
     density = _HIT * hit + _NEW * (z < mapped) / np.maximum(mapped, 2.0) + (_GONE * (z > mapped) + _ANY) / _SPAN_M
-    off = _CERTAIN * sigma + _MARGIN_M
+    off = _CERTAIN * seen.sigma + _MARGIN_M
     return Agreement(
         likelihood=float(np.log(density).mean()), through=float((~unmapped & (z > furthest + off)).mean()),
         front=float((~unmapped & (z < nearest - off)).mean()), unmapped=float(unmapped.mean()),
     )  # fmt: skip
 
 
-def _seen_at(
-    drawn: Float32[NDArray[np.float32], "h w"], optical: Float64[NDArray[np.float64], "n 3"], camera: PinholeCamera
+def _around(
+    drawn: Float32[NDArray[np.float32], "h w"],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """At each point's pixel: the depth drawn, and the least and the greatest of it and its eight neighbours'."""
+    """At each pixel: the least depth of it and its eight neighbours, its own, the greatest."""
     depth = np.pad(np.where(drawn > 0, drawn, np.float32(_NOTHING_M)), 1, mode="edge")
-    u = np.rint(optical[:, 0] / optical[:, 2] * camera.fx + camera.cx).astype(np.intp).clip(0, camera.width - 1)
-    v = np.rint(optical[:, 1] / optical[:, 2] * camera.fy + camera.cy).astype(np.intp).clip(0, camera.height - 1)
     across = np.stack([depth[:, :-2], depth[:, 1:-1], depth[:, 2:]])
     low, high = across.min(axis=0), across.max(axis=0)
     low = np.minimum(np.minimum(low[:-2], low[1:-1]), low[2:])
     high = np.maximum(np.maximum(high[:-2], high[1:-1]), high[2:])
-    return low[v, u], depth[1:-1, 1:-1][v, u], high[v, u]
+    return low, depth[1:-1, 1:-1], high

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from model_training.calibration.collect import asked_of, preset_of
+from model_training.calibration import collect
+from model_training.calibration.collect import asked_of, in_the_map, of_another_city, preset_of
 from model_training.evaluation.predict import RANKED, Predictions
 from service.maps.calibration import FEATURES
 
@@ -39,3 +40,48 @@ def test_outside_the_map_no_answer_is_right():
 )
 def test_the_preset_is_the_last_part_of_a_sets_name(name, preset):
     assert preset_of(name) == preset
+
+
+class City:
+    """Query sets by name; one without truth cannot be asked."""
+
+    def query_sets(self, *, with_truth=False):
+        return ["clear_precise", "clear_stereo", "rain_precise"] + ["untold_stereo"] * (not with_truth)
+
+
+@pytest.fixture
+def predicted(monkeypatch):
+    """What was asked of whom, in order; each set is answered by as many right answers as its name has letters."""
+    asked = []
+
+    def predict(localizer, dataset, name, *, report):
+        asked.append((localizer, dataset, name, report))
+        return predictions([0.0] * len(name))
+
+    monkeypatch.setattr(collect, "predict", predict)
+    return asked
+
+
+@pytest.mark.parametrize("ask", [in_the_map, of_another_city])
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ((), ["clear_precise", "clear_stereo", "rain_precise"]),
+        (("clear_stereo",), ["clear_stereo"]),
+        (["rain_precise", "clear_precise"], ["rain_precise", "clear_precise"]),
+    ],
+)
+def test_query_sets_are_asked_as_they_are_named_or_else_all_that_have_truth(predicted, ask, names, expected):
+    city, report = City(), print
+    found = ask("localizer", city, report, names) if names else ask("localizer", city, report)
+    assert predicted == [("localizer", city, name, report) for name in expected]
+    assert [len(each) for each in found] == [len(name) for name in expected]
+
+
+def test_sets_of_the_maps_own_city_keep_their_names_and_those_of_another_only_their_preset(predicted):
+    names = ("clear_precise", "rain_stereo")
+    own, other = in_the_map("localizer", City(), print, names), of_another_city("localizer", City(), print, names)
+    assert [set(each.kind.tolist()) for each in own] == [{"clear_precise"}, {"rain_stereo"}]
+    assert [set(each.kind.tolist()) for each in other] == [{"other_city.precise"}, {"other_city.stereo"}]
+    assert all(each.known.all() and each.right.all() for each in own)
+    assert not any(each.known.any() or each.right.any() for each in other)

@@ -3,9 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model_training.calibration.fit import RATES, Asked, expected_calibration_error, fit, pooled
+from model_training.calibration import fit as fitting
+from model_training.calibration.fit import RATES, Asked, _thresholds, expected_calibration_error, fit, pooled
 from service.errors import DatasetError
-from service.maps.calibration import FEATURES, RIVALRY, probability, read_calibration
+from service.localization.query import FALSE_ACCEPT_RATE
+from service.maps.calibration import FEATURES, RIVALRY, Logistic, probability, read_calibration
 
 COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
 INLIERS, MARGIN = FEATURES.index("inliers"), FEATURES.index("margin")
@@ -145,32 +147,100 @@ def confidences(calibration, asked):
     return found
 
 
-def test_thresholds_let_no_more_through_than_their_rate_of_any_kind_outside_the_map(few):
+KINDS = ("other_city", "removed_streets")
+
+
+def share_through(confidence, asked, level):
+    """Of the queries outside the map, each kind weighing alike."""
+    return np.mean([np.mean(confidence[~asked.known & (asked.kind == kind)] > level) for kind in KINDS])
+
+
+def test_thresholds_let_no_more_through_than_their_rate_of_all_kinds_outside_the_map_alike(few):
     """Those without evidence count among the queries, and never get through."""
     calibration = fit(few, measured_on={})
     confidence = confidences(calibration, few)
     assert [each.false_accept_rate for each in calibration.thresholds] == list(RATES)
     for threshold in calibration.thresholds:
-        for kind in ("other_city", "removed_streets"):
-            assert np.mean(confidence[few.kind == kind] > threshold.confidence + 1e-12) <= threshold.false_accept_rate
+        assert share_through(confidence, few, threshold.confidence + 1e-12) <= threshold.false_accept_rate
 
 
-def test_thresholds_are_no_higher_than_the_worst_kind_needs(few):
-    """Just below its threshold, one query more of that kind gets through than the rate allows."""
+def test_thresholds_are_no_higher_than_all_kinds_together_need(few):
+    """Just below its threshold, one query more gets through than the rate allows; the worst kind may exceed it."""
     calibration = fit(few, measured_on={})
     confidence = confidences(calibration, few)
     for threshold in calibration.thresholds:
-        allowed = [
-            int(threshold.false_accept_rate * (few.kind == kind).sum()) for kind in ("other_city", "removed_streets")
-        ]
-        through = [
-            np.sum(confidence[few.kind == kind] > threshold.confidence - 1e-9)
-            for kind in ("other_city", "removed_streets")
-        ]
-        assert any(got > may for got, may in zip(through, allowed, strict=True))
+        assert share_through(confidence, few, threshold.confidence - 1e-9) > threshold.false_accept_rate
     levels = [threshold.confidence for threshold in calibration.thresholds]
     assert levels == sorted(levels, reverse=True)
     assert levels[0] > levels[-1]
+    worst = [np.mean(confidence[few.kind == kind] > levels[-1]) for kind in KINDS]
+    assert max(worst) > RATES[-1]
+
+
+#: Log odds are the first feature itself.
+BY_FIRST = Logistic(
+    mean=(0.0,) * COUNT, spread=(1.0,) * COUNT, weights=(1.0, *[0.0] * (3 * COUNT - 1)), bias=0.0,
+)  # fmt: skip
+
+
+def outside(odds, kind):
+    """Queries outside the map of such log odds; NaN for no evidence."""
+    evidence = np.zeros((len(odds), COUNT))
+    evidence[:, 0] = odds
+    return asked_of(evidence, np.zeros(len(odds)), np.zeros(len(odds)), kind)
+
+
+@pytest.mark.parametrize(
+    ("rate", "first_refused"),
+    [
+        (0.06, 3.0),  # not even the one of the eight
+        (0.0625, 2.5),
+        (0.3, 2.5),  # one of the two would be a quarter more
+        (0.3125, 2.0),  # exactly reached is not exceeded
+        (0.374, 2.0),
+        (0.375, 1.5),
+        (0.49, 1.0),
+    ],
+)
+def test_thresholds_by_hand(monkeypatch, rate, first_refused):
+    """Two of one kind weigh a quarter each, eight of another a sixteenth; the surest ones come first."""
+    monkeypatch.setattr(fitting, "RATES", (rate,))
+    odds = [2.5, -1.0, 3.0, 2.0, 1.5, 1.0, 0.5, 0.0, -0.5, np.nan]
+    kind = ["two"] * 2 + ["eight"] * 8
+    order = np.random.default_rng(4).permutation(10)
+    asked = pooled([outside(np.array(odds)[order], np.array(kind)[order]), known_and_surer()])
+    (found,) = _thresholds(asked, BY_FIRST)
+    assert found.false_accept_rate == rate
+    level = float(probability(np.array(first_refused)))
+    assert level < found.confidence <= level + 1e-12  # the refused one itself does not reach it
+
+
+def known_and_surer():
+    """Three queries in the map, surer than any outside; they have no say."""
+    evidence = np.full((3, COUNT), 3.9)
+    return asked_of(evidence, np.ones(3), np.ones(3), ["eight", "two", "clear"])
+
+
+def test_queries_that_are_equally_sure_are_refused_together(monkeypatch):
+    """Half of four may pass, but the second is as sure as the third."""
+    monkeypatch.setattr(fitting, "RATES", (0.5,))
+    (found,) = _thresholds(outside([2.0, 1.0, 1.0, 0.0], ["a"] * 4), BY_FIRST)
+    assert probability(np.array(1.0)) < found.confidence < probability(np.array(2.0))
+
+
+def test_no_threshold_is_above_one(monkeypatch):
+    """However sure the surest is: next to 1 no number is left above it."""
+    monkeypatch.setattr(fitting, "probability", lambda odds: np.ones_like(odds))
+    assert {each.confidence for each in _thresholds(outside([2.0, 1.0], ["a"] * 2), BY_FIRST)} == {1.0}
+
+
+@given(st.integers(0, 10**6), st.integers(2, 5))
+@settings(max_examples=30, deadline=None)
+def test_how_often_a_kind_was_asked_does_not_move_the_thresholds(seed, times):
+    """Every query of one kind asked several times over; were all queries alike, the kind would come to count for more."""
+    rng = np.random.default_rng(seed)
+    one, other = outside(rng.uniform(0, 3, 60), ["one"] * 60), outside(rng.uniform(-3, 2, 200), ["other"] * 200)
+    assert _thresholds(pooled([one] * times + [other]), BY_FIRST) == _thresholds(pooled([one, other]), BY_FIRST)
 
 
 def test_of_a_kind_that_has_both_only_the_queries_outside_the_map_count_for_its_thresholds(few):
@@ -180,6 +250,10 @@ def test_of_a_kind_that_has_both_only_the_queries_outside_the_map_count_for_its_
     for threshold in calibration.thresholds:
         assert np.mean(outside > threshold.confidence + 1e-12) <= threshold.false_accept_rate
         assert np.sum(outside > threshold.confidence - 1e-9) > int(threshold.false_accept_rate * len(outside))
+
+
+def test_the_rate_that_holds_where_none_is_named_is_one_that_has_a_threshold_of_its_own():
+    assert FALSE_ACCEPT_RATE in RATES
 
 
 def test_what_was_fitted_can_be_written_and_read(few):

@@ -1,11 +1,13 @@
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.calibration.fit import Asked, fit, pooled  # after the skip
+from model_training.calibration import make  # after the skip
+from model_training.calibration.fit import Asked, fit, pooled
 from model_training.calibration.make import confidences, cross_checks
 from service.maps.calibration import FEATURES
 
@@ -58,3 +60,94 @@ def test_a_city_is_not_predicted_from_itself():
     heads = [line for line in cross_checks([one, other]) if line.startswith("city")]
     assert min(float(line.rsplit(" ", 1)[1]) for line in heads) > 0.3
     assert len(pooled([one, other])) == 2400
+
+
+class Work:
+    """Cities that are never simulated, maps that are never built, questions that are never asked: who would have asked what."""
+
+    def __init__(self, monkeypatch, folder, encoder):
+        self.folder, self.encoder, self.built, self.asked = folder, encoder, [], []
+        self.cities = [SimpleNamespace(name=name, folder=folder / name) for name in ("one", "two", "three")]
+        monkeypatch.setattr(make, "WithoutStreets", self.without_streets)
+        monkeypatch.setattr(make, "build_map", self.build_map)
+        monkeypatch.setattr(make, "MapBundle", SimpleNamespace(open=lambda folder: folder.name.rsplit("-", 1)[0]))
+        monkeypatch.setattr(make, "Localizer", SimpleNamespace(open=lambda bundle: bundle))
+        monkeypatch.setattr(make, "in_the_map", self.asking("in_the_map"))
+        monkeypatch.setattr(make, "of_another_city", self.asking("of_another_city"))
+        monkeypatch.setattr(make, "where_streets_are_missing", self.where_streets_are_missing)
+
+    def without_streets(self, folder):
+        return SimpleNamespace(name=folder.name, folder=folder, is_outside="is_outside", partial=True)
+
+    def build_map(self, dataset, encoder, folder, settings, *, report):
+        folder.mkdir()
+        assert (encoder, report) == (self.encoder, print)
+        assert settings.calibration is None  # or the answers would already be judged
+        self.built.append((dataset.name, hasattr(dataset, "partial"), settings.name, settings.spacing_m))
+
+    def asking(self, how):
+        def ask(localizer, dataset, report, names=()):
+            self.asked.append((how, localizer, dataset.name, tuple(names)))
+            return [city(len(self.asked), count=10)]
+
+        return ask
+
+    def where_streets_are_missing(self, localizer, dataset, names, is_outside, report):
+        assert (is_outside, report) == ("is_outside", print)
+        self.asked.append(("where_streets_are_missing", localizer, dataset.name, tuple(names)))
+        return [city(len(self.asked), count=10)]
+
+    def all_of(self, index, *, anew=False):
+        return make._asked(self.folder, self.encoder, self.cities, index, anew=anew, report=print)
+
+
+@pytest.fixture
+def work(monkeypatch, tmp_path, encoder_file):
+    return Work(monkeypatch, tmp_path, encoder_file)
+
+
+CLEAR = ("clear_precise", "clear_stereo")
+
+
+def test_a_city_is_asked_of_its_own_map_the_next_ones_sparse_ones_of_both_and_where_streets_are_missing(work):
+    """Who comes to a sparse survey looks less like its places, whether he is a stranger or not."""
+    found = work.all_of(1)
+    assert work.asked == [
+        ("in_the_map", "two", "two", ()),
+        ("of_another_city", "three", "two", ()),
+        ("in_the_map", "two-sparse", "two", CLEAR),
+        ("of_another_city", "three-sparse", "two", CLEAR),
+        ("where_streets_are_missing", "two-without-streets", "two", CLEAR),
+    ]
+    np.testing.assert_array_equal(found.evidence, pooled([city(k, count=10) for k in (1, 2, 3, 4, 5)]).evidence)
+
+
+def test_a_sparse_map_has_a_place_every_five_metres_and_any_other_every_metre(work):
+    work.all_of(1)
+    assert work.built == [
+        ("two", False, "two", 1.0),
+        ("three", False, "three", 1.0),
+        ("two", False, "two-sparse", 5.0),
+        ("three", False, "three-sparse", 5.0),
+        ("two", True, "two-without-streets", 1.0),
+    ]
+
+
+def test_the_last_city_is_asked_of_the_first_ones_maps(work):
+    work.all_of(2)
+    assert [row[1] for row in work.asked if row[0] == "of_another_city"] == ["one", "one-sparse"]
+
+
+def test_maps_and_answers_are_kept_and_questions_asked_anew_only_on_demand(work):
+    """Each city's sparse map serves the city before it, too."""
+    first = work.all_of(1)
+    count = len(work.asked)
+    again = work.all_of(1)
+    assert len(work.asked) == count
+    np.testing.assert_array_equal(again.evidence, first.evidence)
+    assert again.kind.tolist() == first.kind.tolist()
+    work.all_of(1, anew=True)
+    assert len(work.asked) == 2 * count
+    assert len(work.built) == 5
+    work.all_of(2)
+    assert [row[2] for row in work.built[5:]] == ["one", "one-sparse", "three-without-streets"]

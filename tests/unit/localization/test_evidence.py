@@ -19,7 +19,7 @@ def candidate(support=0.0, *, xyz=(0.0, 0.0, 1.5), heading_deg=0.0, scale=1.0):
     R = rotation_z(np.deg2rad(heading_deg))
     registered = Registered(R, np.array(xyz, np.float64), scale, 0.0, 0.7, np.eye(8), 0)
     T_map_camera = transform_from(R @ R_BODY_OPTICAL, np.array(xyz, np.float64))
-    return Candidate(T_map_camera, registered, 0.8, Agreement(-1.5, 0.02, 0.2, 0.1), support)
+    return Candidate(T_map_camera, registered, 0.8, 1.5, Agreement(-1.5, 0.02, 0.2, 0.1), support)
 
 
 def refined(*candidates, covariance=None, points=1500):
@@ -59,11 +59,19 @@ def weighed(frame):
 @pytest.mark.parametrize(
     ("name", "expected"),
     [("inliers", 0.7), ("similarity", 0.8), ("likelihood", -1.5), ("through", 0.02), ("front", 0.2), ("unmapped", 0.1),
-     ("measured", 0.75)],
+     ("measured", 0.75), ("place_m", 1.5)],
 )  # fmt: skip
 def test_what_is_known_of_the_best_candidate_is_told_as_it_is(weighed, name, expected):
-    other = replace(candidate(-1.0, xyz=(50, 0, 1.5)), similarity=0.1, agreement=Agreement(-9.0, 0.9, 0.9, 0.9))
+    other = replace(
+        candidate(-1.0, xyz=(50, 0, 1.5)), similarity=0.1, place_m=7.0, agreement=Agreement(-9.0, 0.9, 0.9, 0.9)
+    )
     assert weighed(candidates=(candidate(), other))[name] == expected
+
+
+@pytest.mark.parametrize(("place_m", "expected"), [(0.0, 0.0), (9.9, 9.9), (10.1, 10.0), (1e4, 10.0)])
+def test_places_further_than_ten_metres_are_told_as_ten(weighed, place_m, expected):
+    """Calibration has seen no survey so sparse."""
+    assert weighed(candidates=(replace(candidate(), place_m=place_m),))["place_m"] == expected
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_y, rotation_z
 from service.localization import similar
@@ -10,9 +12,16 @@ FAN_DEG = [0.0, 90.0, 180.0, 270.0]
 
 @pytest.fixture(autouse=True)
 def counted(monkeypatch):
-    """What these tests count on."""
+    """What these tests count on: so wide a curve that all places count alike, unless a test says otherwise."""
     monkeypatch.setattr(similar, "PLACES", 5)
     monkeypatch.setattr(similar, "VIEWS", 2)
+    monkeypatch.setattr(similar, "WIDTH_M", 1e9)
+
+
+@pytest.fixture
+def width(monkeypatch):
+    """Sets how fast places count less."""
+    return lambda width_m: monkeypatch.setattr(similar, "WIDTH_M", width_m)
 
 
 def views_of(similarity):
@@ -28,7 +37,12 @@ def street(bundle_at):
     return bundle_at([(10.0 * k, 0.0, 2.0 + 30 * (k % 2)) for k in range(8)], FAN_DEG, views_of(fan))
 
 
-def asked(bundle, x_m, heading_deg, descriptors=((1.0, 0.0, 0.0),), *, y_m=0.0, R=None):
+def asked(bundle, *given, **named):
+    """The similarity alone."""
+    return found_at(bundle, *given, **named)[0]
+
+
+def found_at(bundle, x_m, heading_deg, descriptors=((1.0, 0.0, 0.0),), *, y_m=0.0, R=None):
     return similarity_at(
         bundle, np.array(descriptors, np.float32), R_map_level=rotation_z(np.deg2rad(heading_deg)) if R is None else R,
         camera_m=np.array([x_m, y_m, 500.0]),
@@ -89,7 +103,8 @@ def test_places_count_by_their_distance_in_both_directions(bundle_at):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_it_agrees_with_a_slow_loop(bundle_at, seed):
+def test_it_agrees_with_a_slow_loop(bundle_at, width, seed):
+    width(8.0)
     rng = np.random.default_rng(seed)
     xyz, start = rng.uniform(0, 50, (20, 3)), rng.uniform(0, 60)
     fan = start + 60 * np.arange(6)
@@ -98,10 +113,85 @@ def test_it_agrees_with_a_slow_loop(bundle_at, seed):
     query = rng.normal(size=(3, 8))
     query /= np.linalg.norm(query, axis=1, keepdims=True)
     x, y, heading = rng.uniform(0, 50), rng.uniform(0, 50), rng.uniform(-180, 180)
-    best = []
+    best, away = [], []
     for place in sorted(range(20), key=lambda k: np.hypot(xyz[k, 0] - x, xyz[k, 1] - y))[:5]:
+        away.append(np.hypot(xyz[place, 0] - x, xyz[place, 1] - y))
         turns = [abs((degrees - heading + 180) % 360 - 180) for degrees in fan]
         nearest = sorted(range(6), key=lambda k, turns=turns: turns[k])[:2]
         best.append(max(float(views[6 * place + k] @ turned) for k in nearest for turned in query))
-    found = asked(bundle_at(xyz, fan, views), x, heading, query, y_m=y)
-    assert found == pytest.approx(np.mean(best), abs=1e-5)
+    weights = [np.exp(-(d**2) / (2 * 8.0**2)) for d in away]
+    similarity, place_m = found_at(bundle_at(xyz, fan, views), x, heading, query, y_m=y)
+    assert similarity == pytest.approx(np.average(best, weights=weights), abs=1e-5)
+    assert place_m == pytest.approx(np.average(away, weights=weights), abs=1e-5)
+    assert max(weights) < 0.9 * sum(weights)  # or the nearest alone would do
+
+
+def test_a_narrow_curve_leaves_the_nearest_place_alone(street, width):
+    """10 m further is 50 curves' widths further."""
+    width(0.2)
+    cases = [(31, 0.3, 1.0), (34, 0.3, 4.0), (36, 0.4, 4.0), (-100, 0.0, 100.0), (75, 0.7, 5.0)]
+    for x_m, similarity, place_m in cases:
+        assert found_at(street, x_m, 40) == pytest.approx((similarity, place_m), abs=1e-6)
+
+
+def test_of_a_wide_curve_all_places_that_count_do_so_alike(street):
+    """Places 1 to 5 around x = 31: 21, 11, 1, 9 and 19 m away."""
+    assert found_at(street, 31, 40) == pytest.approx((0.3, 61 / 5), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "away", "exponents"),
+    [
+        (1.0, (1.0, 3.0), (0.0, -1.0)),  # the squares differ by 8, which is 2 x 2^2
+        (-2.0, (2.0, 6.0), (0.0, -4.0)),
+        (5.5, (5.5, 1.5), (-3.5, 0.0)),
+        (2.0, (2.0, 2.0), (0.0, 0.0)),
+        (10.0, (10.0, 6.0), (-8.0, 0.0)),
+    ],
+)
+def test_similarity_and_distance_by_hand(bundle_at, width, x_m, away, exponents):
+    """Places at 0 and 4 m, 0.2 and 0.8 similar, under a curve of 2 m."""
+    width(2.0)
+    bundle = bundle_at([(0, 0, 2), (4, 0, 2)], [0.0], views_of([0.2, 0.8]))
+    one, other = np.exp(exponents) / np.exp(exponents).sum()
+    expected = (0.2 * one + 0.8 * other, away[0] * one + away[1] * other)
+    assert found_at(bundle, x_m, 0) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("far_m", [10.0, 40.0, 1e3, 1e5])
+def test_in_a_sparse_survey_the_nearest_place_counts_whatever_its_distance(bundle_at, width, far_m):
+    """Even where, of a curve about the pose, not even the nearest place would be given any weight that a float can hold."""
+    width(2.0)
+    bundle = bundle_at([(0, 0, 2), (0, 300, 2), (0, -300, 2)], [0.0], views_of([0.6, 0.9, 0.1]))
+    assert found_at(bundle, far_m, 0, y_m=-1e-3) == pytest.approx((0.6, far_m), abs=1e-5)
+
+
+def test_a_survey_twice_as_dense_says_the_same(bundle_at, width, monkeypatch):
+    """Every place is there twice: the mean is not drawn to where there are more of them, only to those nearby."""
+    width(2.0)
+    xyz, similarity = [(2.0 * k, 0, 2) for k in range(5)], [0.1, 0.5, 0.7, 0.2, 0.4]
+    once = found_at(bundle_at(xyz, [0.0], views_of(similarity)), 3.1, 0)
+    monkeypatch.setattr(similar, "PLACES", 10)
+    twice = found_at(bundle_at(xyz * 2, [0.0], views_of(similarity * 2)), 3.1, 0)
+    assert twice == pytest.approx(once, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def row(bundle_at):
+    """Eight places 1 m apart, the similarity of each its number in tenths."""
+    return bundle_at([(float(k), 0, 2) for k in range(8)], [0.0], views_of([0.1 * k for k in range(8)]))
+
+
+@given(st.floats(-20, 30), st.floats(-20, 20), st.floats(0.3, 50), st.floats(1.05, 5))
+def test_the_wider_the_curve_the_more_the_further_places_count(row, x_m, y_m, width_m, wider):
+    """And never less than the nearest, nor more than the mean of the five: the distance says which places count."""
+    away = np.sort(np.hypot(np.arange(8) - x_m, y_m))[:5]
+    with pytest.MonkeyPatch.context() as patch:
+        distances = []
+        for each in (width_m, wider * width_m):
+            patch.setattr(similar, "WIDTH_M", each)
+            similarity, place_m = found_at(row, x_m, 0, y_m=y_m)
+            assert 0 - 1e-6 <= similarity <= 0.7 + 1e-6
+            distances.append(place_m)
+    assert away[0] - 1e-6 <= distances[0] <= distances[1] + 1e-6
+    assert distances[1] <= away.mean() + 1e-6

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
-from service.registration.kernel import QueryPoints, SolverOptions, align
+from service.registration.kernel import QueryPoints, SolverOptions, align, pulls
 
 AROUND_A_BATCH = [0, 1, 2, 31, 32, 33, 63, 64, 65, 96, 97]
 SOLVE = SolverOptions(iterations=8, reach=1.2, robust_first=0.8, robust_last=0.1, free_offset=True)
@@ -77,6 +77,19 @@ def test_points_together_say_what_they_say_one_by_one(mixed, solved, count):
     whole = solved(mixed.subset(np.arange(count)), STILL)
     assert whole["weight"] == pytest.approx(sum(each["weight"] for each in alone))
     assert whole["inliers"] * whole["weight"] == pytest.approx(sum(each["inliers"] * each["weight"] for each in alone))
+
+
+@pytest.mark.parametrize("count", AROUND_A_BATCH[1:])
+def test_points_pull_together_as_they_pull_one_by_one(mixed, street_map, pose, start_at, count):
+    start = start_at(rotation_z(0.03) @ pose[0], pose[1] + [0.2, -0.1, 0.05], log_scale=0.002, offset=0.05)
+
+    def pulled(rows):
+        patch = np.arange(len(rows), dtype=np.int32)
+        return pulls(street_map.grid, street_map.surfels, mixed.subset(rows), start, ONE_STEP, patch)
+
+    alone = np.concatenate([pulled(np.array([k])) for k in range(count)])
+    np.testing.assert_array_equal(pulled(np.arange(count)), alone)
+    assert (np.abs(alone).max(axis=1) > 0).any()
 
 
 @given(seed=st.integers(0, 10**6), count=st.sampled_from(AROUND_A_BATCH[3:]))

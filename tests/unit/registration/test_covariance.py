@@ -5,39 +5,26 @@ from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
 from service.registration import covariance
-from service.registration.covariance import covariance_of, inflation
+from service.registration.covariance import covariance_of
 from service.registration.surfel_map import SurfelMap
 
 PRIOR_SIGMA = np.array([30.0, 30.0, 0.3, *np.deg2rad([2.0, 2.0, 10.0])])
+PRIOR = np.diag([*PRIOR_SIGMA, 0.01, 0.3]) ** 2
 FLOOR = np.array([0.02, 0.03, 0.01, *np.deg2rad([0.02, 0.03, 0.05])])
-#: Of pictures whose deviations are four times those of independent points.
+NONE = np.zeros((8, 8))
+#: Of pictures whose deviations are twice those of independent points, and three times those of patches.
 NOISE = 1e-3
 
 
 @pytest.fixture(autouse=True)
 def counted(monkeypatch):
     """What these tests count on."""
-    numbers = {"INFLATION": 4.0, "AT_NOISE": NOISE, "POWER": 0.5, "LEAST": 3.0, "MOST": 8.0, "_FLOOR": FLOOR}
+    numbers = {
+        "AT_NOISE": NOISE, "INDEPENDENT": 2.0, "INDEPENDENT_POWER": 0.5, "SHARED": 3.0, "SHARED_POWER": 0.25, "_AXES": np.ones(6),
+        "_AXES_POWER": np.zeros(6), "LEAST": NOISE / 16, "MOST": 16 * NOISE, "_FLOOR": FLOOR,
+    }  # fmt: skip
     for name, value in numbers.items():
         monkeypatch.setattr(covariance, name, value)
-
-
-noises = st.floats(0, 1e-2)
-
-
-@pytest.mark.parametrize(
-    ("noise", "expected"),
-    [(1e-3, 4.0), (2.25e-3, 6.0), (4e-3, 8.0), (9e-3, 8.0), (1e-3 * 9 / 16, 3.0), (1e-4, 3.0), (0.0, 3.0)],
-)
-def test_the_noisier_the_picture_the_larger_the_deviations_within_limits(noise, expected):
-    """By the root of the noise: 4 at a thousandth, never below 3 or above 8."""
-    assert inflation(noise) == pytest.approx(expected)
-
-
-@given(noises, noises)
-def test_noise_never_makes_a_pose_better_known(one, other):
-    less, more = (covariance_of(random_information(2, 20, 1e3), noise) for noise in sorted((one, other)))
-    assert np.linalg.eigvalsh(more - less).min() > -1e-9
 
 
 def random_information(seed, rows, scale):
@@ -46,57 +33,135 @@ def random_information(seed, rows, scale):
     return scale * gradients.T @ gradients
 
 
+noises = st.floats(0, 0.1)
 informations = st.builds(
     random_information, st.integers(0, 10**6), st.integers(0, 20), st.sampled_from([1.0, 1e3, 1e6])
 )
 
 
-@given(informations, noises)
-def test_a_covariance_is_symmetric_and_positive_definite(information, noise):
-    found = covariance_of(information, noise)
-    np.testing.assert_array_equal(found, found.T)
-    assert np.linalg.eigvalsh(found - 0.99 * np.diag(FLOOR**2)).min() > 0
+def without_floor(information, scatter, noise=NOISE):
+    return covariance_of(information, scatter, noise) - np.diag(FLOOR**2)
+
+
+@pytest.mark.parametrize(
+    ("noise", "independent", "shared"),
+    [(1e-3, 2.0, 3.0), (16e-3, 8.0, 6.0), (0.5, 8.0, 6.0), (1e-3 / 16, 0.5, 1.5), (1e-5, 0.5, 1.5), (0.0, 0.5, 1.5)],
+)
+def test_deviations_of_points_and_of_patches_are_stretched_by_factors_of_the_noise_within_limits(
+    noise, independent, shared
+):
+    """A centimetre by the points' information, two by the patches' scatter: their variances add, and that of the floor.
+
+    By the square and the fourth root of the noise, 2 and 3 at a thousandth, never below a sixteenth of that or above 16 times.
+    """
+    found = covariance_of(1e4 * np.eye(8), 4e4 * np.eye(8), noise)
+    expected = (independent * 0.01) ** 2 + (shared * 0.02) ** 2 + FLOOR[:2] ** 2
+    np.testing.assert_allclose(np.diag(found)[:2], expected, rtol=1e-3)
+
+
+@given(st.integers(0, 10**6), st.sampled_from([1.0, 1e3, 1e6]))
+def test_patches_that_agree_leave_what_independent_points_know(seed, scale):
+    information = random_information(seed, 20, scale)
+    expected = np.linalg.inv(information / 4 + np.linalg.inv(PRIOR))[:6, :6] + np.diag(FLOOR**2)
+    np.testing.assert_allclose(covariance_of(information, NONE, NOISE), expected, rtol=1e-6, atol=1e-12)
+
+
+@given(st.integers(0, 10**6))
+def test_where_scatter_is_the_information_the_sandwich_is_the_usual_covariance(seed):
+    """Nine times the inverse for the patches and four times for the points; the priors are nothing beside so many of them."""
+    information = random_information(seed, 40, 1e9)
+    inverse = np.linalg.inv(information)[:6, :6]
+    shared = covariance_of(information, information, NOISE) - covariance_of(information, NONE, NOISE)
+    np.testing.assert_allclose(shared, 9 * inverse, rtol=1e-3, atol=1e-3 * inverse.max())
+    np.testing.assert_allclose(
+        without_floor(information, information), 13 * inverse, rtol=1e-3, atol=1e-3 * inverse.max()
+    )
+
+
+def test_patches_that_disagree_in_one_way_make_that_way_alone_uncertain():
+    """Along x by 100 and yaw by 200 together; a cm and a hundredth of a radian for each hundred, times three, and they go together."""
+    pull = np.array([100.0, 0, 0, 0, 0, -200.0, 0, 0])
+    shared = covariance_of(1e4 * np.eye(8), np.outer(pull, pull), NOISE) - covariance_of(1e4 * np.eye(8), NONE, NOISE)
+    expected = np.zeros((6, 6))
+    expected[np.ix_([0, 5], [0, 5])] = 9e-4 * np.array([[1.0, -2.0], [-2.0, 4.0]])
+    np.testing.assert_allclose(shared, expected, rtol=1e-2, atol=1e-9)
 
 
 @given(informations, informations, noises)
-def test_more_information_means_less_variance_in_every_direction(information, more, noise):
-    gained = covariance_of(information, noise) - covariance_of(information + more, noise)
+def test_a_covariance_is_symmetric_and_positive_definite(information, scatter, noise):
+    found = covariance_of(information, scatter, noise)
+    np.testing.assert_array_equal(found, found.T)
+    assert np.linalg.eigvalsh(found - 0.99 * np.diag(FLOOR**2)).min() > -1e-9 * found.max()
+    assert np.linalg.eigvalsh(found).min() > 0
+
+
+@given(informations, informations, noises, noises)
+def test_noise_never_makes_a_pose_better_known(information, scatter, one, other):
+    less, more = (covariance_of(information, scatter, noise) for noise in sorted((one, other)))
+    assert np.linalg.eigvalsh(more - less).min() > -1e-9 * more.max()
+
+
+@given(informations, informations, informations, noises)
+def test_more_disagreement_means_more_variance_in_every_direction(information, scatter, more, noise):
+    gained = covariance_of(information, scatter + more, noise) - covariance_of(information, scatter, noise)
+    assert np.linalg.eigvalsh(gained).min() > -1e-9 * max(1.0, gained.max())
+
+
+@given(informations, informations, noises)
+def test_more_information_of_patches_that_agree_means_less_variance_in_every_direction(information, more, noise):
+    gained = covariance_of(information, NONE, noise) - covariance_of(information + more, NONE, noise)
     assert np.linalg.eigvalsh(gained).min() > -1e-6
 
 
-def test_more_information_about_every_unknown_means_strictly_less_variance():
+@pytest.mark.parametrize("patches", [0.0, 1.0, 30.0])
+def test_more_information_about_every_unknown_means_strictly_less_variance(patches):
+    """With scatter that grows as fast, as it does with the number of patches."""
     information = random_information(1, 20, 1e3)
-    variances = [np.diag(covariance_of(factor * information, NOISE)) for factor in (1, 4, 16)]
+    variances = [np.diag(covariance_of(k * information, k * patches * information, NOISE)) for k in (1, 4, 16)]
     assert (variances[0] > variances[1]).all()
     assert (variances[1] > variances[2]).all()
 
 
-def test_without_information_what_is_known_beside_the_points_remains():
+@pytest.mark.parametrize("noise", [0.0, NOISE, 1.0])
+def test_without_information_what_is_known_beside_the_points_remains(noise):
     expected = np.diag(PRIOR_SIGMA**2 + FLOOR**2)
-    np.testing.assert_allclose(covariance_of(np.zeros((8, 8)), NOISE), expected, rtol=1e-9)
+    np.testing.assert_allclose(covariance_of(NONE, NONE, noise), expected, rtol=1e-9)
 
 
-def test_endless_information_leaves_the_floor_of_each_axis():
-    np.testing.assert_allclose(covariance_of(1e15 * np.eye(8), NOISE), np.diag(FLOOR**2), rtol=1e-3, atol=1e-12)
+@pytest.mark.parametrize("scatter", [0.0, 1e15])
+def test_endless_information_leaves_the_floor_of_each_axis(scatter):
+    found = covariance_of(1e15 * np.eye(8), scatter * np.eye(8), NOISE)
+    np.testing.assert_allclose(found, np.diag(FLOOR**2), rtol=1e-3, atol=1e-12)
 
 
-def test_deviations_are_inflated_over_those_of_independent_points():
-    """A centimetre of independent points is four of ours, six of a noisier picture; then come those of the floor."""
-    for noise, times in ((NOISE, 4.0), (2.25 * NOISE, 6.0)):
-        found = np.sqrt(np.diag(covariance_of(1e4 * np.eye(8), noise))[:2])
-        np.testing.assert_allclose(found, np.hypot(times * 0.01, FLOOR[:2]), rtol=1e-3)
+@pytest.mark.parametrize(
+    ("noise", "factors"),
+    [(NOISE, [1, 1, 1, 0.5, 0.5, 1]), (16 * NOISE, [1, 1, 0.25, 0.5, 0.5, 2]), (NOISE / 16, [1, 1, 4, 0.5, 0.5, 0.5])],
+)
+def test_axes_are_stretched_by_factors_of_their_own_but_not_their_floor(monkeypatch, noise, factors):
+    """Deviations are; so correlations stay as they are, and so does the floor."""
+    information, scatter = random_information(3, 30, 1e3), random_information(4, 30, 1e4)
+    plain = without_floor(information, scatter, noise)
+    monkeypatch.setattr(covariance, "_AXES", np.array([1.0, 1.0, 1.0, 0.5, 0.5, 1.0]))
+    monkeypatch.setattr(covariance, "_AXES_POWER", np.array([0.0, 0.0, -0.5, 0.0, 0.0, 0.25]))
+    found = without_floor(information, scatter, noise)
+    np.testing.assert_allclose(found, plain * np.outer(factors, factors), rtol=1e-9, atol=1e-15)
+    assert np.abs(plain[0, 3:]).min() > 0  # or what is said of correlations would be of nothing
 
 
-def test_an_unknown_scale_costs_certainty():
-    """Points that only know the sum of x and the log scale know x no better than the scale, by 0.01."""
+@pytest.mark.parametrize("disagree", [0.0, 1.0])
+def test_an_unknown_scale_costs_certainty(disagree):
+    """Points that only know the sum of x and the log scale know x no better than the scale, by 0.01, however well they agree."""
     information = np.zeros((8, 8))
     information[np.ix_([0, 6], [0, 6])] = 1e8
-    x = covariance_of(information, NOISE)[0, 0]
-    assert np.sqrt(x - FLOOR[0] ** 2) == pytest.approx(0.01, rel=0.01)
+    x = without_floor(information, disagree * information)[0, 0]
+    assert np.sqrt(x) == pytest.approx(0.01, rel=0.01)
 
 
+@pytest.mark.parametrize("disagree", [0.0, 3.0])
 @pytest.mark.parametrize("heading_deg", [0, 30, 120])
-def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_at, settle, heading_deg):
+def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_at, settle, heading_deg, disagree):
+    """Whether its walls agree on the rest or not."""
     R = rotation_z(np.deg2rad(heading_deg))
     flat = [
         ((-30, -4, 0), (60, 0, 0), (0, 8, 0)),
@@ -109,7 +174,8 @@ def test_in_a_corridor_the_position_along_it_is_the_least_known(scene_of, start_
     camera = np.array([0, 0, 1.5])
     points = corridor.points(R, camera)
     state = settle(cloud, points.subset(np.flatnonzero(np.linalg.norm(points.xyz, axis=1) < 25)), start_at(R, camera))
-    found = covariance_of(state["information"][0], NOISE)
+    information = state["information"][0]
+    found = covariance_of(information, disagree * information, NOISE)
     variances, axes = np.linalg.eigh(found[:3, :3])
     assert abs(axes[:, 2] @ R[:, 0]) > 0.999
     assert variances[2] > 1000 * variances[1]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, nearest_grid
+from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, nearest_grid, pulls
 
 UNKNOWNS = ["x", "y", "z", "roll", "pitch", "yaw", "log scale", "disparity offset"]
 FREE = {"reach": 1.0, "robust_first": 1e6, "robust_last": 1e6, "prior_weight": 0.0, "free_offset": True}
@@ -46,14 +46,25 @@ class Problem:
         steps = 1e-5 * np.eye(8)
         return np.stack([(self.residuals(step) - self.residuals(-step)) / 2e-5 for step in steps], axis=1)
 
+    def ratios(self):
+        """Range at which the line from the camera through each point meets its surfel's plane, over the point's own."""
+        stretch = np.exp(self.log_scale) / (1 + self.offset * self.points.q.astype(float))
+        measured = stretch[:, None] * self.points.xyz.astype(float) @ self.R.T
+        normal = self.surfels["normal"].astype(float)
+        return ((self.surfels["xyz"] - self.t) * normal).sum(axis=1) / (measured * normal).sum(axis=1)
+
     def weights(self, surface_m):
         along = self.points.sigma * (self.surfels["normal"] * (self.points.ray @ self.R.T)).sum(axis=1)
-        return self.points.weight / (along**2 + surface_m**2 + self.surfels["thickness_m"] ** 2)
+        along2 = along**2 * self.ratios().clip(0.5, 2) ** 3
+        return self.points.weight / (along2 + surface_m**2 + self.surfels["thickness_m"] ** 2)
 
-    def aligned(self, start_at, *, change=None, **options):
+    def state(self, start_at, *, change=None):
         change = np.zeros(8) if change is None else change
         R = Rotation.from_rotvec(change[3:6]).as_matrix() @ self.R
-        state = start_at(R, self.t + change[:3], log_scale=self.log_scale + change[6], offset=self.offset + change[7])
+        return start_at(R, self.t + change[:3], log_scale=self.log_scale + change[6], offset=self.offset + change[7])
+
+    def aligned(self, start_at, *, change=None, **options):
+        state = self.state(start_at, change=change)
         align(self.grid, self.surfels, self.points, state, SolverOptions(**(FREE | options)))
         return state[0]
 
@@ -86,6 +97,38 @@ def test_a_step_is_that_of_gauss_and_newton(start_at, seed):
     found = problem.away(problem.aligned(start_at, iterations=1, surface=0.05))
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
     assert np.abs(expected).min() > 1e-4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_patch_pulls_by_its_points_numerical_gradients_residuals_and_weights(start_at, seed):
+    """Six patches of points in no order, and the seventh that none lies in."""
+    problem = Problem(seed, off_m=0.3)
+    patch = np.random.default_rng(seed).integers(0, 6, len(problem.surfels)).astype(np.int32)
+    patch[5] = 7
+    each = (problem.weights(0.05) * problem.residuals(np.zeros(8)))[:, None] * problem.jacobian()
+    expected = np.stack([each[patch == number].sum(axis=0) for number in range(8)])
+    state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
+    before = state.tobytes()
+    found = pulls(problem.grid, problem.surfels, problem.points, state, options, patch)
+    size = np.abs(each).sum(axis=0)
+    np.testing.assert_allclose(found / size, expected / size, atol=1e-5)
+    assert (found[6] == 0).all()
+    assert (np.abs(expected / size).max(axis=0) > 0.03).all()  # or a sign could hide
+    assert state.tobytes() == before
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_all_pulls_together_are_what_a_step_gives_way_to(start_at, seed):
+    """Of the solver's own information, but for the 0.001 a point that keeps turns from running away."""
+    problem = Problem(seed, off_m=0.05)
+    state, options = problem.state(start_at), SolverOptions(**FREE, iterations=1, surface=0.05)
+    count = len(problem.surfels)
+    found = pulls(problem.grid, problem.surfels, problem.points, state, options, np.arange(count, dtype=np.int32) % 9)
+    moved = problem.aligned(start_at, iterations=1, surface=0.05)
+    damping = np.diag([0, 0, 0, *[1e-3 * problem.points.weight.sum()] * 3, 0, 0])
+    step = problem.away(moved)
+    expected = -(moved["information"] + damping) @ step
+    np.testing.assert_allclose(found.sum(axis=0), expected, atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -5,6 +5,8 @@ import pytest
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
+from service.localization import refine as refining
+from service.localization import similar
 from service.localization.prior import Prior
 from service.localization.refine import RefineSettings, SupportWeights, refine, settings_for_rig
 from service.localization.starts import StartSettings
@@ -229,6 +231,49 @@ def test_similarity_is_the_mean_over_frames(bundle, cloud, two_frames):
     across = replace(two_frames[1], descriptors=np.array([[0.0, 1.0]], np.float32))
     found = refined(bundle, cloud, two_frames[0], across)
     assert found.best.similarity == pytest.approx((0.4 + np.sqrt(0.84)) / 2, abs=1e-6)
+
+
+def test_how_far_the_places_are_is_the_mean_over_frames(bundle, cloud, two_frames, monkeypatch):
+    """Places lie at whole metres of the street's middle; each frame is as far from the nearest as it stands."""
+    monkeypatch.setattr(similar, "WIDTH_M", 0.01)
+    found = refined(bundle, cloud, *two_frames).best
+    stood = [found.T_map_camera @ frame.T_reference_camera for frame in two_frames]
+    away = [np.hypot(T[0, 3] - round(T[0, 3]), T[1, 3]) for T in stood]
+    assert found.place_m == pytest.approx(np.mean(away), abs=1e-6)
+    assert away[0] > away[1] + 0.1
+
+
+def test_the_covariance_is_of_the_best_supported_candidate_its_scatter_and_the_median_noise(
+    bundle, cloud, depth, both, seen_in, monkeypatch
+):
+    """Which is not the one that most points agree with, since the views of the other street are more similar."""
+    asked = []
+    kept = refining.scatter_of, refining.covariance_of
+
+    def scatter_of(*given):
+        asked.append(given)
+        return kept[0](*given)
+
+    def covariance_of(*given):
+        asked.append(given)
+        return kept[1](*given)
+
+    monkeypatch.setattr(refining, "scatter_of", scatter_of)
+    monkeypatch.setattr(refining, "covariance_of", covariance_of)
+    first = seen_in(depth, both)
+    frames = [replace(first, noise=noise) for noise in (3e-4, 1e-4, 2e-4)]
+    found = refined(bundle, cloud, *frames, inliers=1.0, similarity=1.0, likelihood=0.0)
+    best = found.best.registered
+    assert best.inliers < max(each.registered.inliers for each in found.candidates)
+    (of_cloud, points, registered, settings), (information, scatter, noise) = asked
+    assert of_cloud is cloud
+    assert registered is best
+    assert settings is BY_INLIERS
+    assert len(points) == found.points
+    np.testing.assert_array_equal(information, best.information)
+    np.testing.assert_array_equal(scatter, kept[0](cloud, points, best, BY_INLIERS))
+    assert noise == 2e-4
+    np.testing.assert_array_equal(found.covariance, kept[1](information, scatter, noise))
 
 
 def test_a_stereo_rigs_disparity_offset_is_estimated_where_its_baseline_is_known(bundle, cloud, street, here, seen_in):

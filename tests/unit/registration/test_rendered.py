@@ -9,7 +9,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z, transform_from
 from service.registration import rendered
 from service.registration.register import Registered
-from service.registration.rendered import Agreement, agreement
+from service.registration.rendered import Agreement, agreement, seen_by
 from service.registration.surfel_map import SurfelMap
 
 #: Off the middle, and larger than what is drawn: 4 pixels of it are one of the drawn ones.
@@ -59,7 +59,7 @@ def seeing(points_at):
 
 
 def agreed(cloud, points, pose=AT_ORIGIN, *, R_level_camera=R_BODY_OPTICAL):
-    return agreement(cloud, points, CAMERA, R_level_camera, pose)
+    return agreement(cloud, seen_by(points, CAMERA, R_level_camera), pose)
 
 
 def shares(found):
@@ -232,6 +232,50 @@ def test_a_camera_that_leans_and_turns_agrees_with_what_it_truly_sees(
     found = agreed(wall, points_at(in_camera @ R_level_camera.T, sigma=0.1), pose, R_level_camera=R_level_camera)
     assert shares(found) == (0, 0, 0)
     assert found.likelihood > 0
+
+
+@pytest.mark.parametrize(
+    ("ray", "column", "row"),
+    [
+        ((0.006, 0, 1), 35, 32),
+        ((0.204, -0.1, 1), 45, 27),
+        ((0.196, -0.106, 1), 44, 27),
+        ((-0.296, 0.4, 1), 20, 52),
+        ((3.0, 0, 1), 79, 32),  # beyond the edge: the last that there is
+        ((-3.0, 0, 1), 0, 32),
+        ((0.006, 3.0, 1), 35, 59),
+        ((0.006, -3.0, 1), 35, 0),
+    ],
+)
+@pytest.mark.parametrize("z_m", [0.7, 20.0])
+def test_a_point_lies_in_the_pixel_of_the_small_picture_that_its_ray_meets(seeing, ray, column, row, z_m):
+    """50 px of focal length, the middle at (34.5, 32), whatever the depth."""
+    seen = seen_by(seeing(z_m, [ray]), CAMERA, R_BODY_OPTICAL)
+    assert (seen.camera.width, seen.camera.height, seen.camera.cx, seen.camera.cy) == (80, 60, 34.5, 32.0)
+    assert (seen.column.tolist(), seen.row.tolist()) == ([column], [row])
+
+
+def test_depth_and_deviation_are_told_along_the_cameras_axis_and_the_depth_as_it_was_measured(seeing):
+    """The ray (3, 0, 4) / 5: of 1 m along it 0.8 m are ahead."""
+    leaning = rotation_z(0.4) @ rotation_y(0.3) @ R_BODY_OPTICAL
+    points = seeing([8.0, 4.0], [(0.75, 0, 1), (0, 0, 1)], sigma=1.0, R_level_camera=leaning, focal_baseline_px_m=80.0)
+    seen = seen_by(points, CAMERA, leaning)
+    assert seen.z.tolist() == pytest.approx([8.0, 4.0], rel=1e-5)
+    assert seen.sigma.tolist() == pytest.approx([0.8, 1.0], rel=1e-5)
+    np.testing.assert_array_equal(seen.q, points.q)
+    np.testing.assert_array_equal(seen.R_level_camera, leaning)
+    assert len(seen) == 2
+
+
+def test_a_query_that_was_prepared_once_serves_every_candidate(wall, seeing):
+    """The second pose is no worse served for the first, whose scale and offset are its own."""
+    points = seeing([8.0, 9.0, 10.0], [(0, 0, 1), (0.1, 0, 1), (0.2, 0.1, 1)], focal_baseline_px_m=80.0)
+    once = seen_by(points, CAMERA, R_BODY_OPTICAL)
+    poses = [AT_ORIGIN, replace(AT_ORIGIN, scale=1.1, offset=-1.2), moved(1.0), moved(0, R=rotation_z(0.3)), AT_ORIGIN]
+    found = [agreement(wall, once, pose) for pose in poses]
+    assert found == [agreed(wall, points, pose) for pose in poses]
+    assert found[0] == found[-1]
+    assert len({each.likelihood for each in found}) == 4
 
 
 def test_the_mean_of_several_pictures():

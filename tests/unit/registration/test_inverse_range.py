@@ -1,0 +1,117 @@
+"""A triangulating camera errs evenly in 1 / range: what it sees too near must not count for better measured than what it sees too far."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.geometry.rigid import rotation_z
+from service.registration.kernel import SURFEL, SolverOptions, align, nearest_grid
+
+#: No robust kernel, no surface's roughness: the points' own noise is all there is.
+FREE = {"reach": 1.2, "robust_first": 1e6, "robust_last": 1e6, "surface": 0.0, "prior_weight": 0.0}
+
+
+@pytest.fixture(scope="module")
+def one_surfel():
+    """At the origin, facing x."""
+    surfels = np.zeros(1, SURFEL)
+    surfels["normal"] = [1, 0, 0]
+    return nearest_grid(surfels, cell_m=0.3, reach_m=1.2), surfels
+
+
+def known(one_surfel, points, start, **options):
+    """How much one iteration learns of x."""
+    align(*one_surfel, points, start, SolverOptions(**(FREE | options), iterations=1))
+    return start["information"][0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("measured_m", "there_m", "ratio"),
+    [
+        (5.0, 5.0, 1.0),
+        (5.0, 4.0, 0.8),  # seen too far
+        (4.0, 5.0, 1.25),  # seen too near
+        (1.6, 0.8, 0.5),
+        (1.6, 0.5, 0.5),  # half and double are the bounds
+        (0.6, 1.2, 2.0),
+        (0.6, 1.5, 2.0),
+        (0.6, -0.3, 0.5),  # the surface lies behind the camera
+    ],
+)
+def test_the_variance_is_that_of_the_range_where_the_ray_meets_the_surface(
+    one_surfel, points_at, start_at, measured_m, there_m, ratio
+):
+    """By the third power of the ratio: with it, weight times residual is odd in the error of 1 / range."""
+    found = known(one_surfel, points_at([[measured_m, 0, 0]], sigma=0.2), start_at(np.eye(3), [-there_m, 0, 0]))
+    assert found == pytest.approx(1 / (0.04 * ratio**3), rel=1e-4)
+
+
+def test_only_what_the_ray_brings_is_scaled_and_only_as_far_as_it_meets_the_surface(one_surfel, points_at, start_at):
+    """The ray (4, 3, 0) / 5 measures 5 m and meets the wall at 4 m: of sigma 0.5 it brings 0.4 across, times 0.8^3; 0.3 are rough."""
+    start = start_at(np.eye(3), [-3.2, -2.8, 0])
+    found = known(one_surfel, points_at([[4, 3, 0]], sigma=0.5), start, surface=0.3)
+    assert found == pytest.approx(1 / (0.16 * 0.8**3 + 0.09), rel=1e-4)
+
+
+def test_the_range_is_the_one_that_scale_and_offset_make_of_the_measured_one(one_surfel, points_at, start_at):
+    """4 m are 5 m at a scale of 1.25, or where 20 px of disparity are 16 px in truth: the ratio of the wall at 5 m is 1."""
+    points = points_at([[4.0, 0, 0]], sigma=0.2, focal_baseline_px_m=80.0)
+    for changed in ({"log_scale": np.log(1.25)}, {"offset": -4.0}):
+        assert known(one_surfel, points, start_at(np.eye(3), [-5, 0, 0], **changed)) == pytest.approx(25, rel=1e-4)
+
+
+@pytest.mark.parametrize("before_m", [0.1, 0.0, -0.1])
+def test_a_ray_along_the_surface_tells_no_range(one_surfel, points_at, start_at, before_m):
+    """It never meets it, or lies in it: the roughness alone remains, and nothing is divided by zero."""
+    start = start_at(np.eye(3), [before_m, 0, 0])
+    found = known(one_surfel, points_at([[0, 0.5, 0]], sigma=0.2), start, surface=0.1)
+    assert found == pytest.approx(100, rel=1e-4)
+
+
+@pytest.fixture(scope="module")
+def wall(scene_of):
+    """Square to x, 8 x 8 m about the origin, of no thickness."""
+    surfels = scene_of(((0, -4, -4), (0, 8, 0), (0, 0, 8))).surfels()
+    surfels["thickness_m"] = 0
+    return nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
+
+
+def seen_twice(points_at, distance_m, error):
+    """Points on the wall, each once with 1 / range too large by a share and once too small; the deviation goes by range squared."""
+    y, z = (each.ravel() for each in np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-1, 1, 7)))
+    true = np.stack([np.full(y.size, distance_m), 0.3 * distance_m * y, 0.3 * distance_m * z], axis=1)
+    measured = np.concatenate([true / (1 + error), true / (1 - error)])
+    sigma = 0.02 * (np.linalg.norm(measured, axis=1)) ** 2
+    return replace(points_at(measured), sigma=sigma.astype(np.float32))
+
+
+def drawn_nearer_m(distance_m, error):
+    """By how much the wall would come out too near if each point weighed by its own measured range.
+
+    Ranges 1 / (1 +- e) weigh by the fourth power of 1 +- e: their mean is (1 + 3 e^2) / (1 + 6 e^2 + e^4).
+    """
+    return distance_m * (1 - (1 + 3 * error**2) / (1 + 6 * error**2 + error**4))
+
+
+@given(st.floats(2.0, 5.0), st.floats(0.05, 0.15), st.floats(-0.05, 0.05), st.floats(-3, 3))
+def test_noise_that_is_even_in_inverse_range_draws_no_wall_nearer(
+    wall, points_at, start_at, distance_m, error, off_m, heading
+):
+    """Along the ray the camera comes out where it stood, far closer than measured ranges as weights would put it.
+
+    Scale is kept: to a scale, noise that is even in 1 / range is not even. Position and turn are free; the fan is even about both.
+    """
+    R = rotation_z(heading)
+    surfels = wall[1].copy()
+    surfels["xyz"], surfels["normal"] = surfels["xyz"] @ R.T.astype("f4"), surfels["normal"] @ R.T.astype("f4")
+    turned = nearest_grid(surfels, cell_m=0.4, reach_m=1.2), surfels
+    start = start_at(R, R @ [off_m - distance_m, 0, 0])
+    options = SolverOptions(**(FREE | {"prior_weight": 1e-6}), iterations=10, free_scale=False)
+    align(*turned, seen_twice(points_at, distance_m, error), start, options)
+    too_far_ahead = float(R[:, 0] @ start["t"][0]) + distance_m
+    bias = drawn_nearer_m(distance_m, error)
+    assert bias > 0.01
+    assert abs(too_far_ahead) < 0.05 * bias
