@@ -1,6 +1,9 @@
 # The service alone: no torch, no compiler, no package installer in the last stage.
 #   docker build -t streetfix .
-#   docker run --read-only --tmpfs /tmp -p 127.0.0.1:8000:8000 -v "$PWD/maps:/maps:ro" streetfix
+#   docker run --read-only --tmpfs /tmp -p 8000:8000 -p 50051:50051 -v "$PWD/maps:/maps:ro" \
+#     -v "$PWD/keys.txt:/keys.txt:ro" -e STREETFIX_API_KEYS=/keys.txt streetfix
+# A container listens on all of its addresses, so it asks for API keys (streetfix keys) or client certificates; where the port is
+# published to loopback or a private network alone, -e STREETFIX_INSECURE_PUBLIC=true lets it start without.
 
 FROM python:3.11-slim AS build
 WORKDIR /src
@@ -29,13 +32,13 @@ ENV PATH=/opt/streetfix/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     ORT_DISABLE_TELEMETRY=1 \
     STREETFIX_MAPS=/maps \
-    STREETFIX_PORT=8000
+    STREETFIX_PORT=8000 \
+    STREETFIX_GRPC_PORT=50051
 USER 10001:10001
 WORKDIR /tmp
 VOLUME ["/maps"]
-EXPOSE 8000
+EXPOSE 8000 50051
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=10s --timeout=3s --start-period=20s --retries=3 \
   CMD ["python", "-c", "import os, urllib.request as r; r.urlopen('http://127.0.0.1:' + os.environ['STREETFIX_PORT'] + '/readyz', timeout=2)"]
-# Inside a container every address is the container's own; publish the port to loopback or a private network.
 CMD ["streetfix", "serve", "--host", "0.0.0.0"]

@@ -9,6 +9,9 @@ StreetfixError                     code            kind
 ├── UnsupportedFormatError         format          unsupported  a format that we do not read
 ├── TooLargeError                  too-large       too_large    a part is beyond a limit
 ├── UnknownMapError                unknown-map     not_found    no map of that name is mounted
+├── NoPoseError                    no-pose         not_found    no sure pose, asked for in a format that has no word for doubt
+├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
+├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
 ├── BusyError                      busy            busy         the queue is full
 ├── DeadlineError                  deadline        deadline     a request took longer than the service allows
 ├── BundleError                    bundle          not_ready    a map bundle is missing, damaged or of another version
@@ -17,6 +20,7 @@ StreetfixError                     code            kind
 ├── UnreachableError               unreachable     not_ready    a service does not answer
 ├── RefusedError                   refused         invalid      a service refused a request (seen by its client)
 ├── AddressError                   address         not_ready    the service cannot listen where it was told to
+├── KeysError                      keys            not_ready    the file of API keys, or a certificate, cannot be used
 └── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
 
 No number of HTTP or gRPC stands here: each face has one table over ``kind``.
@@ -24,7 +28,7 @@ No number of HTTP or gRPC stands here: each face has one table over ``kind``.
 
 from typing import ClassVar, Literal
 
-Kind = Literal["invalid", "unsupported", "too_large", "not_found", "busy", "deadline", "not_ready"]
+Kind = Literal["invalid", "unsupported", "too_large", "not_found", "unauthorized", "busy", "deadline", "not_ready"]
 
 
 class StreetfixError(Exception):
@@ -95,6 +99,26 @@ class UnknownMapError(StreetfixError):
     kind = "not_found"
 
 
+class NoPoseError(StreetfixError):
+    """The pictures do not say where they were taken, and the format that was asked for has no word for doubt."""
+
+    code = "no-pose"
+    kind = "not_found"
+
+
+class NotGeoreferencedError(StreetfixError):
+    """A place on the Earth is asked of a map that has none."""
+
+    code = "no-georeference"
+
+
+class UnauthorizedError(StreetfixError):
+    """The service asks for an API key, and got none or not one of its own."""
+
+    code = "unauthorized"
+    kind = "unauthorized"
+
+
 class BusyError(StreetfixError):
     """The queue is full; try again shortly."""
 
@@ -146,6 +170,13 @@ class AddressError(StreetfixError):
     """The service cannot listen on the address it was given."""
 
     code = "address"
+    kind = "not_ready"
+
+
+class KeysError(StreetfixError):
+    """The file of API keys, or a certificate, cannot be used."""
+
+    code = "keys"
     kind = "not_ready"
 
 

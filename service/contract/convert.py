@@ -1,12 +1,16 @@
-"""Between the REST contract and the core's types; no arithmetic but degrees."""
+"""Between the contract and the core's types, the same for every face; no arithmetic but degrees."""
 
 import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from service.errors import NotYetSupportedError, RequestError
+from service.contract import schema
+from service.errors import NotYetSupportedError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import (
     heading_of_body,
@@ -15,8 +19,6 @@ from service.geometry.rigid import (
     rotation_from_quaternion_xyzw,
     transform_from,
 )
-from service.http import schema
-from service.http.problems import request_error_from
 from service.localization.answer import Answer
 from service.localization.evidence import distinct_candidates
 from service.localization.prior import Prior
@@ -24,31 +26,61 @@ from service.localization.search import Neighbour
 from service.maps.reader import MapBundle
 from service.runtime.engine import EncodedQuery, Located
 
-_PARTS = ("rgb", "depth", "request")
+M = TypeVar("M", bound=BaseModel)
 
 
-def query_from_parts(parts: dict[str, bytes]) -> EncodedQuery:
-    """Check the parts and the JSON among them.
+def parsed(document: bytes, model: type[M]) -> M:
+    """A part's JSON as a message of the contract.
 
     Raises:
-        RequestError: a part is missing or unknown, or a field of the JSON makes no sense.
+        RequestError: it is no JSON, or a field makes no sense.
+    """
+    try:
+        return model.model_validate_json(document)
+    except ValidationError as error:
+        raise invalid(error) from error
+
+
+def checked(content: dict[str, Any], model: type[M]) -> M:
+    """What another face was sent, as a message of the contract.
+
+    Raises:
+        RequestError: a field makes no sense.
+    """
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise invalid(error) from error
+
+
+def invalid(error: ValidationError) -> RequestError:
+    """One error of ours from pydantic's: the first field is named, the next ones are in the message."""
+    return request_error_from(error.errors(include_url=False, include_input=False, include_context=False))
+
+
+def request_error_from(errors: Sequence[Any]) -> RequestError:
+    """The same from its list."""
+    told = [f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg']}" for each in errors[:5]]
+    field = ".".join(str(part) for part in errors[0]["loc"])
+    return RequestError("; ".join(told) + "; see the schema at /openapi.json", field=field)
+
+
+def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> EncodedQuery:
+    """The core's query.
+
+    Args:
+        request: checked against the contract.
+        rgb: encoded picture.
+        depth: encoded picture.
+
+    Raises:
+        RequestError: a field makes no sense beside the others.
         NotYetSupportedError: a field that this release cannot use.
     """
-    for name in _PARTS:
-        if name not in parts:
-            raise RequestError(f"the part {name!r} is missing; send the parts rgb, depth and request", field=name)
-    if unknown := sorted(set(parts) - set(_PARTS)):
-        raise RequestError(
-            f"the part {unknown[0]!r} is unknown; send the parts rgb, depth and request", field=unknown[0]
-        )
-    try:
-        request = schema.LocalizeRequest.model_validate_json(parts["request"])
-    except ValidationError as error:
-        raise request_error_from(error.errors(include_url=False, include_input=False, include_context=False)) from error
-    _require_supported(request)
+    _require_supported(request.camera)
     return EncodedQuery(
-        rgb=parts["rgb"],
-        depth=parts["depth"],
+        rgb=rgb,
+        depth=depth,
         map_name=request.map,
         camera=_camera(request.camera),
         depth_encoding=request.depth.encoding,
@@ -57,13 +89,58 @@ def query_from_parts(parts: dict[str, bytes]) -> EncodedQuery:
         baseline_m=request.depth.baseline_m,
         max_range_m=request.depth.max_range_m,
         down_camera=None if request.gravity is None else _down(request.gravity),
-        T_vehicle_camera=None if request.T_vehicle_camera is None else _transform(request.T_vehicle_camera),
+        T_vehicle_camera=None
+        if request.T_vehicle_camera is None
+        else transform_of(request.T_vehicle_camera, "T_vehicle_camera"),
         neighbours=request.options.neighbours,
         refine=request.options.refine,
         prior=None if request.prior is None else _prior(request.prior),
         prior_wgs84=_wgs84(request.prior),
         false_accept_rate=request.options.false_accept_rate,
     )
+
+
+def sequence_from(
+    request: schema.SequenceRequest, pictures: Sequence[tuple[bytes, bytes]]
+) -> tuple[tuple[EncodedQuery, ...], tuple[NDArray[np.float64], ...]]:
+    """The core's queries, the reference first, and where each camera stood against the reference.
+
+    Args:
+        request: checked against the contract.
+        pictures: rgb and depth of each frame, encoded.
+
+    Raises:
+        RequestError: a field makes no sense beside the others.
+        NotYetSupportedError: a field that this release cannot use.
+    """
+    queries, transforms = [], []
+    for number, (frame, (rgb, depth)) in enumerate(zip(request.frames, pictures, strict=True)):
+        where = f"frames.{number}"
+        if (frame.T_reference_camera is None) != (number == 0):
+            raise RequestError(
+                f"{where}.T_reference_camera: the first frame is the reference and has none, every other frame needs one",
+                field=f"{where}.T_reference_camera",
+            )
+        alone = schema.LocalizeRequest(
+            map=request.map, camera=frame.camera, depth=frame.depth, gravity=frame.gravity, options=request.options,
+            T_vehicle_camera=None if number else request.T_vehicle_camera, prior=None if number else request.prior,
+        )  # fmt: skip
+        with fields_under(where):
+            queries.append(query_from(alone, rgb=rgb, depth=depth))
+            T = frame.T_reference_camera
+            transforms.append(np.eye(4) if T is None else transform_of(T, "T_reference_camera"))
+    return tuple(queries), tuple(transforms)
+
+
+@contextmanager
+def fields_under(where: str) -> Iterator[None]:
+    """Errors name their field as one of this message's."""
+    try:
+        yield
+    except StreetfixError as error:
+        error.field = f"{where}.{error.field}" if error.field else where
+        error.message = f"{where}: {error.message}"
+        raise
 
 
 def answer_from(located: Located) -> schema.LocalizeAnswer:
@@ -78,7 +155,7 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         vehicle_pose=None
         if answer.T_map_vehicle is None
         else _pose(answer.T_map_vehicle, heading_of_body(answer.T_map_vehicle), None),
-        geopose=None,
+        geopose=geopose_of(answer.T_map_camera if answer.T_map_vehicle is None else answer.T_map_vehicle, bundle),
         hypotheses=_hypotheses(answer),
         neighbours=[_neighbour(each, bundle) for each in answer.neighbours],
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
@@ -90,6 +167,19 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
             register=times.register_ms,
             total=times.total_ms,
         ),
+    )
+
+
+def geopose_of(T_map_body: NDArray[np.float64], bundle: MapBundle) -> schema.GeoPose | None:
+    """Where on the Earth a body of the map stands, and how; None where the map is not georeferenced."""
+    earth = bundle.earth
+    if earth is None:
+        return None
+    latitude_deg, longitude_deg, height_m = earth.to_earth(T_map_body[:3, 3])
+    x, y, z, w = quaternion_xyzw_from(earth.R_enu_map(T_map_body[:3, 3]) @ T_map_body[:3, :3]).tolist()
+    return schema.GeoPose(
+        position=schema.GeoPosition(lat=latitude_deg, lon=longitude_deg, h=height_m),
+        quaternion=schema.Quaternion(x=x, y=y, z=z, w=w),
     )
 
 
@@ -110,8 +200,8 @@ def map_entry_from(bundle: MapBundle) -> schema.MapEntry:
     )
 
 
-def _require_supported(request: schema.LocalizeRequest) -> None:
-    if any(request.camera.distortion):
+def _require_supported(camera: schema.Camera) -> None:
+    if any(camera.distortion):
         raise NotYetSupportedError(
             "camera.distortion: this release reads rectified pictures only; rectify both and send no distortion",
             field="camera.distortion",
@@ -180,12 +270,17 @@ def _down(gravity: schema.Vector) -> NDArray[np.float64]:
     return down
 
 
-def _transform(transform: schema.RigidTransform) -> NDArray[np.float64]:
+def transform_of(transform: schema.RigidTransform, name: str) -> NDArray[np.float64]:
+    """The matrix.
+
+    Raises:
+        RequestError: its quaternion is no rotation.
+    """
     q, p = transform.orientation, transform.position
     quaternion = np.array([q.x, q.y, q.z, q.w])
     length = float(np.linalg.norm(quaternion))
     if not 1e-6 < length < 1e9:
-        field = "T_vehicle_camera.orientation"
+        field = f"{name}.orientation"
         raise RequestError(f"{field}: a quaternion of length {length:g} is no rotation; send a unit one", field=field)
     return transform_from(rotation_from_quaternion_xyzw(quaternion), np.array([p.x, p.y, p.z]))
 

@@ -1,6 +1,6 @@
-"""The REST contract: the request's JSON part and the answer. Degrees here, radians inside."""
+"""The contract as REST says it in JSON and gRPC in messages: requests and answers. Degrees here, radians inside."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -148,6 +148,36 @@ class LocalizeRequest(_Strict):
     options: Options = Options()
 
 
+MOST_FRAMES = 16
+
+
+class BatchRequest(_Strict):
+    """The JSON part of a batch: request k goes with the parts rgbK and depthK."""
+
+    requests: list[LocalizeRequest] = Field(min_length=1, max_length=MOST_FRAMES)
+
+
+class SequenceFrame(_Strict):
+    """A pair of pictures of a sequence: frame k goes with the parts rgbK and depthK."""
+
+    camera: Camera
+    depth: Depth = Depth()
+    gravity: Vector | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
+    T_reference_camera: RigidTransform | None = Field(
+        None, description="where this camera stood against the first frame's; null in the first frame"
+    )
+
+
+class SequenceRequest(_Strict):
+    """The JSON part of a sequence: frames of a drive, or the cameras of a rig at one instant; the first one's pose is answered."""
+
+    map: str | None = Field(None, max_length=64, description="optional where one map is mounted")
+    frames: list[SequenceFrame] = Field(min_length=1, max_length=MOST_FRAMES)
+    T_vehicle_camera: RigidTransform | None = Field(None, description="where the first frame's camera sits")
+    prior: Prior | None = Field(None, description="of the first frame's camera")
+    options: Options = Options()
+
+
 class Street(BaseModel):
     """The street under the registered position; without registration the one that the nearest places voted for."""
 
@@ -174,6 +204,24 @@ class Pose(BaseModel):
     covariance: list[float] | None = Field(
         description="6x6, row by row, translation first, map axes, about this frame's origin; null: not known without registration"
     )
+
+
+class GeoPosition(BaseModel):
+    """On the WGS-84 ellipsoid, as OGC GeoPose spells it."""
+
+    lat: float = Field(description="degrees")
+    lon: float = Field(description="degrees")
+    h: float = Field(description="metres above the ellipsoid")
+
+
+class GeoPose(BaseModel):
+    """OGC GeoPose 1.0, Basic-Quaternion: from east, north, up at the position to the axes of what is posed.
+
+    That is the vehicle (x forward, y left, z up) where T_vehicle_camera was sent, else the camera (x right, y down, z forward).
+    """
+
+    position: GeoPosition
+    quaternion: Quaternion
 
 
 class Neighbour(BaseModel):
@@ -227,7 +275,9 @@ class LocalizeAnswer(BaseModel):
     street: Street | None = Field(description="null where the map has no streets, or the neighbours lie in none")
     pose: Pose = Field(description="T_map_camera")
     vehicle_pose: Pose | None = Field(description="T_map_vehicle, where T_vehicle_camera was sent")
-    geopose: dict[str, Any] | None = Field(description="null in this release; OGC GeoPose follows")
+    geopose: GeoPose | None = Field(
+        description="the vehicle's where T_vehicle_camera was sent, else the camera's; null where the map is not georeferenced"
+    )
     hypotheses: list[HypothesisOfPose] = Field(
         description="distinct poses that were registered, the best supported first; empty without registration"
     )

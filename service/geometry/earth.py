@@ -53,17 +53,29 @@ class Georeference:
             latitude = float(np.arctan2(z, flat * (1 - _E2 * n / (n + height))))
         return float(np.rad2deg(latitude)), float(np.rad2deg(np.arctan2(y, x))), height
 
+    def R_enu_map(self, position_m: Float64[NDArray[np.float64], "3"]) -> Float64[NDArray[np.float64], "3 3"]:
+        """From map axes to east, north and up at a position of the map; they part by a degree in a hundred kilometres."""
+        latitude_deg, longitude_deg, _ = self.to_earth(position_m)
+        turned: Float64[NDArray[np.float64], "3 3"] = (
+            _east_north_up(latitude_deg, longitude_deg) @ self._east_north_up().T
+        )
+        return turned
+
     def _origin(self) -> Float64[NDArray[np.float64], "3"]:
         return _earth_centred(self.latitude_deg, self.longitude_deg, self.height_m)
 
     def _east_north_up(self) -> Float64[NDArray[np.float64], "3 3"]:
-        """Rows: east, north and up at the origin, earth-centred."""
-        b, l = np.deg2rad([self.latitude_deg, self.longitude_deg])  # noqa: E741  # geodesy's own letters
-        return np.array([
-            [-np.sin(l), np.cos(l), 0.0],
-            [-np.sin(b) * np.cos(l), -np.sin(b) * np.sin(l), np.cos(b)],
-            [np.cos(b) * np.cos(l), np.cos(b) * np.sin(l), np.sin(b)],
-        ])  # fmt: skip
+        return _east_north_up(self.latitude_deg, self.longitude_deg)
+
+
+def _east_north_up(latitude_deg: float, longitude_deg: float) -> Float64[NDArray[np.float64], "3 3"]:
+    """Rows: east, north and up at a place, earth-centred."""
+    b, l = np.deg2rad([latitude_deg, longitude_deg])  # noqa: E741  # geodesy's own letters
+    return np.array([
+        [-np.sin(l), np.cos(l), 0.0],
+        [-np.sin(b) * np.cos(l), -np.sin(b) * np.sin(l), np.cos(b)],
+        [np.cos(b) * np.cos(l), np.cos(b) * np.sin(l), np.sin(b)],
+    ])  # fmt: skip
 
 
 def _earth_centred(latitude_deg: float, longitude_deg: float, height_m: float) -> Float64[NDArray[np.float64], "3"]:

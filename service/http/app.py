@@ -6,10 +6,15 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.http import problems, schema
+from service.contract import schema
+from service.contract.oscp import GeoPoseRequest
+from service.http import problems
+from service.http.asking import Asking
+from service.http.auth import AuthMiddleware
 from service.http.request_id import RequestIdMiddleware
-from service.http.routes import health, localize, maps
+from service.http.routes import health, localize, maps, oscp
 from service.runtime.engine import Engine
+from service.runtime.keys import KeyRing
 
 _DESCRIPTION = """Street, position and heading of one RGB and one depth picture against a LiDAR map.
 
@@ -18,17 +23,26 @@ x right, y down, z forward. Headings are counter-clockwise from map x, in (-180,
 `application/problem+json`, every response has an `X-Request-Id`."""
 
 
-def create_app(engine: Engine) -> FastAPI:
-    """The application; it neither opens nor closes the engine."""
+def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
+    """The application; it neither opens nor closes the engine.
+
+    Args:
+        engine: open.
+        keys: who may ask; None lets everybody.
+    """
     version = installed_version("streetfix")
     # FastAPI's pages about the contract load scripts and styles from other hosts, which a service must not make a browser do.
     app = FastAPI(
         title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False, docs_url=None, redoc_url=None
     )  # fmt: skip
-    app.include_router(localize.router_for(engine))
+    asking = Asking(engine)
+    app.include_router(localize.router_for(asking))
+    app.include_router(oscp.router_for(asking))
     app.include_router(maps.router_for(engine))
     app.include_router(health.router_for(engine, version))
-    app.add_middleware(RequestIdMiddleware)
+    if keys is not None:
+        app.add_middleware(AuthMiddleware, keys=keys)
+    app.add_middleware(RequestIdMiddleware, requested=engine.metrics.requested)  # outermost: the last one added
     problems.install(app)
     app.openapi = lambda: _openapi_of(app)  # type: ignore[method-assign]  # FastAPI's documented way
     return app
@@ -39,7 +53,13 @@ def _openapi_of(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = document["components"]["schemas"]
-        for model in (schema.LocalizeRequest, problems.Problem):
+        for model in (
+            schema.LocalizeRequest,
+            schema.SequenceRequest,
+            schema.BatchRequest,
+            GeoPoseRequest,
+            problems.Problem,
+        ):
             written = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(written.pop("$defs", {}))
             schemas[model.__name__] = written

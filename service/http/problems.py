@@ -12,7 +12,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.errors import Kind, RequestError, StreetfixError
+from service.contract.convert import request_error_from
+from service.errors import Kind, StreetfixError
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 1
@@ -22,6 +23,7 @@ STATUS_OF_KIND: dict[Kind, int] = {
     "unsupported": 415,
     "too_large": 413,
     "not_found": 404,
+    "unauthorized": 401,
     "busy": 503,
     "not_ready": 503,
     "deadline": 504,
@@ -69,48 +71,41 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _on_http)
 
 
-def problem_response(
-    *, status: int, code: str, title: str, detail: str, request_id: str, field: str = "", headers: Any = None
-) -> Response:
+def problem_response(problem: Problem, headers: Any = None) -> Response:
     """A problem as a response."""
-    problem = Problem(
-        type=f"/problems/{code}",
-        title=title,
-        status=status,
-        detail=detail,
-        code=code,
-        field=field or None,
+    all_headers = dict(headers or {})
+    if problem.status == 503:
+        all_headers["Retry-After"] = str(RETRY_AFTER_S)
+    return Response(problem.model_dump_json(), status_code=problem.status, media_type=MEDIA_TYPE, headers=all_headers)
+
+
+def problem_of(error: StreetfixError, request_id: str) -> Problem:
+    """An error of ours as a problem."""
+    return Problem(
+        type=f"/problems/{error.code}",
+        title=title_of(type(error)),
+        status=STATUS_OF_KIND[error.kind],
+        detail=error.message,
+        code=error.code,
+        field=error.field or None,
         request_id=request_id,
     )
-    all_headers = dict(headers or {})
-    if status == 503:
-        all_headers["Retry-After"] = str(RETRY_AFTER_S)
-    return Response(problem.model_dump_json(), status_code=status, media_type=MEDIA_TYPE, headers=all_headers)
 
 
 def internal_error(error: Exception, request_id: str) -> Response:
     """What nobody foresaw: the log gets the story, the caller the request id only."""
     _log.error("request_failed request_id=%s", request_id, exc_info=error)
-    return problem_response(
-        status=500,
-        code="internal",
-        title="Internal error.",
-        detail="The service failed on this request; tell its operator the request id.",
-        request_id=request_id,
-    )
+    problem = Problem(
+        type="/problems/internal", title="Internal error.", status=500,
+        detail="The service failed on this request; tell its operator the request id.", code="internal", field=None, request_id=request_id,
+    )  # fmt: skip
+    return problem_response(problem)
 
 
 async def _on_ours(request: Request, error: Exception) -> Response:
     if not isinstance(error, StreetfixError):
         raise error
-    return problem_response(
-        status=STATUS_OF_KIND[error.kind],
-        code=error.code,
-        title=title_of(type(error)),
-        detail=error.message,
-        field=error.field,
-        request_id=request.state.request_id,
-    )
+    return problem_response(problem_of(error, request.state.request_id))
 
 
 async def _on_invalid(request: Request, error: Exception) -> Response:
@@ -123,21 +118,13 @@ async def _on_http(request: Request, error: Exception) -> Response:
     if not isinstance(error, HTTPException):
         raise error
     path = json.dumps(request.url.path[:200])
-    return problem_response(
-        status=error.status_code,
-        code=CODE_OF_STATUS.get(error.status_code, "bad-request"),
-        title=HTTPStatus(error.status_code).phrase + ".",
+    code = CODE_OF_STATUS.get(error.status_code, "bad-request")
+    problem = Problem(
+        type=f"/problems/{code}", title=HTTPStatus(error.status_code).phrase + ".", status=error.status_code,
         detail=f"{request.method} {path}: {error.detail}; the API is described at /openapi.json",
-        request_id=request.state.request_id,
-        headers=error.headers,
-    )
-
-
-def request_error_from(errors: Any) -> RequestError:
-    """One error of ours from pydantic's list: the first field is named, the next ones are in the message."""
-    told = [f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg']}" for each in errors[:5]]
-    field = ".".join(str(part) for part in errors[0]["loc"])
-    return RequestError("; ".join(told) + "; see the schema at /openapi.json", field=field)
+        code=code, field=None, request_id=request.state.request_id,
+    )  # fmt: skip
+    return problem_response(problem, error.headers)
 
 
 def title_of(kind_of_error: type[StreetfixError]) -> str:

@@ -2,6 +2,8 @@
 
 import re
 import uuid
+from collections.abc import Callable
+from time import perf_counter
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect
@@ -10,14 +12,17 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.http.problems import internal_error
 
 HEADER = "X-Request-Id"
+#: As other servers count a caller that went away before the answer.
+_CLIENT_CLOSED = 499
 _ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 class RequestIdMiddleware:
     """Takes the caller's ``X-Request-Id`` if it is a plain one, else makes one; answers unforeseen errors with 500."""
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, requested: Callable[[str, str, str, float], None]) -> None:
         self._app = app
+        self._requested = requested
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -27,21 +32,24 @@ class RequestIdMiddleware:
         given = Headers(scope=scope).get(HEADER, "")
         request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = request_id
-        started = False
+        started, began, status = False, perf_counter(), 0
 
         async def send_with_id(message: Message) -> None:
-            nonlocal started
+            nonlocal started, status
             if message["type"] == "http.response.start":
-                started = True
+                started, status = True, message["status"]
                 MutableHeaders(scope=message)[HEADER] = request_id
             await send(message)
 
         try:
             await self._app(scope, receive, send_with_id)
         except ClientDisconnect:
-            return
+            status = _CLIENT_CLOSED
         except Exception as error:
             response = internal_error(error, request_id)
             if started:
                 raise
             await response(scope, receive, send_with_id)
+        finally:
+            operation = getattr(scope.get("route"), "operation_id", None) or "none"
+            self._requested("rest", operation, str(status), perf_counter() - began)

@@ -15,8 +15,20 @@ class Admission:
 
     def __init__(self, *, threads: int, queue: int, initializer: Callable[[], None] | None = None) -> None:
         self.capacity = threads + queue
-        self._slots = threading.Semaphore(self.capacity)
+        self._lock = threading.Lock()
+        self._taken = 0
+        self._working = 0
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="streetfix", initializer=initializer)
+
+    @property
+    def working(self) -> int:
+        """Tasks that a worker runs now."""
+        return self._working
+
+    @property
+    def waiting(self) -> int:
+        """Tasks that wait for a worker."""
+        return max(0, self._taken - self._working)
 
     def submit(self, task: Callable[[], T]) -> Future[T]:
         """Run a task on a worker; a cancelled future that still waits gives its place back and never runs.
@@ -24,16 +36,31 @@ class Admission:
         Raises:
             BusyError: all workers are at work and the queue is full.
         """
-        if not self._slots.acquire(blocking=False):
-            raise BusyError(f"{self.capacity} requests are being worked on or wait already; try again in a second")
+        with self._lock:
+            if self._taken == self.capacity:
+                raise BusyError(f"{self.capacity} requests are being worked on or wait already; try again in a second")
+            self._taken += 1
         try:
-            future = self._pool.submit(task)
+            future = self._pool.submit(self._run, task)
         except RuntimeError as error:
-            self._slots.release()
+            self._give_back()
             raise BusyError("the service is shutting down; try another instance") from error
-        future.add_done_callback(lambda _: self._slots.release())
+        future.add_done_callback(lambda _: self._give_back())
         return future
 
     def close(self) -> None:
         """Let running tasks end, drop waiting ones."""
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _run(self, task: Callable[[], T]) -> T:
+        with self._lock:
+            self._working += 1
+        try:
+            return task()
+        finally:
+            with self._lock:
+                self._working -= 1
+
+    def _give_back(self) -> None:
+        with self._lock:
+            self._taken -= 1

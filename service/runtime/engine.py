@@ -6,15 +6,18 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import RequestError
+from service.errors import RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
 from service.localization.answer import Answer
+from service.localization.frames import Frame
+from service.localization.localizer import Localizer
 from service.localization.prior import Prior
 from service.localization.query import Query
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
 from service.runtime.map_registry import MapRegistry
+from service.runtime.metrics import Metrics
 from service.runtime.settings import Settings
 from service.runtime.threads import limit_pools, usable_cores
 
@@ -64,6 +67,7 @@ class Engine:
         self.settings = settings
         self.threads = settings.threads or usable_cores()
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
+        self.metrics = Metrics(self.admission, registry)
 
     @classmethod
     def open(cls, settings: Settings) -> "Engine":
@@ -89,13 +93,57 @@ class Engine:
             UnsupportedFormatError: a picture's format is not read.
             TooLargeError: a picture is beyond the limits.
         """
-        localizer = self.registry.get(encoded.map_name)
+        return self.localize_sequence((encoded,), (np.eye(4),))
+
+    def localize_sequence(
+        self, encoded: tuple[EncodedQuery, ...], T_reference_camera: tuple[NDArray[np.float64], ...]
+    ) -> Located:
+        """Decode several pairs and localize them as one, in the thread of the caller.
+
+        Args:
+            encoded: the reference first; its map is asked.
+            T_reference_camera: of each; the first is the identity.
+
+        Raises:
+            StreetfixError: as for a single one; its field is under ``frames.K`` where there are several.
+        """
+        localizer = self.registry.get(encoded[0].map_name)
+        frames, decode_ms = [], 0.0
+        for number, (each, T) in enumerate(zip(encoded, T_reference_camera, strict=True)):
+            try:
+                frame, ms = self.look_up(localizer, each)
+            except StreetfixError as error:
+                if len(encoded) > 1:
+                    error.field = f"frames.{number}.{error.field}" if error.field else f"frames.{number}"
+                raise
+            frames.append(replace(frame, T_reference_camera=T))
+            decode_ms += ms
+        return self.answer(localizer, tuple(frames), decode_ms)
+
+    def answer(self, localizer: Localizer, frames: tuple[Frame, ...], decode_ms: float) -> Located:
+        """Answer frames that were looked up, and count the answer.
+
+        Args:
+            localizer: of the map they were looked up in.
+            frames: the reference first.
+            decode_ms: that decoding took.
+        """
+        answer = localizer.answer(frames)
+        timings = replace(answer.timings, decode_ms=decode_ms, total_ms=answer.timings.total_ms + decode_ms)
+        timed = replace(answer, timings=timings)
+        self.metrics.answered(timed, localizer.bundle, frames=len(frames))
+        return Located(timed, localizer.bundle)
+
+    def look_up(self, localizer: Localizer, encoded: EncodedQuery) -> tuple[Frame, float]:
+        """A pair decoded and looked up in a map, and the milliseconds that decoding took.
+
+        Raises:
+            StreetfixError: as ``localize``.
+        """
         started = perf_counter()
         query = replace(self._decode(encoded), prior=_prior_in(encoded, localizer.bundle))
-        decode_ms = 1e3 * (perf_counter() - started)
-        answer = localizer.localize(query)
-        timings = replace(answer.timings, decode_ms=decode_ms, total_ms=answer.timings.total_ms + decode_ms)
-        return Located(replace(answer, timings=timings), localizer.bundle)
+        decoded = perf_counter()
+        return localizer.look_up(query), 1e3 * (decoded - started)
 
     def close(self) -> None:
         """Let running work end and drop what waits."""

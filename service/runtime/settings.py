@@ -1,9 +1,10 @@
 """Settings of a service: defaults < environment ``STREETFIX_*`` < flags. Made once, in the command line."""
 
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.errors import RequestError
@@ -32,6 +33,24 @@ class Settings(BaseSettings):
     maps: Annotated[tuple[Path, ...], NoDecode] = Field((), description="map bundles, or folders of them; ':' between")
     host: str = Field("127.0.0.1", description="address to listen on; loopback unless told otherwise")
     port: int = Field(8000, ge=0, le=65535, description="0 lets the system choose")
+    grpc_port: int | None = Field(
+        None, ge=0, le=65535, description="gRPC beside REST, on the same host; default: not served"
+    )
+    api_keys: Path | None = Field(
+        None, description="file of API keys (streetfix keys); with it every request needs one"
+    )
+    tls_certificate: Path | None = Field(None, description="PEM chain; with it both faces speak TLS alone")
+    tls_key: Path | None = Field(None, description="PEM private key of the certificate")
+    tls_client_ca: Path | None = Field(
+        None, description="PEM authorities; clients need a certificate of theirs (mutual TLS)"
+    )
+    insecure_public: bool = Field(
+        False, description="listen beyond loopback although nobody has to show a key or certificate"
+    )
+    grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
+    grace_s: float = Field(
+        20.0, ge=0, le=3600, description="how long running requests may take to end when the service stops"
+    )
     threads: int | None = Field(None, ge=1, le=256, description="requests worked on at once; default: the usable cores")
     queue: int = Field(64, ge=0, le=100_000, description="requests that may wait for a thread before 503")
     request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
@@ -41,10 +60,34 @@ class Settings(BaseSettings):
     )  # fmt: skip
     limits: Limits = Limits()
 
+    @model_validator(mode="after")
+    def _safe(self) -> "Settings":
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key go together; set both or neither")
+        if self.tls_client_ca is not None and self.tls_certificate is None:
+            raise ValueError("tls_client_ca needs tls_certificate and tls_key")
+        guarded = self.api_keys is not None or self.tls_client_ca is not None
+        if not (guarded or self.insecure_public or is_loopback(self.host)):
+            raise ValueError(
+                f"host {self.host} can be reached from other machines, and anybody could ask; set api_keys (streetfix keys) or "
+                "tls_client_ca, or insecure_public if something before this service keeps strangers out"
+            )
+        return self
+
     @field_validator("maps", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return tuple(part for part in value.split(":") if part) if isinstance(value, str) else value
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is reached from this machine alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:  # a name, which may be anything
+        return False
 
 
 def load_settings(**flags: object) -> Settings:
@@ -59,4 +102,5 @@ def load_settings(**flags: object) -> Settings:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise RequestError(f"setting {where}: {first['msg']} (it is {first['input']!r})", field=where) from error
+        what = f"setting {where}: {first['msg']} (it is {first['input']!r})" if where else f"settings: {first['msg']}"
+        raise RequestError(what, field=where) from error

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from service.contract.schema import LocalizeRequest
 from service.http.openapi import main, openapi_text
-from service.http.schema import LocalizeRequest
 
 COMMITTED = Path(__file__).parents[2] / "openapi" / "openapi.json"
 

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from service.http import schema
+from service.contract import schema
 
 PROTO = Path(__file__).parents[2] / "proto"
 BUF = Path(sys.executable).parent / "buf"
@@ -61,3 +61,18 @@ def test_the_request_has_the_fields_of_the_rest_contract() -> None:
     expected = {renamed.get(name, name) for name in schema.LocalizeRequest.model_fields}
     assert fields_of("LocalizeRequest") == expected | {"rgb", "depth"}
     assert fields_of("DepthFormat") == set(schema.Depth.model_fields)
+
+
+def test_the_generated_code_is_that_of_the_proto(tmp_path: Path) -> None:
+    folder = "service/grpc/generated"
+    done = subprocess.run(
+        [sys.executable, "-m", "grpc_tools.protoc", "-I", f"{folder}={PROTO}", f"--python_out={tmp_path}", f"--pyi_out={tmp_path}",
+         f"--grpc_python_out={tmp_path}", f"{folder}/streetfix/v1/localization.proto"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    made = sorted((tmp_path / folder / "streetfix" / "v1").iterdir())
+    assert len(made) == 3
+    for path in made:
+        committed = PROTO.parent / path.relative_to(tmp_path)
+        assert committed.read_text() == path.read_text(), "make generate"

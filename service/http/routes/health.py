@@ -1,11 +1,13 @@
 """What an orchestrator asks."""
 
 from fastapi import APIRouter
+from starlette.responses import Response
 
+from service.contract import schema
 from service.errors import BundleError
-from service.http import schema
 from service.http.routes.localize import problems
 from service.runtime.engine import Engine
+from service.runtime.metrics import CONTENT_TYPE
 
 
 def router_for(engine: Engine, version: str) -> APIRouter:
@@ -23,6 +25,18 @@ def router_for(engine: Engine, version: str) -> APIRouter:
         if not engine.is_ready:
             raise BundleError("no map is mounted; start the service with a map bundle")
         return schema.Health()
+
+    @router.get(
+        "/metrics",
+        operation_id="getMetrics",
+        summary="What Prometheus scrapes",
+        response_class=Response,
+        responses={
+            200: {"content": {"text/plain": {"schema": {"type": "string"}}}, "description": "Prometheus' text format."}
+        },
+    )
+    def get_metrics() -> Response:
+        return Response(engine.metrics.text(), headers={"content-type": CONTENT_TYPE})
 
     @router.get("/v1/version", operation_id="getVersion", summary="What runs here")
     async def get_version() -> schema.Version:

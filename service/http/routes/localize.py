@@ -1,6 +1,8 @@
-"""POST /v1/localize."""
+"""POST /v1/localize, alone, as a sequence, and as a batch."""
 
 import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
 
@@ -8,12 +10,16 @@ from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.errors import BusyError, DeadlineError
-from service.http import schema
-from service.http.body import read_body, split_multipart
-from service.http.convert import answer_from, query_from_parts
-from service.http.problems import MEDIA_TYPE
-from service.runtime.engine import Engine
+from service.contract import schema
+from service.contract.convert import answer_from, fields_under, parsed, query_from, sequence_from
+from service.errors import StreetfixError
+from service.http.asking import Asking
+from service.http.body import split_multipart
+from service.http.geopose import GEOPOSE, sure_geopose, wants_geopose
+from service.http.outcome import BatchAnswer, Outcome
+from service.http.parts import document_of, numbered_pictures, require_parts
+from service.http.problems import MEDIA_TYPE, problem_of
+from service.runtime.engine import Engine, Located
 
 _REQUEST_BODY: dict[str, Any] = {
     "required": True,
@@ -44,17 +50,33 @@ _REQUEST_BODY: dict[str, Any] = {
 }
 
 
+def _numbered(document: str) -> dict[str, Any]:
+    """Body of several pairs: rgb0, depth0, rgb1, depth1 and so on, beside the JSON."""
+    pictures: dict[str, Any] = {}
+    for kind, formats in (("rgb", "as rgb of /v1/localize"), ("depth", "as depth of /v1/localize")):
+        for number in range(schema.MOST_FRAMES):
+            pictures[f"{kind}{number}"] = {"type": "string", "format": "binary", "description": formats}
+    properties = pictures | {"request": {"$ref": f"#/components/schemas/{document}"}}
+    content = {
+        "type": "object",
+        "required": ["rgb0", "depth0", "request"],
+        "additionalProperties": False,
+        "properties": properties,
+    }
+    encoding = {"request": {"contentType": "application/json"}}
+    return {"required": True, "content": {"multipart/form-data": {"schema": content, "encoding": encoding}}}
+
+
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """The documented problems of a route."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status: {"description": HTTPStatus(status).phrase, "content": content} for status in statuses}
 
 
-def router_for(engine: Engine) -> APIRouter:
-    """The route, bound to an engine."""
+def router_for(asking: Asking) -> APIRouter:
+    """The routes, bound to an engine."""
     router = APIRouter(tags=["localization"])
-    settings = engine.settings
-    bodies = asyncio.Semaphore(engine.admission.capacity)  # bounds the memory of bodies that are still coming in
+    engine = asking.engine
 
     @router.post(
         "/v1/localize",
@@ -65,34 +87,118 @@ def router_for(engine: Engine) -> APIRouter:
         openapi_extra={"requestBody": _REQUEST_BODY},
     )
     async def localize(request: Request) -> Response:
-        """Street, position and heading of one RGB and one depth picture.
+        """Street, pose with covariance, and confidence of one RGB and one depth picture.
 
-        The answer rests on retrieval: its position is the similarity-weighted mean of the best hypothesis' places.
-        `prior` is a reserved name, refused until it means something; `options.refine` allows what a later release does.
+        The most similar places of the map are looked up, the depth picture is registered on the map's cloud from each of them, and
+        the best supported pose is answered; with `options.refine` false it is the mean of the best hypothesis' places.
         """
-        if bodies.locked():
-            raise BusyError(
-                f"{engine.admission.capacity} requests are coming in or wait already; try again in a second"
-            )
-        try:
-            async with asyncio.timeout(settings.request_timeout_s), bodies:
-                return await _answer(engine, request)
-        except TimeoutError as error:
-            raise DeadlineError(
-                f"no answer within {settings.request_timeout_s:g} s; send the body faster, or try again later"
-            ) from error
+        return await ask(request, _single)
+
+    @router.post(
+        "/v1/localize/sequence",
+        operation_id="localizeSequence",
+        summary="Localize frames of a drive, or the cameras of a rig, as one",
+        response_model=schema.LocalizeAnswer,
+        responses=problems(404, 413, 415, 422, 503, 504),
+        openapi_extra={"requestBody": _numbered("SequenceRequest")},
+    )
+    async def localize_sequence(request: Request) -> Response:
+        """The pose of the first frame; the others say what it leaves open, as in a street of repeating blocks.
+
+        Every other frame comes with `T_reference_camera`: odometry, or where the camera sits on the rig.
+        """
+        return await ask(request, _sequence)
+
+    @router.post(
+        "/v1/localize/batch",
+        operation_id="localizeBatch",
+        summary="Localize several pairs, each on its own",
+        response_model=BatchAnswer,
+        responses=problems(413, 415, 422, 503, 504),
+        openapi_extra={"requestBody": _numbered("BatchRequest")},
+    )
+    async def localize_batch(request: Request) -> Response:
+        """An outcome for each request, in their order: an answer, or the problem that it alone would have got."""
+        return await ask(request, _batch)
+
+    async def ask(request: Request, work: Work) -> Response:
+        async def answer(body: bytearray) -> Response:
+            headers = request.headers
+            given = Given(
+                body, headers.get("content-type", ""), request.state.request_id,
+                geopose_alone=work is not _batch and wants_geopose(headers.get("accept", "")),
+            )  # fmt: skip
+            media_type = GEOPOSE if given.geopose_alone else "application/json"
+            return Response(await work(engine, given), media_type=media_type, headers={"Vary": "Accept"})
+
+        return await asking(request, answer)
 
     return router
 
 
-async def _answer(engine: Engine, request: Request) -> Response:
-    limits = engine.settings.limits
-    body = await read_body(request, max_bytes=limits.max_request_bytes)
-    content_type = request.headers.get("content-type", "")
+@dataclass(frozen=True, slots=True)
+class Given:
+    """A body that has come in whole."""
 
+    body: bytearray
+    content_type: str
+    request_id: str
+    geopose_alone: bool = False
+
+    def parts(self, most: int) -> dict[str, bytes]:
+        """Its parts."""
+        return split_multipart(self.body, self.content_type, max_parts=most)
+
+
+Work = Callable[[Engine, Given], Awaitable[bytes]]
+
+
+async def _single(engine: Engine, given: Given) -> bytes:
     def work() -> bytes:
-        query = query_from_parts(split_multipart(body, content_type, max_parts=limits.max_parts))
-        return answer_from(engine.localize(query)).model_dump_json(by_alias=True).encode()
+        parts = given.parts(engine.settings.limits.max_parts)
+        require_parts(parts, ("rgb", "depth", "request"))
+        request = parsed(parts["request"], schema.LocalizeRequest)
+        return _written(engine.localize(query_from(request, rgb=parts["rgb"], depth=parts["depth"])), given)
 
-    answer = await asyncio.wrap_future(engine.admission.submit(work))
-    return Response(answer, media_type="application/json")
+    return await asyncio.wrap_future(engine.admission.submit(work))
+
+
+async def _sequence(engine: Engine, given: Given) -> bytes:
+    def work() -> bytes:
+        parts = given.parts(2 * schema.MOST_FRAMES + 1)
+        request = parsed(document_of(parts), schema.SequenceRequest)
+        queries, transforms = sequence_from(request, numbered_pictures(parts, len(request.frames)))
+        return _written(engine.localize_sequence(queries, transforms), given)
+
+    return await asyncio.wrap_future(engine.admission.submit(work))
+
+
+async def _batch(engine: Engine, given: Given) -> bytes:
+    """Requests of a batch take workers one by one, as if each had come alone; those beyond the queue get their own problem."""
+
+    def split() -> list[tuple[schema.LocalizeRequest, bytes, bytes]]:
+        parts = given.parts(2 * schema.MOST_FRAMES + 1)
+        requests = parsed(document_of(parts), schema.BatchRequest).requests
+        pictures = numbered_pictures(parts, len(requests))
+        return [(request, *pair) for request, pair in zip(requests, pictures, strict=True)]
+
+    async def one(number: int, request: schema.LocalizeRequest, rgb: bytes, depth: bytes) -> Outcome:
+        def work() -> schema.LocalizeAnswer:
+            return answer_from(engine.localize(query_from(request, rgb=rgb, depth=depth)))
+
+        try:
+            with fields_under(f"requests.{number}"):
+                return Outcome(answer=await asyncio.wrap_future(engine.admission.submit(work)), problem=None)
+        except StreetfixError as error:
+            return Outcome(answer=None, problem=problem_of(error, given.request_id))
+
+    asked = await asyncio.wrap_future(engine.admission.submit(split))
+    outcomes = await asyncio.gather(*(one(number, *each) for number, each in enumerate(asked)))
+    return BatchAnswer(outcomes=list(outcomes)).model_dump_json(by_alias=True).encode()
+
+
+def _written(located: Located, given: Given) -> bytes:
+    answer = answer_from(located)
+    if not given.geopose_alone:
+        return answer.model_dump_json(by_alias=True).encode()
+    return sure_geopose(answer).model_dump_json().encode()

@@ -5,8 +5,9 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from service.http import schema
-from service.http.convert import map_entry_from
+from service.contract import schema
+from service.contract.convert import map_entry_from
+from service.contract.coverage import coverage_geojson
 from service.http.routes.localize import problems
 from service.runtime.engine import Engine
 
@@ -17,6 +18,14 @@ _STREETS: dict[int | str, dict[str, Any]] = {
         "content": {GEOJSON: {"schema": {"type": "object"}}},
     },
     **problems(404, 422),
+}
+
+_COVERAGE: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "A GeoJSON FeatureCollection with a MultiPolygon of each map; longitude and latitude where the map is "
+        "georeferenced, else metres of the map frame (`properties.frame`).",
+        "content": {GEOJSON: {"schema": {"type": "object"}}},
+    }
 }
 
 
@@ -37,5 +46,15 @@ def router_for(engine: Engine) -> APIRouter:
     )
     def get_streets(map: str) -> Response:  # noqa: A002  # the contract's name
         return Response(engine.registry.get(map).bundle.streets_geojson(), media_type=GEOJSON)
+
+    @router.get(
+        "/v1/coverage",
+        operation_id="getCoverage",
+        summary="Where the maps can answer",
+        response_class=Response,
+        responses=_COVERAGE,
+    )
+    def get_coverage() -> Response:
+        return Response(coverage_geojson([localizer.bundle for localizer in engine.registry]), media_type=GEOJSON)
 
     return router

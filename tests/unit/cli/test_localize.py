@@ -12,8 +12,8 @@ from rich.console import Console
 from service.cli.answer_text import print_answer
 from service.cli.localize import localize
 from service.cli.main import main
+from service.contract.schema import Prior
 from service.errors import RefusedError, RequestError, UnreachableError
-from service.http.schema import Prior
 
 ANSWER: dict[str, Any] = {
     "status": "LOCALIZED",

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.contract.convert import answer_from, parsed, query_from
+from service.contract.schema import LocalizeRequest
 from service.errors import RequestError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
-from service.http.convert import answer_from, query_from_parts
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
 from service.localization.query import Query
@@ -20,19 +21,23 @@ from service.runtime.engine import Located
 BOTH = {"position": {"x": 1, "y": 2}, "wgs84": {"latitude_deg": 0, "longitude_deg": 0}}
 
 
+def query_of(parts):
+    return query_from(parsed(parts["request"], LocalizeRequest), rgb=parts["rgb"], depth=parts["depth"])
+
+
 @pytest.fixture
 def prior_of(parts_of):
     """The prior that a request's JSON asks for, and its degrees."""
 
     def made(prior):
-        encoded = query_from_parts(parts_of(prior=prior))
+        encoded = query_of(parts_of(prior=prior))
         return encoded.prior, encoded.prior_wgs84
 
     return made
 
 
 def test_a_request_without_a_prior_has_none(parts_of):
-    encoded = query_from_parts(parts_of())
+    encoded = query_of(parts_of())
     assert (encoded.prior, encoded.prior_wgs84, encoded.false_accept_rate) == (None, None, None)
 
 
@@ -82,7 +87,7 @@ def test_a_prior_that_says_too_much_or_nothing_is_refused(prior_of, prior, messa
 
 
 def test_a_rate_of_false_accepts_is_passed_on(parts_of):
-    assert query_from_parts(parts_of(options={"false_accept_rate": 0.02})).false_accept_rate == 0.02
+    assert query_of(parts_of(options={"false_accept_rate": 0.02})).false_accept_rate == 0.02
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +100,9 @@ def localized(bundle_path, pictures):
 def candidate(support, *, xyz, heading_deg=0.0):
     R, at = rotation_z(np.deg2rad(heading_deg)), np.array(xyz, np.float64)
     registered = Registered(R, at, 1.0, 0.0, 0.7, np.eye(8), 0)
-    return Candidate(transform_from(R @ R_BODY_OPTICAL, at), registered, 0.8, Agreement(-1.5, 0.0, 0.0, 0.0), support)
+    return Candidate(
+        transform_from(R @ R_BODY_OPTICAL, at), registered, 0.8, 1.5, Agreement(-1.5, 0.0, 0.0, 0.0), support
+    )
 
 
 def hypotheses_of(localized, *candidates):

@@ -1,0 +1,179 @@
+"""Between protobuf messages and the contract's models, in which limits and meanings are checked once for every face."""
+
+from typing import Any
+
+from google.protobuf.message import Message
+
+from service.contract import schema
+from service.contract.convert import checked
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+
+_KINDS = {
+    pb.DEPTH_KIND_UNSPECIFIED: "z",
+    pb.DEPTH_KIND_Z: "z",
+    pb.DEPTH_KIND_RANGE: "range",
+    pb.DEPTH_KIND_DISPARITY: "disparity",
+}
+_ENCODINGS = {pb.DEPTH_ENCODING_UNSPECIFIED: "auto", pb.DEPTH_ENCODING_CARLA: "carla"}
+_MODELS = {pb.CAMERA_MODEL_UNSPECIFIED: "PINHOLE", pb.CAMERA_MODEL_PINHOLE: "PINHOLE"}
+_STATUS = {
+    "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED, "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
+    "OUT_OF_MAP": pb.LOCALIZATION_STATUS_OUT_OF_MAP,
+}  # fmt: skip
+_SECTIONS = {
+    None: pb.STREET_SECTION_UNSPECIFIED, "beginning": pb.STREET_SECTION_BEGINNING, "end": pb.STREET_SECTION_END,
+}  # fmt: skip
+
+
+def request_from(message: pb.LocalizeRequest) -> schema.LocalizeRequest:
+    """One pair's request, without its pictures.
+
+    Raises:
+        RequestError: a field makes no sense.
+    """
+    content = _of_pair(message) | _of_all(message)
+    return checked(content, schema.LocalizeRequest)
+
+
+def sequence_request_from(message: pb.LocalizeSequenceRequest) -> schema.SequenceRequest:
+    """A sequence's request, without its pictures.
+
+    Raises:
+        RequestError: a field makes no sense.
+    """
+    frames = [
+        _of_pair(frame) | _sub(frame, "reference_from_camera", "T_reference_camera", transform_content)
+        for frame in message.frames
+    ]
+    return checked(_of_all(message) | {"frames": frames}, schema.SequenceRequest)
+
+
+def transform_from(message: pb.RigidTransform) -> schema.RigidTransform:
+    """A transform on its own.
+
+    Raises:
+        RequestError: a number makes no sense.
+    """
+    return checked(transform_content(message), schema.RigidTransform)
+
+
+def _of_all(message: pb.LocalizeRequest | pb.LocalizeSequenceRequest) -> dict[str, Any]:
+    """What a single pair and a sequence both say."""
+    return (
+        _given(message, "map") | _sub(message, "vehicle_from_camera", "T_vehicle_camera", transform_content)
+        | _sub(message, "prior", "prior", _prior)
+        | _sub(message, "options", "options", lambda m: _given(m, "neighbours", "refine", "false_accept_rate"))
+    )  # fmt: skip
+
+
+def _of_pair(message: pb.LocalizeRequest | pb.SequenceFrame) -> dict[str, Any]:
+    """What goes with one pair of pictures."""
+    return (
+        _sub(message, "camera", "camera", _camera) | _sub(message, "depth_format", "depth", _depth)
+        | _sub(message, "gravity", "gravity", _vector)
+    )  # fmt: skip
+
+
+def _camera(message: pb.Camera) -> dict[str, Any]:
+    numbers = {name: getattr(message, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    return numbers | {"model": _MODELS.get(message.model, message.model), "distortion": list(message.distortion)}
+
+
+def _depth(message: pb.DepthFormat) -> dict[str, Any]:
+    named = {
+        "kind": _KINDS.get(message.kind, message.kind),
+        "encoding": _ENCODINGS.get(message.encoding, message.encoding),
+    }
+    return named | _given(message, "scale_m", "max_range_m", "baseline_m")
+
+
+def _prior(message: pb.Prior) -> dict[str, Any]:
+    return (
+        _given(message, "heading_deg", "heading_std_deg")
+        | _sub(message, "position", "position", lambda m: {"x": m.x, "y": m.y} | _given(m, "std_m"))
+        | _sub(
+            message, "wgs84", "wgs84",
+            lambda m: {"latitude_deg": m.latitude_deg, "longitude_deg": m.longitude_deg} | _given(m, "std_m"),
+        )
+    )  # fmt: skip
+
+
+def transform_content(message: pb.RigidTransform) -> dict[str, Any]:
+    """As the contract's model takes it; a quaternion that was left out is no rotation, and refused later."""
+    q = message.orientation
+    return {"position": _vector(message.position), "orientation": {"x": q.x, "y": q.y, "z": q.z, "w": q.w}}
+
+
+def _vector(message: pb.Vector3) -> dict[str, float]:
+    return {"x": message.x, "y": message.y, "z": message.z}
+
+
+def _given(message: Message, *names: str) -> dict[str, Any]:
+    """Optional fields that were sent."""
+    return {name: getattr(message, name) for name in names if message.HasField(name)}
+
+
+def _sub(message: Message, field: str, name: str, content: Any) -> dict[str, Any]:
+    """A message inside another, if it was sent."""
+    return {name: content(getattr(message, field))} if message.HasField(field) else {}
+
+
+def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
+    """The contract's answer as a message."""
+    times = answer.timings_ms
+    message = pb.LocalizeResponse(
+        status=_STATUS[answer.status],
+        confidence=answer.confidence,
+        street=None if answer.street is None else _street(answer.street),
+        pose=_pose(answer.pose),
+        vehicle_pose=None if answer.vehicle_pose is None else _pose(answer.vehicle_pose),
+        geopose=None if answer.geopose is None else _geopose(answer.geopose),
+        neighbours=[
+            pb.Neighbour(
+                place=each.place, distance=each.distance, similarity=each.similarity, street=each.street,
+                position=_vector3(each.position), heading_deg=each.heading_deg,
+            )
+            for each in answer.neighbours
+        ],
+        map=pb.MapVersion(name=answer.map.name, version=answer.map.version),
+        timings=pb.Timings(
+            decode_ms=times.decode, fuse_ms=times.fuse, encode_ms=times.encode, search_ms=times.search,
+            register_ms=times.register_, total_ms=times.total,
+        ),
+        hypotheses=[
+            pb.Hypothesis(pose=_pose(each.pose), share=each.share, inliers=each.inliers, similarity=each.similarity)
+            for each in answer.hypotheses
+        ],
+    )  # fmt: skip
+    return message
+
+
+def map_message(entry: schema.MapEntry) -> pb.MapEntry:
+    """A mounted map as a message."""
+    return pb.MapEntry(**entry.model_dump())
+
+
+def _geopose(geopose: schema.GeoPose) -> pb.GeoPose:
+    at, q = geopose.position, geopose.quaternion
+    return pb.GeoPose(
+        latitude_deg=at.lat, longitude_deg=at.lon, height_m=at.h, orientation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w)
+    )
+
+
+def _street(street: schema.Street) -> pb.Street:
+    return pb.Street(
+        id=street.id, name=street.name, street=street.street, section=_SECTIONS[street.section],
+        class_index=street.class_index, vote=street.vote,
+    )  # fmt: skip
+
+
+def _pose(pose: schema.Pose) -> pb.Pose:
+    q = pose.orientation
+    return pb.Pose(
+        position=_vector3(pose.position), orientation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w), heading_deg=pose.heading_deg,
+        covariance=pose.covariance or (),
+    )  # fmt: skip
+
+
+def _vector3(vector: schema.Vector) -> pb.Vector3:
+    return pb.Vector3(x=vector.x, y=vector.y, z=vector.z)

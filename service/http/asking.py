@@ -1,0 +1,42 @@
+"""How every route that localizes takes its body: counted, bounded in number and in time."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.errors import BusyError, DeadlineError
+from service.http.body import read_body
+from service.runtime.engine import Engine
+
+
+class Asking:
+    """Reads bodies for an engine; one for all routes of an application."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._bodies = asyncio.Semaphore(
+            engine.admission.capacity
+        )  # bounds the memory of bodies that are still coming in
+
+    async def __call__(self, request: Request, work: Callable[[bytearray], Awaitable[Response]]) -> Response:
+        """Read the body and work on it.
+
+        Raises:
+            BusyError: as many come in, or wait, as may.
+            TooLargeError: the body is beyond the limit.
+            DeadlineError: body and work took longer than a request may.
+        """
+        settings = self.engine.settings
+        if self._bodies.locked():
+            raise BusyError(
+                f"{self.engine.admission.capacity} requests are coming in or wait already; try again in a second"
+            )
+        try:
+            async with asyncio.timeout(settings.request_timeout_s), self._bodies:
+                return await work(await read_body(request, max_bytes=settings.limits.max_request_bytes))
+        except TimeoutError as error:
+            raise DeadlineError(
+                f"no answer within {settings.request_timeout_s:g} s; send the body faster, or try again later"
+            ) from error

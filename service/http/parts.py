@@ -1,0 +1,40 @@
+"""Which parts a multipart body must have, and the pictures among them."""
+
+from service.errors import RequestError
+
+
+def require_parts(parts: dict[str, bytes], names: tuple[str, ...]) -> None:
+    """Exactly these.
+
+    Raises:
+        RequestError: one is missing, or one is unknown.
+    """
+    told = f"send the parts {', '.join(names[:-1])} and {names[-1]}"
+    for name in names:
+        if name not in parts:
+            raise RequestError(f"the part {name!r} is missing; {told}", field=name)
+    if unknown := sorted(set(parts) - set(names)):
+        raise RequestError(f"the part {unknown[0]!r} is unknown; {told}", field=unknown[0])
+
+
+def document_of(parts: dict[str, bytes]) -> bytes:
+    """The JSON part.
+
+    Raises:
+        RequestError: it is missing.
+    """
+    if "request" not in parts:
+        raise RequestError(
+            "the part 'request' is missing; send the JSON that says what the pictures are", field="request"
+        )
+    return parts["request"]
+
+
+def numbered_pictures(parts: dict[str, bytes], count: int) -> list[tuple[bytes, bytes]]:
+    """rgb0, depth0, rgb1, depth1 and so on, in pairs.
+
+    Raises:
+        RequestError: one is missing, or there are others.
+    """
+    require_parts(parts, (*(f"{kind}{k}" for k in range(count) for kind in ("rgb", "depth")), "request"))
+    return [(parts[f"rgb{k}"], parts[f"depth{k}"]) for k in range(count)]

@@ -1,0 +1,70 @@
+"""The OSCP GeoPose Protocol, version 2, so that its clients work unchanged."""
+
+import asyncio
+import re
+import time
+import uuid
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.contract.convert import answer_from, parsed
+from service.contract.oscp import GeoPoseAnswer, GeoPoseRequest, accuracy_of, query_of
+from service.http.asking import Asking
+from service.http.geopose import sure_geopose
+from service.http.routes.localize import problems
+
+MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"
+_VERSION = re.compile(r"application/vnd\.oscp\+json\s*;\s*version\s*=\s*\"?([0-9.]+)", re.IGNORECASE)
+_BODY: dict[str, Any] = {
+    "required": True, "content": {"application/json": {"schema": {"$ref": "#/components/schemas/GeoPoseRequest"}}},
+}  # fmt: skip
+
+
+def router_for(asking: Asking) -> APIRouter:
+    """The routes, bound to an engine."""
+    router = APIRouter(tags=["geopose"])
+    engine = asking.engine
+
+    @router.get("/geopose", operation_id="getGeoPoseStatus", summary="Whether the protocol is served")
+    async def status() -> dict[str, str]:
+        return {"status": "running", "protocol": "OSCP GeoPose Protocol", "version": "2.0"}
+
+    @router.post(
+        "/geopose",
+        operation_id="postGeoPose",
+        summary="Localize by the OSCP GeoPose Protocol 2.0",
+        response_model=GeoPoseAnswer,
+        responses=problems(400, 404, 413, 422, 503, 504),
+        openapi_extra={"requestBody": _BODY},
+    )
+    async def geopose(request: Request, map: Annotated[str | None, Query(max_length=64)] = None) -> Response:  # noqa: A002
+        """Where a camera stands on the Earth: colour and DEPTH readings in, a GeoPose out.
+
+        `Accept: application/vnd.oscp+json;version=2.0` is needed. Intrinsics are COLMAP's (the corner of the first pixel is (0, 0));
+        DEPTH is a 16-bit PNG in millimetres or a float TIFF in metres; the accelerometer's axes are W3C's. An answer that is not sure
+        is the problem `no-pose`, since the protocol has no word for doubt. `map` chooses among several maps.
+        """
+        found = _VERSION.search(request.headers.get("accept", ""))
+        if found is None or found[1].split(".")[0] != "2":
+            said = "none" if found is None else found[1]
+            raise HTTPException(400, f"the protocol's version is {said}; send Accept: {MEDIA_TYPE}")
+
+        async def answer(body: bytearray) -> Response:
+            def work() -> bytes:
+                asked = parsed(bytes(body), GeoPoseRequest)
+                located = answer_from(engine.localize(query_of(asked, map)))
+                told = GeoPoseAnswer(
+                    id=asked.id or uuid.uuid4().hex, timestamp=time.time_ns() // 1_000_000,
+                    accuracy=accuracy_of(located.pose.covariance), geopose=sure_geopose(located),
+                )  # fmt: skip
+                return told.model_dump_json().encode()
+
+            return Response(await asyncio.wrap_future(engine.admission.submit(work)), media_type=MEDIA_TYPE)
+
+        return await asking(request, answer)
+
+    return router

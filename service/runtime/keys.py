@@ -1,0 +1,92 @@
+"""API keys: who may ask. The file holds names and hashes, never a key."""
+
+import hashlib
+import hmac
+import re
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.errors import KeysError, UnauthorizedError
+
+_NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_HASH = re.compile(r"[0-9a-f]{64}")
+_MOST_BYTES, _MOST_KEY = 2**20, 512
+
+
+@dataclass(frozen=True, slots=True)
+class KeyRing:
+    """Names of callers by the SHA-256 of their keys.
+
+    A key is 256 random bits, so no table of likely keys can be made and a plain hash is enough; a slow one would only cost
+    every request.
+    """
+
+    name_of: dict[str, str]
+
+    @classmethod
+    def open(cls, path: Path) -> "KeyRing":
+        """Read a file with a line ``NAME SHA256`` for each caller; ``#`` begins a remark.
+
+        Raises:
+            KeysError: it is not there, too large, empty, or a line of it is no such thing.
+        """
+        try:
+            with path.open("rb") as file:
+                content = file.read(_MOST_BYTES + 1)
+            text = content.decode("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise KeysError(
+                f"{path}: the file of API keys cannot be read ({error}); streetfix keys makes its lines"
+            ) from error
+        if len(content) > _MOST_BYTES:
+            raise KeysError(f"{path}: over {_MOST_BYTES} bytes is no file of API keys")
+        found: dict[str, str] = {}
+        for number, line in enumerate(text.splitlines(), 1):
+            words = line.split("#", 1)[0].split()
+            if not words:
+                continue
+            if len(words) != 2 or not _NAME.fullmatch(words[0]) or not _HASH.fullmatch(words[1]):
+                raise KeysError(
+                    f"{path}: line {number} is not NAME SHA256 (64 hexadecimal digits); streetfix keys makes such a line"
+                )
+            if words[1] in found or words[0] in found.values():
+                raise KeysError(f"{path}: line {number} has the name or the key of a line before it; keep one of them")
+            found[words[1]] = words[0]
+        if not found:
+            raise KeysError(f"{path}: there is no key in it, so nobody could ask; streetfix keys NAME >> {path}")
+        return cls(found)
+
+    def require(self, presented: str | None) -> str:
+        """Name of the caller.
+
+        Raises:
+            UnauthorizedError: no key, or not one of ours.
+        """
+        if not presented:
+            raise UnauthorizedError(
+                "this service asks for an API key; send it as Authorization: Bearer KEY, or as X-Api-Key"
+            )
+        digest = hash_of(presented[:_MOST_KEY])
+        for known, name in self.name_of.items():
+            if hmac.compare_digest(known, digest):
+                return name
+        raise UnauthorizedError("the API key is none of this service's; ask its operator for one")
+
+
+def presented_key(authorization: str | None, api_key: str | None) -> str | None:
+    """The key among the two headers that may carry it."""
+    scheme, _, value = (authorization or "").partition(" ")
+    if scheme.lower() == "bearer" and value.strip():
+        return value.strip()
+    return api_key or None
+
+
+def new_key() -> str:
+    """256 random bits, as text."""
+    return "sf_" + secrets.token_urlsafe(32)
+
+
+def hash_of(key: str) -> str:
+    """What the file keeps of a key."""
+    return hashlib.sha256(key.encode("utf-8", "replace")).hexdigest()

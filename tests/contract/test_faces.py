@@ -1,0 +1,186 @@
+"""The same request gets the same answer through every face, over real sockets."""
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import pytest
+import uvicorn
+from google.protobuf.json_format import MessageToDict
+
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+from service.grpc.server import GrpcServer
+from service.http.app import create_app
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
+
+Parts = Callable[..., dict[str, bytes]]
+CAMERA = pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
+DEPTH = pb.DepthFormat(scale_m=1)
+#: Where the second of two frames stood: the camera 1 m further along its optical axis.
+AHEAD = {"position": {"x": 0.0, "y": 0.0, "z": 1.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+
+
+@pytest.fixture(scope="module")
+def faces(bundle_path: Path) -> Iterator[tuple[httpx.Client, LocalizationServiceStub]]:
+    """REST and gRPC on one engine."""
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1, queue=16))
+    server = uvicorn.Server(uvicorn.Config(create_app(engine), port=0, log_config=None, lifespan="off"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        assert thread.is_alive()
+    port = server.servers[0].sockets[0].getsockname()[1]
+    grpc_server = GrpcServer(engine, host="127.0.0.1", port=0)
+    grpc_server.start()
+    with (
+        grpc.insecure_channel(f"127.0.0.1:{grpc_server.port}") as channel,
+        httpx.Client(base_url=f"http://127.0.0.1:{port}") as client,
+    ):
+        yield client, LocalizationServiceStub(channel)
+    grpc_server.stop(grace_s=1)
+    server.should_exit = True
+    thread.join()
+    engine.close()
+
+
+def flat(answer: dict[str, Any]) -> dict[str, Any]:
+    """An answer of either face with the other's spelling taken off: no times, no nulls, no empty lists, one name for a value."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {
+                k: plain(v) for k, v in value.items() if v not in (None, [], {}) and k not in ("timings", "timings_ms")
+            }
+        if isinstance(value, list):
+            return [plain(each) for each in value]
+        if isinstance(value, str):
+            return value.removeprefix("LOCALIZATION_STATUS_").removeprefix("STREET_SECTION_").lower()
+        return float(value) if isinstance(value, int) else value
+
+    return plain(answer)  # type: ignore[no-any-return]
+
+
+def of_message(message: pb.LocalizeResponse) -> dict[str, Any]:
+    return flat(MessageToDict(message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True))
+
+
+def posted(client: httpx.Client, path: str, parts: dict[str, bytes]) -> Any:
+    response = client.post(path, files={name: (name, data) for name, data in parts.items()})
+    assert response.status_code == 200, response.text
+    return response.json()
+
+
+def pair(parts: dict[str, bytes]) -> dict[str, bytes]:
+    return {"rgb": parts["rgb"], "depth": parts["depth"]}
+
+
+def numbered(parts: dict[str, bytes], count: int, document: dict[str, Any]) -> dict[str, bytes]:
+    pictures = {f"{name}{k}": parts[name] for k in range(count) for name in ("rgb", "depth")}
+    return pictures | {"request": json.dumps(document).encode()}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({}, {}),
+        ({"options": {"refine": False, "neighbours": 3}}, {"options": pb.Options(refine=False, neighbours=3)}),
+        ({"gravity": {"x": 0.02, "y": 1, "z": 0}}, {"gravity": pb.Vector3(x=0.02, y=1)}),
+        ({"T_vehicle_camera": AHEAD}, {"vehicle_from_camera": AHEAD}),
+        ({"map": "tiny", "prior": {"position": {"x": 20, "y": 2}, "heading_deg": 90}},
+         {"map": "tiny", "prior": pb.Prior(position=pb.PriorPosition(x=20, y=2), heading_deg=90)}),
+    ],
+)  # fmt: skip
+def test_one_pair(faces: Any, parts_of: Parts, changed: dict[str, Any], message: dict[str, Any]) -> None:
+    client, stub = faces
+    parts = parts_of(**changed)
+    rest = posted(client, "/v1/localize", parts)
+    request = pb.LocalizeRequest(**pair(parts), camera=CAMERA, depth_format=DEPTH, **message)
+    assert of_message(stub.Localize(request)) == flat(rest)
+    assert rest["pose"]["position"]["x"] == pytest.approx(20, abs=0.3)
+
+
+def test_a_sequence(faces: Any, parts_of: Parts) -> None:
+    client, stub = faces
+    parts = parts_of()
+    request = json.loads(parts["request"])
+    frames = [request, request | {"T_reference_camera": AHEAD}]
+    rest = posted(client, "/v1/localize/sequence", numbered(parts, 2, {"map": "tiny", "frames": frames}))
+    message = pb.SequenceFrame(**pair(parts), camera=CAMERA, depth_format=DEPTH)
+    ahead = pb.SequenceFrame(**pair(parts), camera=CAMERA, depth_format=DEPTH, reference_from_camera=AHEAD)
+    answer = stub.LocalizeSequence(pb.LocalizeSequenceRequest(map="tiny", frames=[message, ahead])).answer
+    assert of_message(answer) == flat(rest)
+    alone = posted(client, "/v1/localize", parts)
+    assert rest["pose"]["covariance"] != alone["pose"]["covariance"]  # the second frame had its say
+
+
+def test_a_batch_answers_each_on_its_own(faces: Any, parts_of: Parts) -> None:
+    client, stub = faces
+    parts = parts_of()
+    good, lost = json.loads(parts["request"]), json.loads(parts["request"]) | {"map": "west"}
+    rest = posted(client, "/v1/localize/batch", numbered(parts, 2, {"requests": [good, lost]}))["outcomes"]
+    message = pb.LocalizeRequest(**pair(parts), camera=CAMERA, depth_format=DEPTH)
+    elsewhere = pb.LocalizeRequest(**pair(parts), camera=CAMERA, depth_format=DEPTH, map="west")
+    outcomes = stub.LocalizeBatch(pb.LocalizeBatchRequest(requests=[message, elsewhere])).outcomes
+    assert of_message(outcomes[0].answer) == flat(rest[0]["answer"]) == flat(posted(client, "/v1/localize", parts))
+    assert (rest[0]["problem"], rest[1]["answer"]) == (None, None)
+    problem, other = rest[1]["problem"], outcomes[1].problem
+    assert (other.code, other.title, other.detail, other.field) == tuple(
+        problem[name] for name in ("code", "title", "detail", "field")
+    )
+    assert (problem["code"], problem["field"], problem["status"]) == ("unknown-map", "requests.1.map", 404)
+
+
+def test_a_stream_is_a_sequence_that_grows(faces: Any, parts_of: Parts) -> None:
+    client, stub = faces
+    parts = parts_of()
+    frame = pb.LocalizeRequest(**pair(parts), camera=CAMERA, depth_format=DEPTH)
+
+    def drive() -> Iterator[pb.LocalizeStreamRequest]:
+        yield pb.LocalizeStreamRequest(frame=frame)
+        yield pb.LocalizeStreamRequest(frame=frame, previous_from_camera=AHEAD)
+        yield pb.LocalizeStreamRequest(frame=pb.LocalizeRequest(camera=CAMERA), previous_from_camera=AHEAD)
+        yield pb.LocalizeStreamRequest(frame=frame, previous_from_camera=AHEAD)
+        yield pb.LocalizeStreamRequest(frame=frame)
+
+    answers = list(stub.LocalizeStream(drive()))
+    assert [answer.frames for answer in answers] == [1, 2, 0, 1, 1]
+    assert answers[2].outcome.problem.field == "frame 2.rgb"
+    alone = flat(posted(client, "/v1/localize", parts))
+    assert [of_message(answers[k].outcome.answer) == alone for k in (0, 1, 3, 4)] == [True, False, True, True]
+    # From the newer frame the older one stood 1 m behind.
+    behind = AHEAD | {"position": {"x": 0.0, "y": 0.0, "z": -1.0}}
+    request = json.loads(parts["request"])
+    document = {"frames": [request, request | {"T_reference_camera": behind}]}
+    rest = posted(client, "/v1/localize/sequence", numbered(parts, 2, document))
+    assert of_message(answers[1].outcome.answer) == flat(rest)
+
+
+def test_a_stream_remembers_five_frames(faces: Any, parts_of: Parts) -> None:
+    _, stub = faces
+    frame = pb.LocalizeRequest(**pair(parts_of()), camera=CAMERA, depth_format=DEPTH)
+    stay = AHEAD | {"position": {"x": 0.0, "y": 0.0, "z": 0.0}}
+    requests = [pb.LocalizeStreamRequest(frame=frame, previous_from_camera=stay if k else None) for k in range(7)]
+    assert [answer.frames for answer in stub.LocalizeStream(iter(requests))] == [1, 2, 3, 4, 5, 5, 5]
+
+
+def test_maps_streets_and_coverage(faces: Any) -> None:
+    client, stub = faces
+    maps = client.get("/v1/maps").json()["maps"]
+    listed = [
+        MessageToDict(entry, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+        for entry in stub.ListMaps(pb.ListMapsRequest()).maps
+    ]
+    assert listed == maps
+    assert stub.GetStreets(pb.GetStreetsRequest(map="tiny")).geojson == client.get("/v1/maps/tiny/streets").content
+    coverage = client.get("/v1/coverage")
+    assert stub.GetCoverage(pb.GetCoverageRequest()).geojson == coverage.content
+    assert stub.GetCoverage(pb.GetCoverageRequest(map="tiny")).geojson == coverage.content
+    assert coverage.headers["content-type"] == "application/geo+json"
+    (feature,) = coverage.json()["features"]
+    assert (feature["properties"]["map"], feature["geometry"]["type"]) == ("tiny", "MultiPolygon")

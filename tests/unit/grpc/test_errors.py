@@ -1,0 +1,244 @@
+"""What a gRPC client sees when something is wrong."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from google.rpc import error_details_pb2
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from grpc_status import rpc_status
+
+from service.errors import AddressError, Kind
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+from service.grpc.server import SERVICE, GrpcServer
+from service.grpc.status import CODE_OF_KIND
+from service.runtime.engine import Engine
+from service.runtime.settings import Limits, Settings
+
+Parts = Callable[..., dict[str, bytes]]
+CAMERA = pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
+
+
+@pytest.fixture
+def engine(bundle_path: Path) -> Iterator[Engine]:
+    limits = Limits(max_request_bytes=200_000)
+    engine = Engine.open(
+        Settings(maps=(bundle_path,), threads=1, queue=1, grpc_streams=1, request_timeout_s=2, limits=limits)
+    )
+    yield engine
+    engine.close()
+
+
+@pytest.fixture
+def channel(engine: Engine) -> Iterator[grpc.Channel]:
+    server = GrpcServer(engine, host="127.0.0.1", port=0)
+    server.start()
+    with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
+        yield channel
+    server.stop(grace_s=0)
+
+
+@pytest.fixture
+def stub(channel: grpc.Channel) -> LocalizationServiceStub:
+    return LocalizationServiceStub(channel)
+
+
+@pytest.fixture
+def request_of(parts_of: Parts) -> Callable[..., pb.LocalizeRequest]:
+    def make(**changed: Any) -> pb.LocalizeRequest:
+        parts = parts_of()
+        given = {"rgb": parts["rgb"], "depth": parts["depth"], "camera": CAMERA} | changed
+        return pb.LocalizeRequest(**{name: value for name, value in given.items() if value is not None})
+
+    return make
+
+
+def details(error: grpc.RpcError) -> dict[str, Any]:
+    """The details of a refused call by their type."""
+    kinds = {
+        "ErrorInfo": error_details_pb2.ErrorInfo,
+        "BadRequest": error_details_pb2.BadRequest,
+        "RetryInfo": error_details_pb2.RetryInfo,
+    }
+    found = {}
+    status = rpc_status.from_call(error)
+    for detail in () if status is None else status.details:
+        name = detail.type_url.rsplit(".", 1)[-1]
+        found[name] = kinds[name]()
+        detail.Unpack(found[name])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("changed", "code", "reason", "field"),
+    [
+        ({"camera": None}, grpc.StatusCode.INVALID_ARGUMENT, "request", "camera"),
+        ({"camera": pb.Camera(width=64, height=48, fx=0, fy=32)}, grpc.StatusCode.INVALID_ARGUMENT, "request", "camera.fx"),
+        ({"camera": pb.Camera(model=7, width=64, height=48, fx=32, fy=32)}, grpc.StatusCode.INVALID_ARGUMENT, "request", "camera.model"),
+        ({"depth_format": pb.DepthFormat(kind=9)}, grpc.StatusCode.INVALID_ARGUMENT, "request", "depth.kind"),
+        ({"depth_format": pb.DepthFormat(scale_m=float("nan"))}, grpc.StatusCode.INVALID_ARGUMENT, "request", "depth.scale_m"),
+        ({"options": pb.Options(neighbours=51)}, grpc.StatusCode.INVALID_ARGUMENT, "request", "options.neighbours"),
+        ({"vehicle_from_camera": pb.RigidTransform()}, grpc.StatusCode.INVALID_ARGUMENT, "request", "T_vehicle_camera.orientation"),
+        ({"rgb": b"GIF89a" + bytes(50)}, grpc.StatusCode.INVALID_ARGUMENT, "format", "rgb"),
+        ({"depth": b""}, grpc.StatusCode.INVALID_ARGUMENT, "undecodable", "depth"),
+        ({"map": "../west"}, grpc.StatusCode.NOT_FOUND, "unknown-map", None),
+        ({"prior": pb.Prior(wgs84=pb.PriorWgs84(latitude_deg=1))}, grpc.StatusCode.INVALID_ARGUMENT, "request", "prior.wgs84"),
+    ],
+)  # fmt: skip
+def test_a_bad_request_is_told_in_details(
+    stub: LocalizationServiceStub, request_of: Any, changed: dict[str, Any], code: Any, reason: str, field: str | None
+) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request_of(**changed))
+    assert caught.value.code() == code
+    found = details(caught.value)
+    assert (found["ErrorInfo"].reason, found["ErrorInfo"].domain) == (reason, "streetfix")
+    if field is None:
+        assert "BadRequest" not in found
+    else:
+        (violation,) = found["BadRequest"].field_violations
+        assert violation.field == field
+        assert violation.description == caught.value.details()
+    assert "RetryInfo" not in found
+
+
+def test_a_message_beyond_the_limit_is_refused(stub: LocalizationServiceStub, request_of: Any) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request_of(rgb=bytes(300_000)))
+    assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+@pytest.mark.parametrize("count", [0, 17])
+def test_a_batch_of_none_or_of_too_many_is_refused(stub: LocalizationServiceStub, count: int) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.LocalizeBatch(pb.LocalizeBatchRequest(requests=[pb.LocalizeRequest()] * count))
+    assert details(caught.value)["BadRequest"].field_violations[0].field == "requests"
+
+
+@pytest.fixture
+def held(engine: Engine) -> Iterator[threading.Event]:
+    """The only worker is busy until the event is set."""
+    release, began = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        began.set()
+        release.wait(30)
+
+    engine.admission.submit(hold)
+    assert began.wait(10)
+    yield release
+    release.set()
+
+
+def test_beyond_the_queue_a_call_is_refused_at_once_and_told_when_to_try_again(
+    stub: LocalizationServiceStub, request_of: Any, engine: Engine, held: threading.Event
+) -> None:
+    waiting = engine.admission.submit(lambda: None)
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request_of())
+    assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+    found = details(caught.value)
+    assert found["ErrorInfo"].reason == "busy"
+    assert found["RetryInfo"].retry_delay.seconds == 1
+    outcome = stub.LocalizeBatch(pb.LocalizeBatchRequest(requests=[request_of()])).outcomes[0]
+    assert (outcome.problem.code, outcome.problem.field) == ("busy", "requests.0")
+    held.set()
+    waiting.result(10)
+    assert stub.Localize(request_of()).map.name == "tiny"
+
+
+def test_work_whose_deadline_has_passed_is_dropped(
+    stub: LocalizationServiceStub, request_of: Any, engine: Engine, held: threading.Event
+) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request_of(), timeout=0.2)
+    assert caught.value.code() == grpc.StatusCode.DEADLINE_EXCEEDED
+    # The place in the queue (there is one) comes back although the worker is still busy.
+    for _ in range(100):
+        try:
+            later = engine.admission.submit(lambda: "ran")
+            break
+        except Exception:
+            threading.Event().wait(0.05)
+    held.set()
+    assert later.result(10) == "ran"
+
+
+def test_the_services_own_limit_of_time_holds_where_the_caller_has_none(
+    stub: LocalizationServiceStub, request_of: Any, held: threading.Event
+) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request_of())
+    assert caught.value.code() == grpc.StatusCode.DEADLINE_EXCEEDED
+    assert details(caught.value)["ErrorInfo"].reason == "deadline"
+
+
+def test_streams_are_limited_and_given_back(stub: LocalizationServiceStub, request_of: Any) -> None:
+    go_on = threading.Event()
+
+    def drive() -> Iterator[pb.LocalizeStreamRequest]:
+        yield pb.LocalizeStreamRequest(frame=request_of())
+        go_on.wait(10)
+
+    first = stub.LocalizeStream(drive())
+    assert next(first).frames == 1
+    with pytest.raises(grpc.RpcError) as caught:
+        next(stub.LocalizeStream(iter([pb.LocalizeStreamRequest(frame=request_of())])))
+    assert details(caught.value)["ErrorInfo"].reason == "busy"
+    go_on.set()
+    assert list(first) == []
+    assert next(stub.LocalizeStream(iter([pb.LocalizeStreamRequest(frame=request_of())]))).frames == 1
+
+
+def test_a_stream_stays_with_its_map(stub: LocalizationServiceStub, request_of: Any) -> None:
+    frames = [pb.LocalizeStreamRequest(frame=request_of(map=name)) for name in ("tiny", "west", "tiny")]
+    first, second, third = stub.LocalizeStream(iter(frames))
+    assert second.outcome.problem.field == "frame 1.map"
+    assert (first.frames, third.frames) == (1, 1)
+
+
+def test_what_nobody_foresaw_tells_the_request_id_and_no_more(
+    stub: LocalizationServiceStub, request_of: Any, engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(_: object) -> None:
+        raise RuntimeError("a secret")
+
+    monkeypatch.setattr(engine, "localize", fails)
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request_of(), metadata=(("x-request-id", "mine-1"),))
+    assert caught.value.code() == grpc.StatusCode.INTERNAL
+    assert "mine-1" in caught.value.details()
+    assert "secret" not in caught.value.details()
+    assert dict(caught.value.initial_metadata())["x-request-id"] == "mine-1"
+
+
+def test_health_and_reflection(channel: grpc.Channel) -> None:
+    health = health_pb2_grpc.HealthStub(channel)
+    for name in ("", SERVICE):
+        found = health.Check(health_pb2.HealthCheckRequest(service=name))
+        assert found.status == health_pb2.HealthCheckResponse.SERVING
+    asked = [reflection_pb2.ServerReflectionRequest(list_services="")]
+    (answer,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter(asked))
+    assert SERVICE in [service.name for service in answer.list_services_response.service]
+    assert SERVICE == "streetfix.v1.LocalizationService"
+
+
+def test_a_port_that_is_taken_is_named(engine: Engine) -> None:
+    server = GrpcServer(engine, host="127.0.0.1", port=0)
+    server.start()
+    try:
+        with pytest.raises(AddressError, match=f"127.0.0.1:{server.port}.*--grpc-port"):
+            GrpcServer(engine, host="127.0.0.1", port=server.port)
+    finally:
+        server.stop(grace_s=0)
+
+
+def test_every_kind_of_error_has_a_code() -> None:
+    from typing import get_args
+
+    assert set(CODE_OF_KIND) == set(get_args(Kind))

@@ -1,0 +1,191 @@
+"""The two outside formats, on a georeferenced map over HTTP: OGC GeoPose by negotiation, OSCP by its own route."""
+
+import base64
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from service.contract.convert import geopose_of
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+from service.maps.content import BundleContent
+from service.maps.reader import MapBundle
+from service.maps.writer import write_bundle
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
+
+Parts = Callable[..., dict[str, bytes]]
+ClientOf = Callable[[Engine], httpx.Client]
+ACCEPT = {"Accept": "application/vnd.oscp+json;version=2.0;"}
+MUNICH = {"latitude_deg": 48.0, "longitude_deg": 11.0, "height_m": 500.0}
+
+
+@pytest.fixture(scope="module")
+def on_earth(content: BundleContent, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "munich"
+    write_bundle(path, replace(content, georeference=MUNICH))
+    return path
+
+
+@pytest.fixture(scope="module")
+def client(on_earth: Path, client_of: ClientOf) -> Iterator[httpx.Client]:
+    engine = Engine.open(Settings(maps=(on_earth,), threads=1))
+    yield client_of(engine)
+    engine.close()
+
+
+@pytest.mark.parametrize(
+    ("heading_deg", "camera", "vehicle"),
+    [
+        # Looking east: the camera's x is south, y down, z east. The vehicle's axes are east, north, up.
+        (0.0, (-0.5, 0.5, -0.5, 0.5), (0, 0, 0, 1)),
+        # Looking north: the camera's x is east, z north. The vehicle is turned left by 90 degrees.
+        (90.0, (-math.sqrt(0.5), 0, 0, math.sqrt(0.5)), (0, 0, math.sqrt(0.5), math.sqrt(0.5))),
+    ],
+)
+def test_quaternions_known_by_hand(on_earth: Path, heading_deg: float, camera: Any, vehicle: Any) -> None:
+    """At the map's origin, where east, north and up are the map's axes; no other member than the standard's."""
+    bundle = MapBundle.open(on_earth)
+    body = rotation_z(math.radians(heading_deg))
+    for R, expected in ((body @ R_BODY_OPTICAL, camera), (body, vehicle)):
+        found = geopose_of(transform_from(R, np.zeros(3)), bundle)
+        assert found is not None
+        told = found.model_dump()
+        assert set(told) == {"position", "quaternion"}
+        assert told["position"] == pytest.approx({"lat": 48.0, "lon": 11.0, "h": 500.0}, abs=1e-9)
+        q = np.array(list(told["quaternion"].values()))
+        assert list(told["quaternion"]) == ["x", "y", "z", "w"]
+        np.testing.assert_allclose(q * np.sign(q @ np.array(expected)), expected, atol=1e-9)
+
+
+def test_far_from_the_origin_up_is_another(on_earth: Path) -> None:
+    """100 km east of it the ground's normal leans east by 0.90 degrees, and map axes lean back against it."""
+    bundle = MapBundle.open(on_earth)
+    found = geopose_of(transform_from(np.eye(3), np.array([100_000.0, 0, 0])), bundle)
+    assert found is not None
+    assert found.position.h == pytest.approx(500 + 100_000**2 / (2 * 6.388e6), abs=1)
+    assert math.degrees(2 * math.acos(found.quaternion.w)) == pytest.approx(
+        1.34, abs=0.03
+    )  # 0.90 lean, and north turns by 0.99
+
+
+def post(client: httpx.Client, parts: dict[str, bytes], **headers: str) -> Any:
+    return client.post("/v1/localize", files={name: (name, data) for name, data in parts.items()}, headers=headers)
+
+
+def test_the_answer_carries_a_geopose_and_negotiation_gives_it_alone(client: httpx.Client, parts_of: Parts) -> None:
+    whole = post(client, parts_of())
+    assert whole.headers["vary"] == "Accept"
+    geopose = whole.json()["geopose"]
+    assert geopose["position"]["lat"] == pytest.approx(48 + 2 / 111_200, abs=0.5 / 111_200 + 1e-2)
+    alone = post(client, parts_of(), Accept="application/geopose+json")
+    assert alone.headers["content-type"] == "application/geopose+json"
+    assert alone.json() == geopose
+    assert set(alone.json()) == {"position", "quaternion"}
+
+
+def test_with_a_vehicle_the_geopose_is_the_vehicles(client: httpx.Client, parts_of: Parts) -> None:
+    T = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}}
+    geopose = post(client, parts_of(T_vehicle_camera=T)).json()["geopose"]
+    q = geopose["quaternion"]
+    heading = math.degrees(math.atan2(2 * (q["w"] * q["z"] + q["x"] * q["y"]), 1 - 2 * (q["y"] ** 2 + q["z"] ** 2)))
+    assert heading == pytest.approx(90, abs=1.5)
+
+
+def oscp(parts: dict[str, bytes], **changed: Any) -> dict[str, Any]:
+    """As the reference clients send it: floats for times, nulls for what they do not know."""
+
+    def camera(kind: str, content: bytes) -> dict[str, Any]:
+        params = {
+            "model": "PINHOLE",
+            "modelParams": [32.0, 32.0, 32.0, 24.0],
+            "minMaxDepth": None,
+            "minMaxDisparity": None,
+        }
+        return {
+            "timestamp": 1.7e12, "sensorId": "0", "privacy": None, "sequenceNumber": 0, "imageFormat": kind, "size": [64, 48],
+            "imageBytes": base64.b64encode(content).decode(), "imageOrientation": {"mirrored": False, "rotation": 0}, "params": params,
+        }  # fmt: skip
+
+    readings = {
+        "cameraReadings": [camera("RGBA32", parts["rgb"]), camera("DEPTH", parts["depth"])],
+        "geolocationReadings": None,
+    }
+    sensors = [{"id": "0", "type": "camera", "name": None, "model": None, "rigIdentifier": None}]
+    return {
+        "id": "mine", "timestamp": 1.7e12 + 0.5, "type": "geopose", "sensors": sensors, "sensorReadings": readings, "priorPoses": [],
+    } | changed  # fmt: skip
+
+
+def test_a_reference_client_gets_the_same_pose(client: httpx.Client, parts_of: Parts) -> None:
+    parts = parts_of()
+    rest = post(client, parts).json()
+    answer = client.post("/geopose", json=oscp(parts), headers=ACCEPT)
+    assert answer.status_code == 200, answer.text
+    told = answer.json()
+    assert list(told) == ["id", "timestamp", "type", "accuracy", "geopose"]
+    assert (told["id"], told["type"], type(told["timestamp"])) == ("mine", "geopose", int)
+    assert told["geopose"] == rest["geopose"]
+    sigma = np.sqrt(np.diag(np.array(rest["pose"]["covariance"]).reshape(6, 6)))
+    assert told["accuracy"] == pytest.approx(
+        {"position": sigma[:3].mean(), "orientation": np.rad2deg(sigma[3:]).mean()}
+    )
+
+
+def test_rgb_alone_is_told_what_is_missing(client: httpx.Client, parts_of: Parts) -> None:
+    request = oscp(parts_of())
+    del request["sensorReadings"]["cameraReadings"][1]
+    refused = client.post("/geopose", json=request, headers=ACCEPT)
+    assert (refused.status_code, refused.json()["code"]) == (422, "request")
+    assert "DEPTH" in refused.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    "accept", ["*/*", "application/json", "application/vnd.oscp+json", "application/vnd.oscp+json;version=1.0"]
+)
+def test_another_version_is_refused(client: httpx.Client, parts_of: Parts, accept: str) -> None:
+    refused = client.post("/geopose", json=oscp(parts_of()), headers={"Accept": accept})
+    assert (refused.status_code, refused.json()["code"]) == (400, "bad-request")
+    assert "version=2.0" in refused.json()["detail"]
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"{", b'{"sensorReadings": 3}', b"[" * 100_000])
+def test_what_is_no_request_is_refused(client: httpx.Client, body: bytes) -> None:
+    refused = client.post("/geopose", content=body, headers=ACCEPT)
+    assert (refused.status_code, refused.json()["code"]) == (422, "request")
+
+
+def test_the_protocol_says_that_it_is_there(client: httpx.Client) -> None:
+    assert client.get("/geopose").json()["version"] == "2.0"
+
+
+def test_a_map_without_a_place_on_the_earth_is_told(bundle_path: Path, parts_of: Parts, client_of: ClientOf) -> None:
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1))
+    client = client_of(engine)
+    for refused in (
+        post(client, parts_of(), Accept="application/geopose+json"),
+        client.post("/geopose", json=oscp(parts_of()), headers=ACCEPT),
+    ):
+        assert (refused.status_code, refused.json()["code"]) == (422, "no-georeference")
+    assert post(client, parts_of()).json()["geopose"] is None
+    engine.close()
+
+
+def test_doubt_is_a_problem_where_the_format_has_no_word_for_it(
+    client: httpx.Client, parts_of: Parts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service.localization import localizer
+    from service.localization.decide import Decision
+
+    monkeypatch.setattr(localizer, "decide", lambda *_: Decision("AMBIGUOUS", 0.4))
+    monkeypatch.setattr(MapBundle, "calibration", object(), raising=False)
+    refused = post(client, parts_of(), Accept="application/geopose+json")
+    assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")
+    assert "AMBIGUOUS" in refused.json()["detail"]
+    assert json.loads(post(client, parts_of()).content)["status"] == "AMBIGUOUS"
