@@ -21,6 +21,7 @@ _KNOWN = {
     "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
     "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
     "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
+    "loadtest": ("Load a running service with a dataset's queries.", "mapping"),
     "demo": ("Map streets, serve the map, ask it where pictures were taken.", "mapping"),
     "train": ("Train an encoder on simulated cities.", "training"),
     "export": ("Make an ONNX encoder from a training's checkpoint.", "training"),

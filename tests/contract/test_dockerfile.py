@@ -85,8 +85,9 @@ def test_nothing_is_written_at_run_time() -> None:
 
 def test_health_is_asked_at_the_port_that_is_exposed() -> None:
     stage = stages()[-1]
-    port = values(stage, "EXPOSE")[0]
-    assert f"STREETFIX_PORT={port}" in values(stage, "ENV")[0]
+    rest, grpc = values(stage, "EXPOSE")[0].split()
+    assert f"STREETFIX_PORT={rest}" in values(stage, "ENV")[0]
+    assert f"STREETFIX_GRPC_PORT={grpc}" in values(stage, "ENV")[0]
     health = values(stage, "HEALTHCHECK")[0]
     code = json.loads(health[health.index("CMD ") + 4 :])[2]
     compile(code, "HEALTHCHECK", "exec")

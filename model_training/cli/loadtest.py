@@ -1,0 +1,130 @@
+"""``streetfix loadtest``."""
+
+import asyncio
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from model_training.datasets.dataset import Dataset
+from model_training.loadtest.drive import Load, drive
+from model_training.loadtest.payloads import Payload, payloads
+from model_training.loadtest.processes import Usage, usage
+from model_training.loadtest.summary import Summary, summarise
+from model_training.loadtest.targets import Grpc, Rest, Target
+from service.errors import RequestError, UnreachableError
+
+
+def command(
+    dataset: Annotated[Path, typer.Option(help="dataset whose query pairs are sent")],
+    url: Annotated[str, typer.Option(help="of the service")] = "http://127.0.0.1:8000",
+    grpc: Annotated[str | None, typer.Option(help="HOST:PORT: ask over gRPC instead", show_default=False)] = None,
+    queries: Annotated[str | None, typer.Option(help="query set [default: the first with truth]")] = None,
+    map_name: Annotated[str | None, typer.Option("--map", help="which map, where the service has several")] = None,
+    rate: Annotated[
+        list[float] | None,
+        typer.Option(help="requests a second, arriving at random, whatever the answers do; repeat for a curve"),
+    ] = None,
+    concurrency: Annotated[
+        list[int] | None, typer.Option(help="clients that wait for each answer; repeat for several [default: 1]", min=1)
+    ] = None,
+    duration: Annotated[float, typer.Option(help="counted seconds of each run", min=0.5)] = 20.0,
+    warm_up: Annotated[float, typer.Option(help="seconds before them", min=0.0)] = 3.0,
+    timeout: Annotated[float, typer.Option(help="seconds until a request is given up", min=0.01)] = 30.0,
+    pairs: Annotated[int, typer.Option(help="different picture pairs, sent in turn", min=1)] = 50,
+    refine: Annotated[bool, typer.Option("--refine/--no-refine", help="full answers, or retrieval alone")] = True,
+    key: Annotated[
+        str | None, typer.Option("--api-key", envvar="STREETFIX_API_KEY", help="where the service asks for one")
+    ] = None,
+    pid: Annotated[
+        int | None, typer.Option(help="process of a service on this machine: its processor time is counted")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write all figures here")] = None,
+    plot: Annotated[Path | None, typer.Option(help="draw latency against rate (PNG or SVG; needs matplotlib)")] = None,
+) -> None:
+    """Load a running service with a dataset's queries; latency counts from when a request was due.
+
+    \b
+    Example, a curve:
+      streetfix loadtest --dataset data/small --rate 5 --rate 10 --rate 20 --json load.json --plot load.png
+    """
+    if rate and concurrency:
+        raise RequestError("--rate and --concurrency: give one of them", field="rate")
+    if any(each <= 0 for each in rate or ()):
+        raise RequestError("--rate: it must be positive", field="rate")
+    sent = payloads(Dataset(dataset), queries, map_name=map_name, refine=refine, most=pairs)
+    load = Load(rate=None, warm_up_s=warm_up, duration_s=duration, timeout_s=timeout)
+    runs = [replace(load, rate=each) for each in rate or ()] or [
+        replace(load, concurrency=each) for each in concurrency or [1]
+    ]
+    if pid is not None:
+        usage(pid)  # said before the load, not after it
+    console = Console()
+    found = []
+    for run in runs:
+        target: Target = Rest(url, key=key) if grpc is None else Grpc(grpc, key=key)
+        found.append(asyncio.run(_run(target, sent, run, pid, console)))
+    console.print(table_of(found))
+    if json_file is not None:
+        json_file.write_text(json.dumps([each.as_json() for each in found], indent=1) + "\n")
+    if plot is not None:
+        from model_training.loadtest.plot import draw
+
+        draw(found, plot)
+    if not any(each.answers for each in found):
+        raise UnreachableError(f"{grpc or url}: not one request was answered: {found[-1].errors}")
+
+
+async def _run(target: Target, sent: list[Payload], load: Load, pid: int | None, console: Console) -> Summary:
+    what = f"{load.rate:g}/s" if load.rate is not None else f"{load.concurrency} at a time"
+    columns = (TextColumn(what), BarColumn(), TimeRemainingColumn())
+    before: Usage | None = None
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(what, total=load.warm_up_s + load.duration_s)
+
+        def tick(seconds: float) -> None:
+            nonlocal before
+            if before is None and pid is not None and seconds >= load.warm_up_s:
+                before = usage(pid)
+            progress.update(task, completed=seconds)
+
+        async with target:
+            shots = await drive(target, sent, load, tick)
+    return summarise(shots, sent, load, before, None if pid is None else usage(pid))
+
+
+def table_of(found: list[Summary]) -> Table:
+    """For people."""
+    table = Table(title="load")
+    for name in (
+        "load",
+        "offered/s",
+        "answered/s",
+        "p50 ms",
+        "p90 ms",
+        "p99 ms",
+        "max ms",
+        "refused",
+        "localized",
+        "within 1 m",
+        "CPU ms",
+    ):
+        table.add_column(name, justify="right")
+    for each in found:
+        ms = each.answered_ms
+        table.add_row(
+            f"{each.rate:g}/s" if each.rate is not None else f"{each.concurrency} at a time",
+            f"{each.offered_per_s:.1f}", f"{each.answered_per_s:.1f}",
+            *(f"{ms[name]:.1f}" if ms else "-" for name in ("p50", "p90", "p99", "max")),
+            ", ".join(f"{count} x {code}" for code, count in sorted(each.errors.items())) or "none",
+            "-" if each.localized is None else f"{each.localized:.1%}", "-" if each.right is None else f"{each.right:.1%}",
+            "-" if each.cpu_ms_per_answer is None else f"{each.cpu_ms_per_answer:.1f}",
+        )  # fmt: skip
+    if wrong := sum(each.inconsistent for each in found):
+        table.caption = f"{wrong} answers differ from another answer to the same request"
+    return table

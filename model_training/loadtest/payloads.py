@@ -1,0 +1,87 @@
+"""A dataset's query pairs as requests, encoded once so that a load generator only sends bytes."""
+
+import json
+import uuid
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import Dataset, QueryFrame
+from service.errors import DatasetError
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+
+_KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Payload:
+    """One request.
+
+    Attributes:
+        body: multipart/form-data.
+        content_type: of the body.
+        message: the same for gRPC.
+        true_m: position of the camera, map frame; None where the dataset has no truth.
+    """
+
+    body: bytes
+    content_type: str
+    message: pb.LocalizeRequest
+    true_m: Float64[NDArray[np.float64], "3"] | None
+
+
+def payloads(dataset: Dataset, queries: str | None, *, map_name: str | None, refine: bool, most: int) -> list[Payload]:
+    """Requests of a query set, in its order.
+
+    Args:
+        dataset: opened.
+        queries: name of a set; None takes the first one with truth, else the first.
+        map_name: which map to ask; None where the service has one.
+        refine: whether to ask for registration.
+        most: no more than this many, evenly spread.
+
+    Raises:
+        DatasetError: there is no such set, or it is empty.
+    """
+    names = dataset.query_sets(with_truth=True) or dataset.query_sets()
+    if not names or queries not in (None, *dataset.query_sets()):
+        there = ", ".join(dataset.query_sets()) or "none"
+        raise DatasetError(f"{dataset.folder}: there is no query set {queries or 'at all'}; it has {there}", field="queries")
+    frames = list(dataset.queries(queries or names[0]))
+    if not frames:
+        raise DatasetError(f"{dataset.folder}: the query set {queries or names[0]} is empty", field="queries")
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
+    return [_payload(frames[k], map_name, refine) for k in chosen]
+
+
+def _payload(frame: QueryFrame, map_name: str | None, refine: bool) -> Payload:
+    rgb, depth, camera = frame.rgb_path.read_bytes(), frame.depth_path.read_bytes(), frame.camera
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    intrinsics = {name: getattr(camera, name) for name in names}
+    spec = camera.depth
+    how = {"scale_m": spec.scale_m, "kind": spec.kind, "baseline_m": spec.baseline_m, "max_range_m": spec.max_range_m}
+    document: dict[str, Any] = {
+        "camera": intrinsics, "depth": {name: value for name, value in how.items() if value is not None},
+        "options": {"refine": refine},
+    }  # fmt: skip
+    if map_name is not None:
+        document["map"] = map_name
+    boundary = uuid.uuid4().hex
+    parts = {"rgb": rgb, "depth": depth, "request": json.dumps(document).encode()}
+    body = b"".join(
+        f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"; filename="{name}"\r\n\r\n'.encode()
+        + content
+        + b"\r\n"
+        for name, content in parts.items()
+    )
+    message = pb.LocalizeRequest(
+        rgb=rgb, depth=depth, camera=pb.Camera(**intrinsics), map=map_name, options=pb.Options(refine=refine),
+        depth_format=pb.DepthFormat(
+            scale_m=spec.scale_m, kind=_KINDS[spec.kind], baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
+        ),
+    )  # fmt: skip
+    true_m = None if frame.T_map_camera is None else frame.T_map_camera[:3, 3].copy()
+    return Payload(body + f"--{boundary}--\r\n".encode(), f"multipart/form-data; boundary={boundary}", message, true_m)

@@ -1,0 +1,41 @@
+"""Processor time and memory of a process and its descendants, from /proc."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.errors import RequestError
+
+_TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """Of a tree of processes: processor seconds, resident MiB."""
+
+    cpu_s: float
+    resident_mib: float
+
+
+def usage(pid: int) -> Usage:
+    """What a process and its descendants have used until now.
+
+    Raises:
+        RequestError: there is no such process, or this system has no /proc.
+    """
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+        except OSError:  # ended meanwhile
+            continue
+        parents[int(folder.name)] = (int(fields[1]), (int(fields[11]) + int(fields[12])) / _TICKS, int(fields[21]))
+    if pid not in parents:
+        raise RequestError(f"--pid {pid}: there is no such process here; give the service's own", field="pid")
+    tree, grew = {pid}, True
+    while grew:
+        children = {child for child, (parent, _, _) in parents.items() if parent in tree} - tree
+        tree |= children
+        grew = bool(children)
+    pages = sum(parents[each][2] for each in tree)
+    return Usage(sum(parents[each][1] for each in tree), pages * os.sysconf("SC_PAGE_SIZE") / 2**20)

@@ -1,0 +1,97 @@
+"""What a run of load came to."""
+
+from collections import Counter
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from model_training.loadtest.drive import Load, Shot
+from model_training.loadtest.payloads import Payload
+from model_training.loadtest.processes import Usage
+
+RIGHT_M = 1.0
+_SAME_M = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """Figures of the counted seconds.
+
+    Attributes:
+        offered_per_s: requests due a second;
+        answered_per_s: and answered.
+        answered_ms: percentiles of the answered ones' latency: p50, p90, p95, p99, max; empty without any.
+        refused_ms: of the others'.
+        errors: others by what became of them.
+        localized: share of the answers that are LOCALIZED.
+        right: share of those within 1 m of the truth; None without truth.
+        inconsistent: answers that differ from another answer to the same request.
+        cpu_ms_per_answer: of the service's processes; None where they were not watched.
+        resident_mib: of them at the end.
+    """
+
+    rate: float | None
+    concurrency: int
+    offered_per_s: float
+    answered_per_s: float
+    answered_ms: dict[str, float]
+    refused_ms: dict[str, float]
+    errors: dict[str, int]
+    answers: int
+    localized: float | None
+    right: float | None
+    inconsistent: int
+    cpu_ms_per_answer: float | None
+    resident_mib: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """For a file."""
+        return asdict(self)
+
+
+def summarise(
+    shots: list[Shot], payloads: list[Payload], load: Load, before: Usage | None, after: Usage | None
+) -> Summary:
+    """Figures of a run.
+
+    Args:
+        shots: of ``drive``.
+        payloads: that were sent.
+        load: as it was asked for.
+        before: of the service's processes when the counted seconds began; None where they were not watched.
+        after: of them when all was answered.
+    """
+    counted = [shot for shot in shots if shot.due_s >= load.warm_up_s]
+    answered = [shot for shot in counted if shot.reply.code == "ok"]
+    refused = [shot for shot in counted if shot.reply.code != "ok"]
+    first: dict[int, tuple[float, float, float]] = {}
+    inconsistent = 0
+    for shot in shots:
+        at = shot.reply.position_m
+        if at is not None:
+            inconsistent += bool(np.linalg.norm(np.subtract(first.setdefault(shot.payload, at), at)) > _SAME_M)
+    localized = [shot for shot in answered if shot.reply.status == "LOCALIZED"]
+    distances = [
+        float(np.linalg.norm(np.subtract(at, true)[:2]))
+        for shot in localized
+        if (at := shot.reply.position_m) is not None and (true := payloads[shot.payload].true_m) is not None
+    ]
+    used = None if before is None or after is None else after.cpu_s - before.cpu_s
+    return Summary(
+        rate=load.rate, concurrency=load.concurrency, offered_per_s=len(counted) / load.duration_s,
+        answered_per_s=len(answered) / load.duration_s, answered_ms=_percentiles(answered), refused_ms=_percentiles(refused),
+        errors=dict(Counter(shot.reply.code for shot in refused)), answers=len(answered),
+        localized=len(localized) / len(answered) if answered else None,
+        right=float(np.mean(np.array(distances) <= RIGHT_M)) if distances else None, inconsistent=inconsistent,
+        cpu_ms_per_answer=None if used is None or not answered else 1e3 * used / len(answered),
+        resident_mib=None if after is None else after.resident_mib,
+    )  # fmt: skip
+
+
+def _percentiles(shots: list[Shot]) -> dict[str, float]:
+    if not shots:
+        return {}
+    ms = np.array([1e3 * (shot.done_s - shot.due_s) for shot in shots])
+    found = {f"p{p}": float(np.percentile(ms, p)) for p in (50, 90, 95, 99)}
+    return found | {"max": float(ms.max())}

@@ -1,0 +1,112 @@
+import asyncio
+import time
+
+import numpy as np
+import pytest
+
+from model_training.loadtest.drive import Load, arrivals, drive
+from model_training.loadtest.payloads import Payload
+from model_training.loadtest.summary import summarise
+from model_training.loadtest.targets import Reply
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+
+PAYLOADS = [Payload(b"", "", pb.LocalizeRequest(), np.array([float(k), 0, 0])) for k in range(3)]
+
+
+class Fake:
+    """Answers after a while; remembers what it was asked."""
+
+    def __init__(self, replies=None, *, takes_s=0.0):
+        self.asked, self._replies, self._takes_s = [], replies, takes_s
+        self.at_once = self.most_at_once = 0
+
+    async def ask(self, payload, timeout_s):
+        number = next(k for k, each in enumerate(PAYLOADS) if each is payload)
+        self.asked.append(number)
+        self.at_once += 1
+        self.most_at_once = max(self.most_at_once, self.at_once)
+        await asyncio.sleep(self._takes_s)
+        self.at_once -= 1
+        return (
+            Reply("ok", "LOCALIZED", (float(number), 0.0, 0.0))
+            if self._replies is None
+            else self._replies(len(self.asked))
+        )
+
+
+def test_arrivals_are_a_poisson_process():
+    """Their number has the rate's mean and variance, their gaps an exponential's spread, and the seed decides."""
+    counts = [len(arrivals(50, 10, seed)) for seed in range(200)]
+    assert np.mean(counts) == pytest.approx(500, abs=6)
+    assert np.var(counts) == pytest.approx(500, rel=0.3)
+    gaps = np.diff(arrivals(100, 100, 1))
+    assert gaps.std() == pytest.approx(gaps.mean(), rel=0.05)
+    assert arrivals(5, 10, 3) == arrivals(5, 10, 3) != arrivals(5, 10, 4)
+    assert max(arrivals(5, 10, 3)) < 10
+
+
+def test_arrivals_do_not_wait_for_answers():
+    """Forty a second of 0.5 s each need twenty at once, although nobody said so."""
+    target = Fake(takes_s=0.5)
+    shots = asyncio.run(drive(target, PAYLOADS, Load(rate=40, warm_up_s=0, duration_s=1)))
+    assert [shot.due_s for shot in shots] == arrivals(40, 1, 0)
+    assert target.most_at_once > 8
+    assert target.asked == [k % 3 for k in range(len(shots))]
+    assert min(shot.done_s - shot.due_s for shot in shots) >= 0.5
+
+
+def test_clients_wait_for_answers():
+    target = Fake(takes_s=0.02)
+    shots = asyncio.run(drive(target, PAYLOADS, Load(rate=None, concurrency=4, warm_up_s=0, duration_s=0.3)))
+    assert target.most_at_once == 4
+    assert 8 <= len(shots) <= 4 * 16
+
+
+def test_latency_counts_from_when_a_request_was_due():
+    """A target that stops the whole generator for 0.3 s is charged for all that was due meanwhile."""
+
+    class Stops(Fake):
+        async def ask(self, payload, timeout_s):
+            if not self.asked:
+                time.sleep(0.3)  # the very thing
+            return await super().ask(payload, timeout_s)
+
+    shots = asyncio.run(drive(Stops(), PAYLOADS, Load(rate=100, warm_up_s=0, duration_s=0.4)))
+    late = [shot.done_s - shot.due_s for shot in shots if shot.due_s < 0.2]
+    assert len(late) > 5
+    assert min(late) > 0.09
+
+
+def test_the_summary_counts_what_came_of_it():
+    def reply(number):
+        return {0: Reply("503"), 1: Reply("ok", "AMBIGUOUS", (9.0, 0.0, 0.0))}.get(
+            number % 4, Reply("ok", "LOCALIZED", (0.5, 0.0, 5.0))
+        )
+
+    load = Load(rate=200, warm_up_s=0.2, duration_s=0.5)
+    shots = asyncio.run(drive(Fake(reply), PAYLOADS[:1], load))
+    counted = [shot for shot in shots if shot.due_s >= 0.2]
+    found = summarise(shots, PAYLOADS, load, None, None)
+    refused = sum(shot.reply.code == "503" for shot in counted)
+    assert found.errors == {"503": refused}
+    assert found.answers == len(counted) - refused
+    assert found.offered_per_s == pytest.approx(len(counted) / 0.5)
+    assert found.localized == pytest.approx(2 / 3, abs=0.05)
+    assert found.right == 1.0  # 0.5 m off on the ground; height does not count, nor do answers that are not LOCALIZED
+    assert found.inconsistent > 0
+    assert set(found.answered_ms) == {"p50", "p90", "p95", "p99", "max"}
+    assert (found.cpu_ms_per_answer, found.resident_mib) == (None, None)
+
+
+def test_answers_to_the_same_request_are_compared():
+    load = Load(rate=100, warm_up_s=0, duration_s=0.3)
+    shots = asyncio.run(drive(Fake(), PAYLOADS, load))
+    assert summarise(shots, PAYLOADS, load, None, None).inconsistent == 0
+
+
+def test_without_an_answer_there_are_no_figures_of_any():
+    load = Load(rate=100, warm_up_s=0, duration_s=0.2)
+    shots = asyncio.run(drive(Fake(lambda _: Reply("connection")), PAYLOADS, load))
+    found = summarise(shots, PAYLOADS, load, None, None)
+    assert (found.answers, found.answered_ms, found.localized, found.right) == (0, {}, None, None)
+    assert found.errors == {"connection": len(shots)}
