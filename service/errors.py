@@ -12,6 +12,7 @@ StreetfixError                     code            kind
 ├── NoPoseError                    no-pose         not_found    no sure pose, asked for in a format that has no word for doubt
 ├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
 ├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
+├── ForbiddenError                 forbidden       forbidden    the caller may ask, but not change what the service does
 ├── BusyError                      busy            busy         the queue is full
 ├── DeadlineError                  deadline        deadline     a request took longer than the service allows
 ├── BundleError                    bundle          not_ready    a map bundle is missing, damaged or of another version
@@ -28,7 +29,9 @@ No number of HTTP or gRPC stands here: each face has one table over ``kind``.
 
 from typing import ClassVar, Literal
 
-Kind = Literal["invalid", "unsupported", "too_large", "not_found", "unauthorized", "busy", "deadline", "not_ready"]
+Kind = Literal[
+    "invalid", "unsupported", "too_large", "not_found", "unauthorized", "forbidden", "busy", "deadline", "not_ready"
+]
 
 
 class StreetfixError(Exception):
@@ -117,6 +120,13 @@ class UnauthorizedError(StreetfixError):
 
     code = "unauthorized"
     kind = "unauthorized"
+
+
+class ForbiddenError(StreetfixError):
+    """The caller may ask, but not change what the service does."""
+
+    code = "forbidden"
+    kind = "forbidden"
 
 
 class BusyError(StreetfixError):

@@ -10,6 +10,9 @@ from service.errors import RequestError
 
 def command(
     name: Annotated[str, typer.Argument(help="Who will use it: letters, digits, '.', '_' and '-'.")],
+    operator: Annotated[
+        bool, typer.Option(help="May also change what the service does: which version of a map serves.")
+    ] = False,
 ) -> None:
     """Make an API key: the key on stderr, for its user; its line for the service's file on stdout.
 
@@ -23,4 +26,4 @@ def command(
         raise RequestError(f"the name {name!r} is not 1 to 64 letters, digits, '.', '_' or '-'", field="name")
     key = new_key()
     typer.echo(f"key of {name}, shown once: {key}", err=True)
-    typer.echo(f"{name} {hash_of(key)}")
+    typer.echo(f"{name} {hash_of(key)}" + (" operator" if operator else ""))

@@ -3,6 +3,7 @@
 import math
 import signal
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -90,7 +91,7 @@ def serve(settings: "Settings") -> None:
             # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, server.handle_exit)
-            with _grpc(engine, keys, tls) as grpc_port:
+            with _grpc(engine, keys, tls) as grpc_port, _watching(engine):
                 _say_where(engine.registry, listener, grpc_port, "http" if tls is None else "https")
                 server.run(sockets=[listener])
     finally:
@@ -114,6 +115,22 @@ def _grpc(engine: "Engine", keys: "KeyRing | None", tls: "Certificates | None") 
         yield server.port
     finally:
         server.stop(grace_s=settings.grace_s)
+
+
+@contextmanager
+def _watching(engine: "Engine") -> Iterator[None]:
+    """Mount new bundles inside: every so often, and on SIGHUP."""
+    from service.runtime.map_watcher import MapWatcher
+
+    watcher = MapWatcher(engine.registry, engine.settings.maps, warm=engine.warm)
+    watcher.start(engine.settings.watch_s or threading.TIMEOUT_MAX)
+    before = signal.signal(signal.SIGHUP, lambda *_: watcher.look_now()) if hasattr(signal, "SIGHUP") else None
+    try:
+        yield
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGHUP, before)
+        watcher.stop()
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -21,6 +21,7 @@ from service.geometry.rigid import (
 )
 from service.localization.answer import Answer
 from service.localization.evidence import distinct_candidates
+from service.localization.localizer import Localizer
 from service.localization.prior import Prior
 from service.localization.search import Neighbour
 from service.maps.reader import MapBundle
@@ -183,8 +184,13 @@ def geopose_of(T_map_body: NDArray[np.float64], bundle: MapBundle) -> schema.Geo
     )
 
 
-def map_entry_from(bundle: MapBundle) -> schema.MapEntry:
-    """A mounted map as the contract says it."""
+def map_entry_from(bundle: MapBundle, versions: Sequence[Localizer]) -> schema.MapEntry:
+    """A mounted map as the contract says it.
+
+    Args:
+        bundle: the version that serves.
+        versions: all that are open, the newest first.
+    """
     manifest = bundle.manifest
     return schema.MapEntry(
         name=manifest.name,
@@ -197,6 +203,7 @@ def map_entry_from(bundle: MapBundle) -> schema.MapEntry:
         encoder_sha256=manifest.encoder_sha256,
         georeferenced=manifest.georeference is not None,
         licence=manifest.licence,
+        versions=[each.bundle.manifest.version for each in versions],
     )
 
 

@@ -299,6 +299,13 @@ class MapEntry(BaseModel):
     encoder_sha256: str
     georeferenced: bool
     licence: str
+    versions: list[str] = Field(description="open ones, the newest first; a request may name one as name@version")
+
+
+class ServeVersion(_Strict):
+    """Which version of a map is to serve."""
+
+    version: str = Field(max_length=64)
 
 
 class MapList(BaseModel):

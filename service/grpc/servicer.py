@@ -82,7 +82,10 @@ class Servicer(LocalizationServiceServicer):
         """All mounted maps."""
         del request
         with _answering(self._engine, "ListMaps", context):
-            entries = [map_entry_from(localizer.bundle) for localizer in self._engine.registry]
+            registry = self._engine.registry
+            entries = [
+                map_entry_from(localizer.bundle, registry.versions(localizer.bundle.name)) for localizer in registry
+            ]
             return pb.ListMapsResponse(maps=[map_message(entry) for entry in entries])
 
     def GetStreets(self, request: pb.GetStreetsRequest, context: grpc.ServicerContext) -> pb.GetStreetsResponse:

@@ -20,6 +20,7 @@ CODE_OF_KIND: dict[Kind, int] = {
     "too_large": code_pb2.OUT_OF_RANGE,  # RESOURCE_EXHAUSTED would make clients try the same picture again
     "not_found": code_pb2.NOT_FOUND,
     "unauthorized": code_pb2.UNAUTHENTICATED,
+    "forbidden": code_pb2.PERMISSION_DENIED,
     "busy": code_pb2.RESOURCE_EXHAUSTED,
     "not_ready": code_pb2.UNAVAILABLE,
     "deadline": code_pb2.DEADLINE_EXCEEDED,

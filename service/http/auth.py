@@ -1,14 +1,28 @@
 """Asks for an API key before a byte of a body is read."""
 
 from starlette.datastructures import Headers
+from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import UnauthorizedError
+from service.errors import ForbiddenError, UnauthorizedError
 from service.http.problems import problem_of, problem_response
-from service.runtime.keys import KeyRing, presented_key
+from service.runtime.keys import Caller, KeyRing, presented_key
+from service.runtime.settings import Settings, is_loopback
 
 #: What an orchestrator asks, which has no key.
 OPEN = frozenset({"/livez", "/readyz"})
+
+
+def require_operator(request: Request, settings: Settings) -> None:
+    """Let only those change what a service does who may.
+
+    Raises:
+        ForbiddenError: the caller's key is no operator's; or there are no keys, and others than this machine's users can ask.
+    """
+    caller: Caller | None = getattr(request.state, "caller", None)
+    allowed = is_loopback(settings.host) if caller is None else caller.operator
+    if not allowed:
+        raise ForbiddenError("this is for operators: use a key that streetfix keys --operator made")
 
 
 class AuthMiddleware:
@@ -23,7 +37,8 @@ class AuthMiddleware:
         if scope["type"] == "http" and scope["path"] not in OPEN:
             headers = Headers(scope=scope)
             try:
-                self._keys.require(presented_key(headers.get("authorization"), headers.get("x-api-key")))
+                presented = presented_key(headers.get("authorization"), headers.get("x-api-key"))
+                scope["state"]["caller"] = self._keys.require(presented)
             except UnauthorizedError as error:
                 problem = problem_of(error, scope["state"]["request_id"])
                 await problem_response(problem, {"WWW-Authenticate": "Bearer"})(scope, receive, send)

@@ -24,6 +24,7 @@ STATUS_OF_KIND: dict[Kind, int] = {
     "too_large": 413,
     "not_found": 404,
     "unauthorized": 401,
+    "forbidden": 403,
     "busy": 503,
     "not_ready": 503,
     "deadline": 504,

@@ -145,6 +145,15 @@ class Engine:
         decoded = perf_counter()
         return localizer.look_up(query), 1e3 * (decoded - started)
 
+    def warm(self, localizer: Localizer) -> None:
+        """Ask a map once, in the caller's thread, so that its encoder and the first of its pages are in memory."""
+        limit_pools()
+        camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+        rng = np.random.default_rng(0)
+        rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
+        depth_m = rng.uniform(2.0, 20.0, (48, 64)).astype(np.float32)
+        localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera))
+
     def close(self) -> None:
         """Let running work end and drop what waits."""
         self.admission.close()

@@ -15,18 +15,26 @@ _MOST_BYTES, _MOST_KEY = 2**20, 512
 
 
 @dataclass(frozen=True, slots=True)
+class Caller:
+    """Who asks, and whether they may change what the service does."""
+
+    name: str
+    operator: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class KeyRing:
-    """Names of callers by the SHA-256 of their keys.
+    """Callers by the SHA-256 of their keys.
 
     A key is 256 random bits, so no table of likely keys can be made and a plain hash is enough; a slow one would only cost
     every request.
     """
 
-    name_of: dict[str, str]
+    caller_of: dict[str, Caller]
 
     @classmethod
     def open(cls, path: Path) -> "KeyRing":
-        """Read a file with a line ``NAME SHA256`` for each caller; ``#`` begins a remark.
+        """Read a file with a line ``NAME SHA256`` or ``NAME SHA256 operator`` for each caller; ``#`` begins a remark.
 
         Raises:
             KeysError: it is not there, too large, empty, or a line of it is no such thing.
@@ -41,24 +49,25 @@ class KeyRing:
             ) from error
         if len(content) > _MOST_BYTES:
             raise KeysError(f"{path}: over {_MOST_BYTES} bytes is no file of API keys")
-        found: dict[str, str] = {}
+        found: dict[str, Caller] = {}
         for number, line in enumerate(text.splitlines(), 1):
             words = line.split("#", 1)[0].split()
             if not words:
                 continue
-            if len(words) != 2 or not _NAME.fullmatch(words[0]) or not _HASH.fullmatch(words[1]):
+            right = words[2:] in ([], ["operator"]) and len(words) > 1
+            if not right or not _NAME.fullmatch(words[0]) or not _HASH.fullmatch(words[1]):
                 raise KeysError(
                     f"{path}: line {number} is not NAME SHA256 (64 hexadecimal digits); streetfix keys makes such a line"
                 )
-            if words[1] in found or words[0] in found.values():
+            if words[1] in found or words[0] in [caller.name for caller in found.values()]:
                 raise KeysError(f"{path}: line {number} has the name or the key of a line before it; keep one of them")
-            found[words[1]] = words[0]
+            found[words[1]] = Caller(words[0], operator=len(words) == 3)
         if not found:
             raise KeysError(f"{path}: there is no key in it, so nobody could ask; streetfix keys NAME >> {path}")
         return cls(found)
 
-    def require(self, presented: str | None) -> str:
-        """Name of the caller.
+    def require(self, presented: str | None) -> Caller:
+        """The caller.
 
         Raises:
             UnauthorizedError: no key, or not one of ours.
@@ -68,9 +77,9 @@ class KeyRing:
                 "this service asks for an API key; send it as Authorization: Bearer KEY, or as X-Api-Key"
             )
         digest = hash_of(presented[:_MOST_KEY])
-        for known, name in self.name_of.items():
+        for known, caller in self.caller_of.items():
             if hmac.compare_digest(known, digest):
-                return name
+                return caller
         raise UnauthorizedError("the API key is none of this service's; ask its operator for one")
 
 

@@ -47,6 +47,9 @@ class Settings(BaseSettings):
     insecure_public: bool = Field(
         False, description="listen beyond loopback although nobody has to show a key or certificate"
     )
+    watch_s: float = Field(
+        10.0, ge=0, le=86400, description="look for new bundles in the mounted folders this often; 0: on SIGHUP alone"
+    )
     grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
     grace_s: float = Field(
         20.0, ge=0, le=3600, description="how long running requests may take to end when the service stops"

@@ -23,6 +23,7 @@ class Stream:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._localizer: Localizer | None = None
+        self._name: str | None = None
         self._frames: deque[Frame] = deque(maxlen=MOST_FRAMES - 1)  # the newest first, against the newest
 
     def localize(
@@ -38,7 +39,11 @@ class Stream:
             RequestError: another map is asked than before, or as for a single query.
         """
         before, self._frames = self._frames, deque(maxlen=MOST_FRAMES - 1)  # whatever fails here begins the stream anew
-        localizer = self._localizer_for(encoded)
+        last, localizer = self._localizer, self._localizer_for(encoded)
+        if (
+            localizer is not last
+        ):  # the first frame, or another version of the map serves now: what was looked up is not of it
+            before.clear()
         frame, decode_ms = self._engine.look_up(localizer, encoded)
         kept: list[Frame] = []
         if T_previous_camera is not None:
@@ -54,12 +59,13 @@ class Stream:
 
     def _localizer_for(self, encoded: EncodedQuery) -> Localizer:
         if self._localizer is None:
-            self._localizer = self._engine.registry.get(encoded.map_name)
-        elif encoded.map_name not in (None, self._localizer.bundle.name):
+            self._name = encoded.map_name
+        elif encoded.map_name not in (None, self._name, self._localizer.bundle.name):
             raise RequestError(
                 f"map: this stream asks {self._localizer.bundle.name!r} since its first frame, not {encoded.map_name!r}; "
                 "open another stream for another map", field="map",
             )  # fmt: skip
+        self._localizer = self._engine.registry.get(self._name)
         return self._localizer
 
 

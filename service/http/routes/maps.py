@@ -3,11 +3,13 @@
 from typing import Any
 
 from fastapi import APIRouter
+from starlette.requests import Request
 from starlette.responses import Response
 
 from service.contract import schema
 from service.contract.convert import map_entry_from
 from service.contract.coverage import coverage_geojson
+from service.http.auth import require_operator
 from service.http.routes.localize import problems
 from service.runtime.engine import Engine
 
@@ -35,7 +37,26 @@ def router_for(engine: Engine) -> APIRouter:
 
     @router.get("/v1/maps", operation_id="listMaps", summary="All mounted maps")
     async def list_maps() -> schema.MapList:
-        return schema.MapList(maps=[map_entry_from(localizer.bundle) for localizer in engine.registry])
+        registry = engine.registry
+        return schema.MapList(
+            maps=[map_entry_from(each.bundle, registry.versions(each.bundle.name)) for each in registry]
+        )
+
+    @router.put(
+        "/v1/maps/{map}/serving",
+        operation_id="serveVersion",
+        summary="Let another version of a map serve",
+        responses=problems(401, 403, 404, 422),
+    )
+    async def serve_version(map: str, wanted: schema.ServeVersion, request: Request) -> schema.MapEntry:  # noqa: A002
+        """Roll back, or forward again, at once and whole; requests that run end on the version they began with.
+
+        It needs an operator's key (`streetfix keys --operator`), or a service on loopback without keys. A new bundle in the maps folder
+        takes over again, and a restart serves the newest: to keep an old version, take the new one out of the folder.
+        """
+        require_operator(request, engine.settings)
+        served = engine.registry.serve(map, wanted.version)
+        return map_entry_from(served.bundle, engine.registry.versions(map))
 
     @router.get(
         "/v1/maps/{map}/streets",

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.errors import KeysError, UnauthorizedError
-from service.runtime.keys import KeyRing, hash_of, new_key, presented_key
+from service.runtime.keys import Caller, KeyRing, hash_of, new_key, presented_key
 
 A, B = hashlib.sha256(b"a").hexdigest(), hashlib.sha256(b"b").hexdigest()
 
@@ -18,7 +18,12 @@ def ring_of(tmp_path, text):
 
 def test_a_key_leads_to_its_name(tmp_path):
     ring = ring_of(tmp_path, f"# robots\n\nrobot-7 {A}  # the red one\nlab {B}\n")
-    assert (ring.require("a"), ring.require("b")) == ("robot-7", "lab")
+    assert (ring.require("a"), ring.require("b")) == (Caller("robot-7"), Caller("lab"))
+
+
+def test_an_operators_key_says_so(tmp_path):
+    ring = ring_of(tmp_path, f"robot {A}\nme {B} operator")
+    assert (ring.require("a").operator, ring.require("b").operator) == (False, True)
 
 
 @pytest.mark.parametrize("presented", [None, "", "c", A, "a ", "A", "a" * 10_000])
@@ -32,7 +37,8 @@ def test_anything_else_is_refused(tmp_path, presented):
     [
         ("", "no key in it"), ("# none\n", "no key in it"), ("robot", "line 1"), (f"ok {A}\nrobot {B[:-1]}", "line 2"),
         (f"robot {A.upper()}", "line 1"), (f"a robot {A}", "line 1"), (f"rob/ot {A}", "line 1"), (f"{A} robot", "line 1"),
-        (f"one {A}\ntwo {A}", "line 2"), (f"one {A}\none {B}", "line 2"), ("x" * (2**20 + 1), "over"),
+        (f"one {A}\ntwo {A}", "line 2"), (f"one {A} admin", "line 1"), (f"one {A} operator too", "line 1"), (f"one {A}\none {B}", "line 2"),
+        ("x" * (2**20 + 1), "over"),
     ],
 )  # fmt: skip
 def test_a_file_that_is_none_is_named_with_its_line(tmp_path, text, told):
@@ -53,7 +59,7 @@ def test_new_keys_are_long_and_differ_and_get_in(tmp_path):
     one, other = new_key(), new_key()
     assert one != other
     assert len(one) >= 43
-    assert ring_of(tmp_path, f"r {hash_of(one)}").require(one) == "r"
+    assert ring_of(tmp_path, f"r {hash_of(one)}").require(one) == Caller("r")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 
 from service.errors import BundleError, UnknownMapError
+from service.localization.localizer import Localizer
 from service.maps.content import BundleContent
+from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.runtime.map_registry import MapRegistry
 
@@ -39,9 +41,95 @@ def test_with_several_maps_a_name_is_needed(two_maps: Path) -> None:
         MapRegistry.open([two_maps]).get(None)
 
 
-def test_two_maps_of_one_name_are_refused(bundle_path: Path, bundle_copy: Path) -> None:
-    with pytest.raises(BundleError, match="both called 'tiny'"):
+def test_the_same_version_twice_is_refused(bundle_path: Path, bundle_copy: Path) -> None:
+    with pytest.raises(BundleError, match=r"both version .* of 'tiny'"):
         MapRegistry.open([bundle_path, bundle_copy])
+
+
+@pytest.fixture
+def versions(content_of: Callable[..., BundleContent], tmp_path: Path) -> list[Localizer]:
+    """Four versions of one map, the oldest first."""
+    found = []
+    for seed in range(4):
+        path = tmp_path / f"v{seed}"
+        write_bundle(path, content_of(seed=seed))
+        found.append(Localizer.open(MapBundle.open(path)))
+    return found
+
+
+def version_of(localizer: Localizer) -> str:
+    return localizer.bundle.manifest.version
+
+
+def test_the_newest_version_serves_and_others_can_be_named(versions: list[Localizer]) -> None:
+    registry = MapRegistry([versions[1], versions[0], versions[2]])
+    assert registry.get(None) is registry.get("tiny") is versions[2]
+    assert list(registry) == [versions[2]]
+    assert len(registry) == 1
+    assert registry.versions("tiny") == (versions[2], versions[1], versions[0])
+    for each in versions[:3]:
+        assert registry.get(f"tiny@{version_of(each)}") is each
+    for name in ("tiny@", "tiny@x", f"tiny@{version_of(versions[3])}", "@", "west@x"):
+        if name == "tiny@":
+            assert registry.get(name) is versions[2]
+            continue
+        with pytest.raises(UnknownMapError):
+            registry.get(name)
+
+
+def test_a_new_version_takes_over_and_the_oldest_is_dropped(versions: list[Localizer]) -> None:
+    registry = MapRegistry(versions[:3])
+    registry.mount(versions[3])
+    assert registry.get("tiny") is versions[3]
+    assert registry.versions("tiny") == (versions[3], versions[2], versions[1])
+
+
+def test_rolling_back_holds_until_something_newer_comes(versions: list[Localizer]) -> None:
+    registry = MapRegistry(versions[:3])
+    assert registry.serve("tiny", version_of(versions[0])) is versions[0]
+    assert registry.get("tiny") is versions[0]
+    assert registry.versions("tiny") == (versions[2], versions[1], versions[0])
+    registry.mount(versions[1])  # mounted again, it is no news
+    assert registry.get("tiny") is versions[0]
+    registry.mount(versions[3])
+    assert registry.get("tiny") is versions[3]
+
+
+def test_the_version_that_serves_is_never_dropped(versions: list[Localizer]) -> None:
+    registry = MapRegistry(versions[1:])
+    registry.serve("tiny", version_of(versions[1]))
+    registry.mount(versions[0])  # older than all: nothing changes but that it is dropped at once
+    assert registry.get("tiny") is versions[1]
+    assert registry.versions("tiny") == (versions[3], versions[2], versions[1])
+
+
+def test_the_same_version_from_another_folder_takes_its_place(versions: list[Localizer], tmp_path: Path) -> None:
+    registry = MapRegistry(versions[:2])
+    again = Localizer.open(MapBundle.open(tmp_path / "v1"))
+    registry.mount(again)
+    assert registry.get("tiny") is again
+    assert registry.versions("tiny") == (again, versions[0])
+
+
+@pytest.mark.parametrize(("name", "version", "told"), [("west", "x", "mounted: tiny"), ("tiny", "x", "no version 'x'")])
+def test_what_is_not_open_cannot_serve(versions: list[Localizer], name: str, version: str, told: str) -> None:
+    registry = MapRegistry(versions[:1])
+    with pytest.raises(UnknownMapError, match=told):
+        registry.serve(name, version)
+    assert registry.get("tiny") is versions[0]
+
+
+def test_unmounting_lets_the_newest_of_the_others_serve(versions: list[Localizer]) -> None:
+    registry = MapRegistry(versions[:3])
+    registry.unmount("tiny", version_of(versions[2]))
+    assert registry.get("tiny") is versions[1]
+    registry.unmount("tiny", version_of(versions[0]))
+    assert registry.versions("tiny") == (versions[1],)
+    registry.unmount("west", "x")
+    registry.unmount("tiny", version_of(versions[1]))
+    assert len(registry) == 0
+    with pytest.raises(UnknownMapError, match="mounted: none"):
+        registry.get("tiny")
 
 
 @pytest.mark.parametrize(("make", "message"), [(False, "no such folder"), (True, "no manifest.json in it")])

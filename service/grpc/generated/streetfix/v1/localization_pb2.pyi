@@ -169,7 +169,7 @@ class ListMapsResponse(_message.Message):
     def __init__(self, maps: _Optional[_Iterable[_Union[MapEntry, _Mapping]]] = ...) -> None: ...
 
 class MapEntry(_message.Message):
-    __slots__ = ("name", "version", "made_at", "places", "views", "streets", "spacing_m", "encoder_sha256", "georeferenced", "licence")
+    __slots__ = ("name", "version", "made_at", "places", "views", "streets", "spacing_m", "encoder_sha256", "georeferenced", "licence", "versions")
     NAME_FIELD_NUMBER: _ClassVar[int]
     VERSION_FIELD_NUMBER: _ClassVar[int]
     MADE_AT_FIELD_NUMBER: _ClassVar[int]
@@ -180,6 +180,7 @@ class MapEntry(_message.Message):
     ENCODER_SHA256_FIELD_NUMBER: _ClassVar[int]
     GEOREFERENCED_FIELD_NUMBER: _ClassVar[int]
     LICENCE_FIELD_NUMBER: _ClassVar[int]
+    VERSIONS_FIELD_NUMBER: _ClassVar[int]
     name: str
     version: str
     made_at: str
@@ -190,7 +191,8 @@ class MapEntry(_message.Message):
     encoder_sha256: str
     georeferenced: bool
     licence: str
-    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., made_at: _Optional[str] = ..., places: _Optional[int] = ..., views: _Optional[int] = ..., streets: _Optional[int] = ..., spacing_m: _Optional[float] = ..., encoder_sha256: _Optional[str] = ..., georeferenced: _Optional[bool] = ..., licence: _Optional[str] = ...) -> None: ...
+    versions: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, name: _Optional[str] = ..., version: _Optional[str] = ..., made_at: _Optional[str] = ..., places: _Optional[int] = ..., views: _Optional[int] = ..., streets: _Optional[int] = ..., spacing_m: _Optional[float] = ..., encoder_sha256: _Optional[str] = ..., georeferenced: _Optional[bool] = ..., licence: _Optional[str] = ..., versions: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class GetStreetsRequest(_message.Message):
     __slots__ = ("map",)
