@@ -35,6 +35,12 @@ def command(
     ] = None,
     threads: Annotated[int | None, typer.Option(help="Requests worked on at once.  [default: the cores]")] = None,
     queue: Annotated[int | None, typer.Option(help="Requests that may wait before 503.  [default: 64]")] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Check settings, keys, certificates and maps, print the effective settings, and leave."
+        ),
+    ] = False,
     false_accept_rate: Annotated[
         float | None,
         typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
@@ -51,12 +57,37 @@ def command(
     limit_pools_before_import()
     from service.runtime.settings import load_settings
 
-    serve(
+    (check_only if check else serve)(
         load_settings(
             maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
             false_accept_rate=false_accept_rate,
         )
     )  # fmt: skip
+
+
+def check_only(settings: "Settings") -> None:
+    """Open all that a service would open, say what it found, and leave.
+
+    Raises:
+        StreetfixError: what would keep it from serving.
+    """
+    from service.cli.certificates import Certificates
+    from service.runtime.engine import Engine
+    from service.runtime.keys import KeyRing
+
+    if not settings.maps:
+        raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
+    callers = 0 if settings.api_keys is None else len(KeyRing.open(settings.api_keys).caller_of)
+    if settings.tls_certificate is not None:
+        Certificates.read(settings)
+    engine = Engine.open(settings)
+    typer.echo(settings.model_dump_json(indent=2))
+    for localizer in engine.registry:
+        engine.warm(localizer)
+        manifest = localizer.bundle.manifest
+        typer.echo(f"map {manifest.name} {manifest.version}: opens and answers")
+    typer.echo(f"keys of {callers} callers" if callers else "no keys")
+    engine.close()
 
 
 def serve(settings: "Settings") -> None:
@@ -66,18 +97,17 @@ def serve(settings: "Settings") -> None:
         BundleError: a map is missing, damaged or mismatched, or none is given.
         AddressError: the address is taken or not ours.
     """
-    import logging
-
     import uvicorn
 
     from service.cli.certificates import Certificates
     from service.http.app import create_app
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
+    from service.runtime.logs import set_up
 
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    set_up(style=settings.log_style, level=settings.log_level)
     keys = None if settings.api_keys is None else KeyRing.open(settings.api_keys)
     tls = None if settings.tls_certificate is None else Certificates.read(settings)
     engine = Engine.open(settings)

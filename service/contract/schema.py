@@ -320,6 +320,10 @@ class Version(BaseModel):
     version: str
     api: Literal["v1"] = "v1"
     threads: int = Field(description="requests worked on at once")
+    cores: int = Field(description="that this process may use, by affinity and by its container's quota")
+    pools: dict[str, int] = Field(
+        description="threads of each native pool: whole requests run side by side, so one each"
+    )
     maps: list[MapVersion]
 
 

@@ -19,6 +19,7 @@ from service.grpc.generated.streetfix.v1.localization_pb2_grpc import Localizati
 from service.grpc.messages import answer_message, map_message, request_from, sequence_request_from, transform_from
 from service.grpc.status import fail, problem_message, refuse
 from service.runtime.engine import Engine, Located
+from service.runtime.logs import log_request
 from service.runtime.stream import Stream
 
 T = TypeVar("T")
@@ -174,8 +175,9 @@ class Servicer(LocalizationServiceServicer):
 @contextmanager
 def _answering(engine: Engine, call: str, context: grpc.ServicerContext) -> Iterator[None]:
     """Whatever is raised inside ends the call as the contract says, and is counted."""
-    given = dict(context.invocation_metadata()).get(REQUEST_ID, "")
-    request_id = given if isinstance(given, str) and _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
+    metadata = {name: value for name, value in context.invocation_metadata() if isinstance(value, str)}
+    given = metadata.get(REQUEST_ID, "")
+    request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
     context.send_initial_metadata(((REQUEST_ID, request_id),))
     began, code = perf_counter(), "OK"
     try:
@@ -190,4 +192,13 @@ def _answering(engine: Engine, call: str, context: grpc.ServicerContext) -> Iter
         code = "INTERNAL"
         fail(context, error, request_id)
     finally:
-        engine.metrics.requested("grpc", call, code, perf_counter() - began)
+        seconds = perf_counter() - began
+        engine.metrics.requested("grpc", call, code, seconds)
+        log_request(
+            face="grpc",
+            method=call,
+            code=code,
+            seconds=seconds,
+            request_id=request_id,
+            traceparent=metadata.get("traceparent"),
+        )

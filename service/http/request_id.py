@@ -10,6 +10,7 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import internal_error
+from service.runtime.logs import log_request
 
 HEADER = "X-Request-Id"
 #: As other servers count a caller that went away before the answer.
@@ -29,7 +30,8 @@ class RequestIdMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        given = Headers(scope=scope).get(HEADER, "")
+        headers = Headers(scope=scope)
+        given = headers.get(HEADER, "")
         request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = request_id
         started, began, status = False, perf_counter(), 0
@@ -52,4 +54,9 @@ class RequestIdMiddleware:
             await response(scope, receive, send_with_id)
         finally:
             operation = getattr(scope.get("route"), "operation_id", None) or "none"
-            self._requested("rest", operation, str(status), perf_counter() - began)
+            seconds = perf_counter() - began
+            self._requested("rest", operation, str(status), seconds)
+            log_request(
+                face="rest", method=operation, code=str(status), seconds=seconds, request_id=request_id,
+                traceparent=headers.get("traceparent"),
+            )  # fmt: skip

@@ -19,6 +19,9 @@ from service.imaging.view_grid import PLANES
 Side = Literal["survey", "query"]
 Descriptors = Float32[NDArray[np.float32], "B D"]
 
+#: Of one run: whole requests run side by side, and inner pools only get in their way.
+THREADS = 1
+
 
 class Encoder:
     """One encoder for both sides; a session may be used from several threads.
@@ -44,7 +47,7 @@ class Encoder:
         self.trained_on = tuple(session.get_modelmeta().custom_metadata_map.get("trained_on", "").split())
 
     @staticmethod
-    def open(source: Path | bytes, *, threads: int = 1) -> "Encoder":
+    def open(source: Path | bytes, *, threads: int = THREADS) -> "Encoder":
         """Open an ONNX file, or its bytes.
 
         Args:

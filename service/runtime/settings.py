@@ -2,7 +2,7 @@
 
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -49,6 +49,10 @@ class Settings(BaseSettings):
     )
     watch_s: float = Field(
         10.0, ge=0, le=86400, description="look for new bundles in the mounted folders this often; 0: on SIGHUP alone"
+    )
+    log_style: Literal["text", "json"] = Field("text", description="of the log on stderr")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        "warning", description="info: a line for each request"
     )
     grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
     grace_s: float = Field(

@@ -1,5 +1,6 @@
 """Keys and certificates, checked by both faces of the real command over real sockets."""
 
+import json
 import re
 import signal
 import ssl
@@ -159,3 +160,46 @@ def test_tls_is_spoken_by_both_faces(start: Start, pem: dict[str, Path], mutual:
             else:
                 with pytest.raises(grpc.RpcError):
                     stub.ListMaps(pb.ListMapsRequest(), timeout=5)
+
+
+def test_check_says_what_would_be_served_and_leaves(bundle_path: Path, tmp_path: Path) -> None:
+    _, keys = made_key(tmp_path)
+    done = subprocess.run(
+        [*COMMAND, "serve", str(bundle_path), "--check", "--threads", "3"], env={"PATH": "", "STREETFIX_API_KEYS": str(keys)},
+        capture_output=True, text=True, check=False, timeout=60,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert '"threads": 3' in done.stdout
+    assert re.search(r"map tiny \w+: opens and answers\nkeys of 1 callers\n$", done.stdout)
+    (tmp_path / "broken").mkdir()
+    refused_ = subprocess.run(
+        [*COMMAND, "serve", str(tmp_path / "broken"), "--check"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert refused_.returncode == 1
+    assert "manifest.json" in refused_.stderr
+
+
+def test_the_log_has_a_line_for_each_request_and_nothing_of_its_content(
+    bundle_path: Path, parts_of: Callable[..., dict[str, bytes]]
+) -> None:
+    settings = {"STREETFIX_LOG_STYLE": "json", "STREETFIX_LOG_LEVEL": "info"}
+    process = subprocess.Popen(
+        [*COMMAND, "serve", str(bundle_path), "--threads", "1", "--port", "0"], env={"PATH": "", **settings},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    url = next(found[1] for line in process.stdout if (found := re.search(r"serving at (\S+)", line)))
+    files = {name: (name, data) for name, data in parts_of().items()}
+    trace = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01"
+    httpx.post(f"{url}/v1/localize?secret=1", files=files, headers={"X-Request-Id": "r-1", "traceparent": trace})
+    httpx.get(f"{url}/nowhere/secret")
+    process.send_signal(signal.SIGTERM)
+    told = [json.loads(line) for line in process.communicate(timeout=60)[1].splitlines()]
+    requests = [each for each in told if each["event"] == "request"]
+    assert [(each["method"], each["code"]) for each in requests] == [("localize", "200"), ("none", "404")]
+    assert (requests[0]["request_id"], requests[0]["trace_id"]) == ("r-1", trace.split("-")[1])
+    assert "secret" not in json.dumps(told)

@@ -8,6 +8,7 @@ from service.errors import BundleError
 from service.http.routes.localize import problems
 from service.runtime.engine import Engine
 from service.runtime.metrics import CONTENT_TYPE
+from service.runtime.threads import pools, usable_cores
 
 
 def router_for(engine: Engine, version: str) -> APIRouter:
@@ -44,6 +45,8 @@ def router_for(engine: Engine, version: str) -> APIRouter:
         return schema.Version(
             version=version,
             threads=engine.threads,
+            cores=usable_cores(),
+            pools=pools(),
             maps=[schema.MapVersion(name=manifest.name, version=manifest.version) for manifest in maps],
         )
 

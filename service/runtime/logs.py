@@ -1,0 +1,65 @@
+"""One line an event, as JSON for machines or text for people; of a request its id, its trace and its figures, nothing else."""
+
+import json
+import logging
+import re
+import sys
+from datetime import UTC, datetime
+from typing import Literal
+
+#: W3C Trace Context: version, trace id, parent id, flags.
+_TRACEPARENT = re.compile(r"[0-9a-f]{2}-(?!0{32})([0-9a-f]{32})-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
+_log = logging.getLogger("streetfix.requests")
+
+
+class JsonFormatter(logging.Formatter):
+    """A JSON object a line; what an event carries beside its text is under its own names."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line."""
+        told: dict[str, object] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(), "logger": record.name, "event": record.getMessage(),
+        }  # fmt: skip
+        told |= getattr(record, "figures", {})
+        if record.exc_info:
+            told["error"] = self.formatException(record.exc_info)
+        return json.dumps(told, default=str)
+
+
+class TextFormatter(logging.Formatter):
+    """The same for people."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line, and a traceback's below it."""
+        figures = " ".join(f"{name}={value}" for name, value in getattr(record, "figures", {}).items())
+        line = super().format(record)
+        head, _, rest = line.partition("\n")
+        return f"{head} {figures}".rstrip() + (f"\n{rest}" if rest else "")
+
+
+def set_up(*, style: Literal["text", "json"], level: Literal["debug", "info", "warning", "error"]) -> None:
+    """Send all loggers to stderr."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(
+        JsonFormatter() if style == "json" else TextFormatter("%(asctime)s %(levelname)s %(name)s %(message)s")
+    )
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+
+
+def log_request(*, face: str, method: str, code: str, seconds: float, request_id: str, traceparent: str | None) -> None:
+    """A request that was answered or refused."""
+    if not _log.isEnabledFor(logging.INFO):
+        return
+    figures: dict[str, object] = {
+        "face": face, "method": method, "code": code, "ms": round(1e3 * seconds, 1), "request_id": request_id,
+    }  # fmt: skip
+    if (trace_id := trace_id_of(traceparent)) is not None:
+        figures["trace_id"] = trace_id
+    _log.info("request", extra={"figures": figures})
+
+
+def trace_id_of(traceparent: str | None) -> str | None:
+    """The trace's id in a ``traceparent`` header; None where it is not well formed."""
+    found = _TRACEPARENT.fullmatch((traceparent or "").strip())
+    return None if found is None else found[1]
