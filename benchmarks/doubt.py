@@ -1,6 +1,7 @@
 """Does confidence know what it does not know? Another city's queries, streets that the map lacks, pictures that show nothing."""
 
 from collections.abc import Callable, Iterator
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,12 @@ from model_training.datasets.without_streets import WithoutStreets
 from model_training.evaluation.predict import Predictions, joined
 from model_training.mapping.build import BuildSettings
 from model_training.simulation.hard import HARD
+from model_training.stock import CALIBRATION
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
-from service.localization.query import Query
+from service.localization.query import FALSE_ACCEPT_RATE, Query
+from service.maps.calibration import read_calibration
 
 RIGHT_M = 1.0
 #: Cities whose maps are built once more with every second street left out.
@@ -107,7 +110,17 @@ def _false_rows(
 ) -> None:  # fmt: skip
     level = float(np.quantile(confidence[right], 0.05))
     report.share(f"{row}.false_accepts_at_95", negative >= level, bar=bar, better="lower")
+    report.share(f"{row}.accepted_by_default", negative >= default_threshold(), better="lower")
     report.row(f"{row}.average_precision", average_precision(confidence, right, negative), "share", n=len(negative))
+
+
+@cache
+def default_threshold() -> float:
+    """The confidence from which on the service accepts an answer if nobody says otherwise."""
+    calibration = read_calibration(CALIBRATION.read_bytes(), path=str(CALIBRATION))
+    if calibration is None:
+        raise ValueError(f"{CALIBRATION} says that it is no calibration")
+    return calibration.threshold(FALSE_ACCEPT_RATE)
 
 
 def average_precision(

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.why_missed import WHY_MISSED
 from model_training.evaluation.error_measures import wilson_interval
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,8 +55,9 @@ class Report:
             holds = value is not None and _holds(value, bar, better)
             shown_bar: object = list(bar) if isinstance(bar, tuple) else bar
             entry |= {"bar": shown_bar, "better": "inside" if isinstance(bar, tuple) else better, "holds": holds}
-        if why is not None:
-            entry["why"] = why
+        told = [each for each in (why, None if entry.get("holds", True) else WHY_MISSED.get(row_id)) if each]
+        if told:
+            entry["why"] = "; ".join(told)
         self.rows = [r for r in self.rows if r["id"] != row_id] + [entry]
         mark = "" if bar is None else ("  holds" if entry["holds"] else "  MISSED")
         shown = "-" if value is None else f"{value:.4f}"
