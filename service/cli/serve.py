@@ -43,7 +43,7 @@ def command(
     ] = False,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
+        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.01]"),
     ] = None,
 ) -> None:
     """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
