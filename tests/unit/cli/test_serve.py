@@ -28,4 +28,4 @@ def test_a_taken_address_is_refused_with_the_remedy(bundle_path: Path) -> None:
 
 def test_an_address_that_is_not_this_machines_is_refused(bundle_path: Path) -> None:
     with pytest.raises(AddressError):
-        serve(Settings(maps=(bundle_path,), host="203.0.113.7"))
+        serve(Settings(maps=(bundle_path,), host="203.0.113.7", insecure_public=True))

@@ -14,8 +14,8 @@ BUSY = "import time\nt = time.process_time()\nwhile time.process_time() - t < 0.
 def test_a_child_counts_with_its_parent():
     parent = f"import subprocess, sys\nsubprocess.run([sys.executable, '-c', {BUSY!r}])"
     process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
     try:
-        assert process.stdout is not None
         assert process.stdout.readline() == "done\n"
         found = usage(process.pid)
         assert 0.55 < found.cpu_s < 5
@@ -26,6 +26,7 @@ def test_a_child_counts_with_its_parent():
         subprocess.run(["pkill", "-P", str(process.pid)], check=False)
         process.kill()
         process.wait()
+        process.stdout.close()
 
 
 def test_a_process_that_is_not_there_is_named():
