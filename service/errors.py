@@ -14,6 +14,7 @@ StreetfixError                     code            kind
 ├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
 ├── ForbiddenError                 forbidden       forbidden    the caller may ask, but not change what the service does
 ├── BusyError                      busy            busy         the queue is full
+├── NotReadyError                  not-ready       not_ready    no map is mounted, or the service is leaving
 ├── DeadlineError                  deadline        deadline     a request took longer than the service allows
 ├── BundleError                    bundle          not_ready    a map bundle is missing, damaged or of another version
 ├── DatasetError                   dataset         invalid      a dataset folder is incomplete or contradicts itself
@@ -134,6 +135,13 @@ class BusyError(StreetfixError):
 
     code = "busy"
     kind = "busy"
+
+
+class NotReadyError(StreetfixError):
+    """No map is mounted, or the service is leaving."""
+
+    code = "not-ready"
+    kind = "not_ready"
 
 
 class DeadlineError(StreetfixError):

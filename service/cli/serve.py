@@ -100,6 +100,7 @@ def serve(settings: "Settings") -> None:
     import uvicorn
 
     from service.cli.certificates import Certificates
+    from service.cli.draining import DrainingServer
     from service.http.app import create_app
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
@@ -117,7 +118,7 @@ def serve(settings: "Settings") -> None:
                 create_app(engine, keys), log_config=None, access_log=False, lifespan="off",
                 timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
             )  # fmt: skip
-            server = uvicorn.Server(config)
+            server = DrainingServer(config, engine, delay_s=settings.drain_s)
             # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, server.handle_exit)

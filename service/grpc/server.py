@@ -71,6 +71,7 @@ class GrpcServer:
             )
         except RuntimeError as error:
             raise AddressError(f"cannot listen on {shown}:{port} for gRPC; choose another --grpc-port") from error
+        engine.when_draining.append(lambda: self._say(health_pb2.HealthCheckResponse.NOT_SERVING))
         self._say(
             health_pb2.HealthCheckResponse.SERVING if engine.is_ready else health_pb2.HealthCheckResponse.NOT_SERVING
         )

@@ -1,5 +1,6 @@
 """The composition root: settings in, a running engine out; every face calls this and nothing below it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -68,6 +69,8 @@ class Engine:
         self.threads = settings.threads or usable_cores()
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.metrics = Metrics(self.admission, registry)
+        self.is_draining = False
+        self.when_draining: list[Callable[[], None]] = []
 
     @classmethod
     def open(cls, settings: Settings) -> "Engine":
@@ -81,8 +84,15 @@ class Engine:
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is a map to answer from."""
-        return len(self.registry) > 0
+        """Whether there is a map to answer from, and the service is not leaving."""
+        return len(self.registry) > 0 and not self.is_draining
+
+    def drain(self) -> None:
+        """Say that the service is leaving; it still answers."""
+        if not self.is_draining:
+            self.is_draining = True
+            for told in self.when_draining:
+                told()
 
     def localize(self, encoded: EncodedQuery) -> Located:
         """Decode and localize, in the thread of the caller.

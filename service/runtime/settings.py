@@ -55,6 +55,9 @@ class Settings(BaseSettings):
         "warning", description="info: a line for each request"
     )
     grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
+    drain_s: float = Field(
+        0.0, ge=0, le=600, description="after SIGTERM: not ready, but answering, so long, for balancers to notice"
+    )
     grace_s: float = Field(
         20.0, ge=0, le=3600, description="how long running requests may take to end when the service stops"
     )

@@ -4,7 +4,7 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from service.contract import schema
-from service.errors import BundleError
+from service.errors import NotReadyError
 from service.http.routes.localize import problems
 from service.runtime.engine import Engine
 from service.runtime.metrics import CONTENT_TYPE
@@ -24,7 +24,8 @@ def router_for(engine: Engine, version: str) -> APIRouter:
     )
     async def readyz() -> schema.Health:
         if not engine.is_ready:
-            raise BundleError("no map is mounted; start the service with a map bundle")
+            what = "the service is leaving" if engine.is_draining else "no map is mounted; mount a map bundle"
+            raise NotReadyError(what)
         return schema.Health()
 
     @router.get(

@@ -43,7 +43,7 @@ def test_a_service_without_a_map_lives_and_is_not_ready(client_of: Callable[[Eng
     client = client_of(engine)
     assert client.get("/livez").status_code == 200
     response = client.get("/readyz")
-    assert (response.status_code, response.json()["code"]) == (503, "bundle")
+    assert (response.status_code, response.json()["code"]) == (503, "not-ready")
     engine.close()
 
 
