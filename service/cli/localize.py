@@ -26,6 +26,12 @@ def command(
     heading: Annotated[
         float | None, typer.Option(help="Where it looked, roughly: degrees, counter-clockwise from map x.")
     ] = None,
+    key: Annotated[
+        str | None,
+        typer.Option(
+            "--api-key", envvar="STREETFIX_API_KEY", help="Where the service asks for one.", show_default=False
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the answer as it came.")] = False,
 ) -> None:
     """Ask where two pictures were taken.
@@ -33,7 +39,7 @@ def command(
     Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json --near 12,-40
     """
     prior = _prior(near, heading)
-    answer = localize(url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior)
+    answer = localize(url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior, key=key)
     if as_json:
         typer.echo(json.dumps(answer))
     else:
@@ -56,7 +62,14 @@ def _prior(near: str | None, heading_deg: float | None) -> dict[str, Any] | None
 
 
 def localize(
-    url: str, *, rgb: Path, depth: Path, camera: Path, map_name: str | None = None, prior: dict[str, Any] | None = None
+    url: str,
+    *,
+    rgb: Path,
+    depth: Path,
+    camera: Path,
+    map_name: str | None = None,
+    prior: dict[str, Any] | None = None,
+    key: str | None = None,
 ) -> dict[str, Any]:
     """Post a pair of pictures.
 
@@ -67,6 +80,7 @@ def localize(
         camera: JSON file with the request's parts: camera, depth, gravity and so on.
         map_name: which map; goes above the file's.
         prior: as in the REST contract; goes above the file's.
+        key: API key, where the service asks for one.
 
     Raises:
         RequestError: a file cannot be read, or the camera file is no JSON object.
@@ -86,7 +100,8 @@ def localize(
         # A proxy named in the environment is for other machines: it could not reach this one's loopback.
         own = httpx.URL(url).host in ("127.0.0.1", "localhost", "::1")
         with httpx.Client(timeout=_TIMEOUT_S, trust_env=not own) as client:
-            response = client.post(f"{url.rstrip('/')}/v1/localize", files=files)
+            headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+            response = client.post(f"{url.rstrip('/')}/v1/localize", files=files, headers=headers)
         answer = response.json()
     except (httpx.HTTPError, httpx.InvalidURL) as error:
         raise UnreachableError(

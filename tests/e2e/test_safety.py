@@ -19,6 +19,7 @@ from service.grpc.generated.streetfix.v1.localization_pb2_grpc import Localizati
 
 COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()"]
 Start = Callable[..., tuple[str, str]]
+Parts = Callable[..., dict[str, bytes]]
 
 
 @pytest.fixture
@@ -56,7 +57,7 @@ def made_key(tmp_path: Path) -> tuple[str, Path]:
     return done.stderr.split()[-1], tmp_path / "keys.txt"
 
 
-def test_with_keys_both_faces_ask_for_one_and_health_stays_open(start: Start, tmp_path: Path) -> None:
+def test_with_keys_both_faces_ask_for_one_and_health_stays_open(start: Start, tmp_path: Path, parts_of: Parts) -> None:
     key, path = made_key(tmp_path)
     assert key not in path.read_text()
     rest, grpc_address = start(api_keys=path, host="0.0.0.0")  # noqa: S104  # beyond loopback, since there are keys
@@ -70,6 +71,14 @@ def test_with_keys_both_faces_ask_for_one_and_health_stays_open(start: Start, tm
         assert httpx.get(f"{rest}/v1/maps", headers=headers).json()["maps"][0]["name"] == "tiny"
     for path_ in ("/livez", "/readyz"):
         assert httpx.get(rest + path_).status_code == 200
+    for name, content in parts_of().items():
+        (tmp_path / name).write_bytes(content)
+    files = [word for name in ("rgb", "depth") for word in (f"--{name}", str(tmp_path / name))]
+    asked = [*COMMAND, "localize", "--url", rest, *files, "--camera", str(tmp_path / "request")]
+    for environment, told in (({}, "unauthorized"), ({"STREETFIX_API_KEY": key}, "LOCALIZED")):
+        done = subprocess.run(asked, env={"PATH": "", **environment}, capture_output=True, text=True, check=False)
+        assert told in done.stdout or "asks for an API key" in done.stderr
+        assert (done.returncode == 0) == (told == "LOCALIZED")
     with grpc.insecure_channel(grpc_address) as channel:
         stub = LocalizationServiceStub(channel)
         for metadata in ((), (("authorization", "Bearer wrong"),)):
