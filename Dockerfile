@@ -40,5 +40,5 @@ VOLUME ["/maps"]
 EXPOSE 8000 50051
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=10s --timeout=3s --start-period=20s --retries=3 \
-  CMD ["python", "-c", "import os, urllib.request as r; r.urlopen('http://127.0.0.1:' + os.environ['STREETFIX_PORT'] + '/readyz', timeout=2)"]
+  CMD ["streetfix", "health"]
 CMD ["streetfix", "serve", "--host", "0.0.0.0"]

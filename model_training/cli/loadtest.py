@@ -84,18 +84,20 @@ async def _run(target: Target, sent: list[Payload], load: Load, pid: int | None,
     what = f"{load.rate:g}/s" if load.rate is not None else f"{load.concurrency} at a time"
     columns = (TextColumn(what), BarColumn(), TimeRemainingColumn())
     before: Usage | None = None
+    after: Usage | None = None
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(what, total=load.warm_up_s + load.duration_s)
 
         def tick(seconds: float) -> None:
-            nonlocal before
-            if before is None and pid is not None and seconds >= load.warm_up_s:
-                before = usage(pid)
+            nonlocal before, after
+            if pid is not None and seconds >= load.warm_up_s:
+                after = usage(pid)
+                before = after if before is None else before
             progress.update(task, completed=seconds)
 
         async with target:
             shots = await drive(target, sent, load, tick)
-    return summarise(shots, sent, load, before, None if pid is None else usage(pid))
+    return summarise(shots, sent, load, before, after)
 
 
 def table_of(found: list[Summary]) -> Table:

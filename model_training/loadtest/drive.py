@@ -70,7 +70,11 @@ async def drive(
 
     async def send(due_s: float) -> None:
         number = next(turn) % len(payloads)
-        reply = await target.ask(payloads[number], load.timeout_s)
+        try:
+            async with asyncio.timeout(load.timeout_s):
+                reply = await target.ask(payloads[number], load.timeout_s)
+        except TimeoutError:
+            reply = Reply("timeout")
         shots.append(Shot(due_s, now(), number, reply))
 
     async def client() -> None:
@@ -80,7 +84,8 @@ async def drive(
     async def clock() -> None:
         while now() < total:
             tick(now())
-            await asyncio.sleep(0.25)
+            await asyncio.sleep(min(0.25, max(0.0, total - now())))
+        tick(total)
 
     async with asyncio.TaskGroup() as group:
         group.create_task(clock())

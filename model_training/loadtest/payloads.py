@@ -49,7 +49,9 @@ def payloads(dataset: Dataset, queries: str | None, *, map_name: str | None, ref
     names = dataset.query_sets(with_truth=True) or dataset.query_sets()
     if not names or queries not in (None, *dataset.query_sets()):
         there = ", ".join(dataset.query_sets()) or "none"
-        raise DatasetError(f"{dataset.folder}: there is no query set {queries or 'at all'}; it has {there}", field="queries")
+        raise DatasetError(
+            f"{dataset.folder}: there is no query set {queries or 'at all'}; it has {there}", field="queries"
+        )
     frames = list(dataset.queries(queries or names[0]))
     if not frames:
         raise DatasetError(f"{dataset.folder}: the query set {queries or names[0]} is empty", field="queries")

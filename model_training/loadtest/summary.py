@@ -20,7 +20,7 @@ class Summary:
 
     Attributes:
         offered_per_s: requests due a second;
-        answered_per_s: and answered.
+        answered_per_s: answers that came within the counted seconds, a second.
         answered_ms: percentiles of the answered ones' latency: p50, p90, p95, p99, max; empty without any.
         refused_ms: of the others'.
         errors: others by what became of them.
@@ -60,9 +60,12 @@ def summarise(
         payloads: that were sent.
         load: as it was asked for.
         before: of the service's processes when the counted seconds began; None where they were not watched.
-        after: of them when all was answered.
+        after: of them when the counted seconds ended.
     """
+    total_s = load.warm_up_s + load.duration_s
     counted = [shot for shot in shots if shot.due_s >= load.warm_up_s]
+    # What comes when the load has ended is late, but no part of what the service answers a second.
+    in_time = sum(shot.reply.code == "ok" and load.warm_up_s <= shot.done_s < total_s for shot in shots)
     answered = [shot for shot in counted if shot.reply.code == "ok"]
     refused = [shot for shot in counted if shot.reply.code != "ok"]
     first: dict[int, tuple[float, float, float]] = {}
@@ -80,11 +83,11 @@ def summarise(
     used = None if before is None or after is None else after.cpu_s - before.cpu_s
     return Summary(
         rate=load.rate, concurrency=load.concurrency, offered_per_s=len(counted) / load.duration_s,
-        answered_per_s=len(answered) / load.duration_s, answered_ms=_percentiles(answered), refused_ms=_percentiles(refused),
+        answered_per_s=in_time / load.duration_s, answered_ms=_percentiles(answered), refused_ms=_percentiles(refused),
         errors=dict(Counter(shot.reply.code for shot in refused)), answers=len(answered),
         localized=len(localized) / len(answered) if answered else None,
         right=float(np.mean(np.array(distances) <= RIGHT_M)) if distances else None, inconsistent=inconsistent,
-        cpu_ms_per_answer=None if used is None or not answered else 1e3 * used / len(answered),
+        cpu_ms_per_answer=None if used is None or not in_time else 1e3 * used / in_time,
         resident_mib=None if after is None else after.resident_mib,
     )  # fmt: skip
 

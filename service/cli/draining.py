@@ -1,7 +1,9 @@
 """A server that says it is leaving before it leaves, so that balancers send their requests elsewhere."""
 
 import signal
+import socket
 import threading
+from collections.abc import Callable
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -17,10 +19,18 @@ class DrainingServer(uvicorn.Server):
     Ctrl-C, and a second SIGTERM, skip the while.
     """
 
-    def __init__(self, config: uvicorn.Config, engine: "Engine", *, delay_s: float) -> None:
+    def __init__(
+        self, config: uvicorn.Config, engine: "Engine", *, delay_s: float, leaving: Callable[[], object] = lambda: None
+    ) -> None:
         super().__init__(config)
         self._engine = engine
         self._delay_s = delay_s
+        self._leaving = leaving
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """No new connections, then the end of running requests; other faces begin to leave at the same moment."""
+        self._leaving()
+        await super().shutdown(sockets)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Uvicorn's handler of signals."""

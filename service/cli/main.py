@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import ValidationError
 
-from service.cli import keys, localize, serve
+from service.cli import health, keys, localize, serve
 from service.errors import ExtraMissingError, StreetfixError
 
 GROUP = "streetfix.commands"
@@ -56,6 +56,7 @@ def app_for(arguments: Sequence[str]) -> typer.Typer:
     app.command("serve")(serve.command)
     app.command("localize")(localize.command)
     app.command("keys")(keys.command)
+    app.command("health")(health.command)
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         summary, extra = _KNOWN.get(point.name, (f"From the package {point.dist.name if point.dist else '?'}.", None))
         function = _load(point, extra) if point.name == called else _not_called

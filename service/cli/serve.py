@@ -4,7 +4,7 @@ import math
 import signal
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -118,11 +118,11 @@ def serve(settings: "Settings") -> None:
                 create_app(engine, keys), log_config=None, access_log=False, lifespan="off",
                 timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
             )  # fmt: skip
-            server = DrainingServer(config, engine, delay_s=settings.drain_s)
-            # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, server.handle_exit)
-            with _grpc(engine, keys, tls) as grpc_port, _watching(engine):
+            with _grpc(engine, keys, tls) as (grpc_port, leave), _watching(engine):
+                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave)
+                # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
+                for number in (signal.SIGINT, signal.SIGTERM):
+                    signal.signal(number, server.handle_exit)
                 _say_where(engine.registry, listener, grpc_port, "http" if tls is None else "https")
                 server.run(sockets=[listener])
     finally:
@@ -131,11 +131,13 @@ def serve(settings: "Settings") -> None:
 
 
 @contextmanager
-def _grpc(engine: "Engine", keys: "KeyRing | None", tls: "Certificates | None") -> Iterator[int | None]:
-    """Serve gRPC inside, where the settings want it; its port."""
+def _grpc(
+    engine: "Engine", keys: "KeyRing | None", tls: "Certificates | None"
+) -> Iterator[tuple[int | None, Callable[[], object]]]:
+    """Serve gRPC inside, where the settings want it; its port, and what begins its end."""
     settings = engine.settings
     if settings.grpc_port is None:
-        yield None
+        yield None, lambda: None
         return
     from service.grpc.server import GrpcServer
 
@@ -143,7 +145,7 @@ def _grpc(engine: "Engine", keys: "KeyRing | None", tls: "Certificates | None") 
     server = GrpcServer(engine, host=settings.host, port=settings.grpc_port, keys=keys, credentials=credentials)
     server.start()
     try:
-        yield server.port
+        yield server.port, lambda: server.begin_stop(grace_s=settings.grace_s)
     finally:
         server.stop(grace_s=settings.grace_s)
 

@@ -336,4 +336,5 @@ def _vector(position: NDArray[np.float64]) -> schema.Vector:
 
 def _degrees(angle_rad: float) -> float:
     """In (-180, 180]."""
-    return 180.0 - (180.0 - math.degrees(angle_rad)) % 360.0
+    found = 180.0 - (180.0 - math.degrees(angle_rad)) % 360.0
+    return found if found > -180.0 else 180.0

@@ -12,6 +12,8 @@ from service.maps.reader import MapBundle
 
 #: Edge of a cell, and how far from a place a robot may stand: retrieval finds it 2 m aside of a survey's lane, and a little more.
 CELL_M, REACH_M = 5.0, 7.5
+_MOST_MADE = 64
+_made: dict[tuple[str, str], bytes] = {}
 
 
 def coverage_geojson(bundles: Sequence[MapBundle]) -> bytes:
@@ -20,10 +22,20 @@ def coverage_geojson(bundles: Sequence[MapBundle]) -> bytes:
     Longitude and latitude where the map is georeferenced, as RFC 7946 has it, else metres of the map frame, which the property
     ``frame`` says.
     """
-    return json.dumps({"type": "FeatureCollection", "features": [_feature(bundle) for bundle in bundles]}).encode()
+    return b'{"type": "FeatureCollection", "features": [' + b", ".join(_feature(bundle) for bundle in bundles) + b"]}"
 
 
-def _feature(bundle: MapBundle) -> dict[str, Any]:
+def _feature(bundle: MapBundle) -> bytes:
+    """Made once for each version of a map: of a large one it takes seconds."""
+    name = (str(bundle.path), bundle.manifest.version)
+    if name not in _made:
+        while len(_made) >= _MOST_MADE:
+            _made.pop(next(iter(_made)))
+        _made[name] = json.dumps(_made_feature(bundle)).encode()
+    return _made[name]
+
+
+def _made_feature(bundle: MapBundle) -> dict[str, Any]:
     rings = [_ring(rectangle, bundle) for rectangle in covered(bundle.T_map_place[:, :2, 3])]
     return {
         "type": "Feature",

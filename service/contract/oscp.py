@@ -27,6 +27,7 @@ _MODELS = {
 }  # fmt: skip
 _COLOUR = ("RGBA32", "RGB", "GRAY8")
 _MOST_READINGS = 64
+_SAME_VIEW = 0.01  # of the picture's size
 #: Of a prior pose whose accuracy was not told, or told too well: its sender has moved since.
 _LEAST_STD_M, _HEADING_STD_DEG = 5.0, 30.0
 
@@ -136,6 +137,7 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
         f"{where}: there is no picture of imageFormat DEPTH; this service localizes by colour and depth together: send the depth "
         "camera's picture (16-bit PNG in mm, or float TIFF in m) as a second reading",
     )  # fmt: skip
+    _require_same_view(colour, depth)
     content: dict[str, Any] = {"map": map_name, "camera": _camera(colour), "depth": _depth_format(depth)}
     if gravity := _gravity(readings):
         content["gravity"] = gravity
@@ -191,6 +193,19 @@ def _camera(reading: CameraReading) -> dict[str, Any]:
         "width": int(reading.size[0]), "height": int(reading.size[1]), "fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5,
         "distortion": numbers[focal + 2 :],
     }  # fmt: skip
+
+
+def _require_same_view(colour: CameraReading, depth: CameraReading) -> None:
+    """Depth is read by the colour camera's intrinsics, so it must be aligned with it; another camera's is refused, not misread."""
+    if depth.params is None or not depth.params.modelParams:
+        return
+    one, other = _camera(colour), _camera(depth)
+    for focal, size in (("fx", "width"), ("fy", "height"), ("cx", "width"), ("cy", "height")):
+        if abs(one[focal] / max(one[size], 1) - other[focal] / max(other[size], 1)) > _SAME_VIEW:
+            raise NotYetSupportedError(
+                f"sensorReadings.cameraReadings.depth.params: its {focal} is another than the colour camera's; send depth aligned with "
+                "the colour picture", field="sensorReadings.cameraReadings.depth.params",
+            )  # fmt: skip
 
 
 def _depth_format(reading: CameraReading) -> dict[str, Any]:

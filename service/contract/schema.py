@@ -28,10 +28,18 @@ class Quaternion(_Strict):
     w: float
 
 
+class Position(_Strict):
+    """Metres; between parts of a robot, or places that it passed."""
+
+    x: float = Field(ge=-1e5, le=1e5)
+    y: float = Field(ge=-1e5, le=1e5)
+    z: float = Field(ge=-1e5, le=1e5)
+
+
 class RigidTransform(_Strict):
     """Takes coordinates of the second frame of its name to the first."""
 
-    position: Vector = Field(description="metres")
+    position: Position
     orientation: Quaternion
 
 

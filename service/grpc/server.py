@@ -1,20 +1,23 @@
 """The gRPC face: an engine in, a listening server out."""
 
 from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import grpc
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from service.errors import AddressError
 from service.grpc.auth import AuthInterceptor
-from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import add_LocalizationServiceServicer_to_server
+from service.grpc.health import Health
+from service.grpc.patience import Patience
+from service.grpc.reading import SERVICE, ReadingInterceptor
 from service.grpc.servicer import Servicer
 from service.runtime.engine import Engine
 from service.runtime.keys import KeyRing
 
-SERVICE: str = pb.DESCRIPTOR.services_by_name["LocalizationService"].full_name
+HEALTH: str = health_pb2.DESCRIPTOR.services_by_name["Health"].full_name
 #: Calls that are refused, or ask nothing of the workers, while every place of the queue is taken.
 _SPARE = 16
 
@@ -43,6 +46,8 @@ class GrpcServer:
         credentials: grpc.ServerCredentials | None = None,
     ) -> None:
         settings = engine.settings
+        self._patience = Patience()
+        reading = ReadingInterceptor(self._patience, timeout_s=settings.request_timeout_s)
         # A thread waits for each call; the work itself is the engine's workers'. A stream holds its thread while it lives.
         most = engine.admission.capacity + settings.grpc_streams + _SPARE
         self._server = grpc.server(
@@ -51,40 +56,38 @@ class GrpcServer:
                 ("grpc.max_receive_message_length", settings.limits.max_request_bytes),
                 ("grpc.max_send_message_length", -1),
                 ("grpc.so_reuseport", 0),
+                ("grpc.keepalive_time_ms", 30_000),  # a robot that lost its link must not keep its stream
+                ("grpc.keepalive_timeout_ms", 10_000),
             ],
             maximum_concurrent_rpcs=most,
-            interceptors=None if keys is None else [AuthInterceptor(keys)],
+            interceptors=[reading] if keys is None else [AuthInterceptor(keys, engine.metrics.requested), reading],
         )
-        add_LocalizationServiceServicer_to_server(  # type: ignore[no-untyped-call]  # generated code
-            Servicer(engine, streams=settings.grpc_streams), self._server
-        )
-        self._health = health.HealthServicer()
-        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        reflection.enable_server_reflection((SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server)
+        servicer = Servicer(engine, self._patience)
+        add_LocalizationServiceServicer_to_server(servicer, self._server)  # type: ignore[no-untyped-call]  # generated code
+        health_pb2_grpc.add_HealthServicer_to_server(Health(engine, ("", SERVICE)), self._server)
+        reflection.enable_server_reflection((SERVICE, HEALTH, reflection.SERVICE_NAME), self._server)
         shown = f"[{host}]" if ":" in host else host
+        address = f"{shown}:{port}"
         try:
-            address = f"{shown}:{port}"
             self.port: int = (
                 self._server.add_insecure_port(address)
                 if credentials is None
                 else self._server.add_secure_port(address, credentials)
             )
         except RuntimeError as error:
-            raise AddressError(f"cannot listen on {shown}:{port} for gRPC; choose another --grpc-port") from error
-        engine.when_draining.append(lambda: self._say(health_pb2.HealthCheckResponse.NOT_SERVING))
-        self._say(
-            health_pb2.HealthCheckResponse.SERVING if engine.is_ready else health_pb2.HealthCheckResponse.NOT_SERVING
-        )
+            raise AddressError(f"cannot listen on {address} for gRPC; choose another --grpc-port") from error
 
     def start(self) -> None:
         """Begin to answer."""
+        self._patience.start()
         self._server.start()
 
-    def stop(self, *, grace_s: float) -> None:
-        """Take no further calls, let running ones end, and give up on them after the grace."""
-        self._say(health_pb2.HealthCheckResponse.NOT_SERVING)
-        self._server.stop(grace_s).wait()
+    def begin_stop(self, *, grace_s: float) -> Event:
+        """Take no further calls, let running ones end, and give up on them after the grace; the event is set when all is over."""
+        ended: Event = self._server.stop(grace_s)
+        return ended
 
-    def _say(self, status: "health_pb2.HealthCheckResponse.ServingStatus.ValueType") -> None:
-        for name in ("", SERVICE):
-            self._health.set(name, status)
+    def stop(self, *, grace_s: float) -> None:
+        """Stop and wait for the end."""
+        self.begin_stop(grace_s=grace_s).wait()
+        self._patience.stop()

@@ -57,6 +57,7 @@ def _openapi_of(app: FastAPI) -> dict[str, Any]:
             schema.LocalizeRequest,
             schema.SequenceRequest,
             schema.BatchRequest,
+            schema.ServeVersion,
             GeoPoseRequest,
             problems.Problem,
         ):

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from service.errors import BusyError, DeadlineError
@@ -35,8 +35,32 @@ class Asking:
             )
         try:
             async with asyncio.timeout(settings.request_timeout_s), self._bodies:
-                return await work(await read_body(request, max_bytes=settings.limits.max_request_bytes))
+                body = await read_body(request, max_bytes=settings.limits.max_request_bytes)
+                return await _unless_gone(request, work(body))
         except TimeoutError as error:
             raise DeadlineError(
                 f"no answer within {settings.request_timeout_s:g} s; send the body faster, or try again later"
             ) from error
+
+
+async def _unless_gone(request: Request, answering: Awaitable[Response]) -> Response:
+    """The answer; work that still waits is dropped where nobody waits for it any more.
+
+    Raises:
+        ClientDisconnect: the caller has gone.
+    """
+    work, gone = asyncio.ensure_future(answering), asyncio.ensure_future(_gone(request))
+    try:
+        await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
+        if not work.done():
+            raise ClientDisconnect
+        return work.result()
+    finally:
+        gone.cancel()
+        work.cancel()
+
+
+async def _gone(request: Request) -> None:
+    """Until the connection is closed: after a body nothing else can come."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

@@ -40,23 +40,32 @@ class Admission:
             if self._taken == self.capacity:
                 raise BusyError(f"{self.capacity} requests are being worked on or wait already; try again in a second")
             self._taken += 1
+        # In a cell that is emptied when the work is over: a cancelled future stays in the pool's queue until a worker comes by, and
+        # must not keep a request's pictures there.
+        cell: list[Callable[[], T]] = [task]
         try:
-            future = self._pool.submit(self._run, task)
+            future = self._pool.submit(self._run, cell)
         except RuntimeError as error:
             self._give_back()
             raise BusyError("the service is shutting down; try another instance") from error
-        future.add_done_callback(lambda _: self._give_back())
+        del task
+
+        def over(_: Future[T]) -> None:
+            cell.clear()
+            self._give_back()
+
+        future.add_done_callback(over)
         return future
 
     def close(self) -> None:
         """Let running tasks end, drop waiting ones."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def _run(self, task: Callable[[], T]) -> T:
+    def _run(self, cell: list[Callable[[], T]]) -> T:
         with self._lock:
             self._working += 1
         try:
-            return task()
+            return cell.pop()()
         finally:
             with self._lock:
                 self._working -= 1

@@ -1,6 +1,5 @@
 """The composition root: settings in, a running engine out; every face calls this and nothing below it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -70,7 +69,6 @@ class Engine:
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.metrics = Metrics(self.admission, registry)
         self.is_draining = False
-        self.when_draining: list[Callable[[], None]] = []
 
     @classmethod
     def open(cls, settings: Settings) -> "Engine":
@@ -88,11 +86,8 @@ class Engine:
         return len(self.registry) > 0 and not self.is_draining
 
     def drain(self) -> None:
-        """Say that the service is leaving; it still answers."""
-        if not self.is_draining:
-            self.is_draining = True
-            for told in self.when_draining:
-                told()
+        """Say that the service is leaving; it still answers. Safe to call from a signal handler."""
+        self.is_draining = True
 
     def localize(self, encoded: EncodedQuery) -> Located:
         """Decode and localize, in the thread of the caller.

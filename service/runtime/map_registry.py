@@ -80,12 +80,15 @@ class MapRegistry:
                 if localizer.bundle.manifest.version == version:
                     return localizer
         mounted = ", ".join(maps) or "none"
-        what = "several maps are mounted and the request names none" if name is None else f"there is no map {name!r}"
+        what = (
+            "several maps are mounted and the request names none" if name is None else f"there is no map {name[:100]!r}"
+        )
         raise UnknownMapError(f"{what}; mounted: {mounted}", field="map")
 
     def versions(self, name: str) -> tuple[Localizer, ...]:
         """Every open version of a map, the newest first; none of an unknown one."""
-        return self._maps[name].versions if name in self._maps else ()
+        known = self._maps.get(name)
+        return () if known is None else known.versions
 
     def mount(self, localizer: Localizer) -> None:
         """Add a version, in place of the same one; it serves from now on if no open version is newer.

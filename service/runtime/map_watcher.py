@@ -32,8 +32,9 @@ class MapWatcher:
         self._thread: threading.Thread | None = None
         self._seen: dict[Path, Stamp] = {}
         self._failed: dict[Path, Stamp] = {}
+        self._holds: dict[Path, tuple[str, str]] = {}  # name and version that were seen at a path
         for version in [each for localizer in registry for each in registry.versions(localizer.bundle.name)]:
-            self._seen[version.bundle.path] = stamp_of(version.bundle.path)
+            self._saw(version, stamp_of(version.bundle.path))
 
     def scan(self, *, drop_missing: bool = False) -> list[str]:
         """Mount what is new; what happened, for people.
@@ -51,18 +52,18 @@ class MapWatcher:
             try:
                 localizer = Localizer.open(MapBundle.open(path))
                 self._warm(localizer)
-            except (StreetfixError, OSError) as error:
+            except Exception as error:  # whatever it is, this bundle does not serve, and the others are looked at
                 self._failed[path] = stamp
                 told.append(f"{path} is not mounted: {error}")
                 _log.warning("map_refused path=%s reason=%s", path, error)
                 continue
-            self._seen[path] = stamp
+            self._saw(localizer, stamp)
             self._registry.mount(localizer)
             manifest = localizer.bundle.manifest
             told.append(f"mounted {manifest.name} {manifest.version}")
             _log.warning("map_mounted name=%s version=%s", manifest.name, manifest.version)
-        if drop_missing:
-            told += self._drop(present)
+        if drop_missing and (dropped := self._drop(present)):
+            told += dropped + self.scan()
         return told
 
     def start(self, interval_s: float) -> None:
@@ -79,7 +80,7 @@ class MapWatcher:
         self._stop.set()
         self._told.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(timeout=5.0)  # a map that is being opened must not keep the service from leaving
 
     def _run(self, interval_s: float) -> None:
         while True:
@@ -101,10 +102,17 @@ class MapWatcher:
                 continue
         return found
 
+    def _saw(self, localizer: Localizer, stamp: Stamp) -> None:
+        path, manifest = localizer.bundle.path, localizer.bundle.manifest
+        self._seen[path], self._holds[path] = stamp, (manifest.name, manifest.version)
+
     def _drop(self, present: list[Path]) -> list[str]:
         told = []
         for path in set(self._seen) - set(present):
             del self._seen[path]
+            gone = self._holds.pop(path)
+            for twin in [each for each, holds in self._holds.items() if holds == gone]:
+                self._seen.pop(twin, None)  # it was not mounted beside its twin, and is looked at again
             for localizer in [v for each in self._registry for v in self._registry.versions(each.bundle.name)]:
                 bundle = localizer.bundle
                 if bundle.path == path:

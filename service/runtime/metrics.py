@@ -71,17 +71,18 @@ class Metrics:
         for stage in _STAGES:
             self._stage_seconds.labels(stage).observe(_milliseconds(answer.timings, stage) / 1e3)
 
-    def requested(self, face: str, method: str, code: str, seconds: float) -> None:
+    def requested(self, face: str, method: str, code: str, seconds: float | None) -> None:
         """Count a request.
 
         Args:
             face: rest or grpc.
             method: operation or call, one of a few.
             code: status, or the code of a problem.
-            seconds: that it took.
+            seconds: that it took; None where that says nothing, as of a stream's life.
         """
         self._requests.labels(face, method, code).inc()
-        self._request_seconds.labels(face, method).observe(seconds)
+        if seconds is not None:
+            self._request_seconds.labels(face, method).observe(seconds)
 
     def text(self) -> bytes:
         """In Prometheus' text format."""

@@ -55,6 +55,7 @@ class Settings(BaseSettings):
         "warning", description="info: a line for each request"
     )
     grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
+    grpc_idle_s: float = Field(300.0, gt=0, le=86400, description="a stream that sends no frame for so long is ended")
     drain_s: float = Field(
         0.0, ge=0, le=600, description="after SIGTERM: not ready, but answering, so long, for balancers to notice"
     )

@@ -66,6 +66,8 @@ class Stream:
                 "open another stream for another map", field="map",
             )  # fmt: skip
         self._localizer = self._engine.registry.get(self._name)
+        if self._name is None:  # the only map now; others may come
+            self._name = self._localizer.bundle.name
         return self._localizer
 
 

@@ -68,6 +68,14 @@ def test_the_dashboard_asks_for_metrics_that_are_there(
     assert {name for name in plain if name not in there and f"{name}_total" not in there} == set()
 
 
+def test_every_file_that_is_mounted_is_there(compose: dict[str, Any]) -> None:
+    mounted = [
+        volume.split(":")[0] for name in ("prometheus", "grafana") for volume in compose["services"][name]["volumes"]
+    ]
+    assert len(mounted) == 4
+    assert all((DEPLOY / path).is_file() for path in mounted)
+
+
 def test_prometheus_scrapes_the_port_of_the_service(compose: dict[str, Any]) -> None:
     config = yaml.safe_load((DEPLOY / "prometheus.yaml").read_text())
     (scrape,) = config["scrape_configs"]

@@ -155,10 +155,10 @@ def port(installed: Path, bundle_path: Path, tmp_path: Path) -> Iterator[str]:
 
 def test_it_serves_a_mounted_map_and_the_health_check_says_so(installed: Path, tmp_path: Path, port: str) -> None:
     health = next(rest for name, rest in instructions()[-1] if name == "HEALTHCHECK")
-    _, *arguments = json.loads(health[health.index("CMD ") + 4 :])
-    done = run([str(installed / "bin" / "python"), *arguments], tmp_path, STREETFIX_PORT=port)
+    program, *arguments = json.loads(health[health.index("CMD ") + 4 :])
+    done = run([str(installed / "bin" / program), *arguments], tmp_path, STREETFIX_PORT=port)
     assert (done.returncode, done.stderr) == (0, "")
-    off = run([str(installed / "bin" / "python"), *arguments], tmp_path, STREETFIX_PORT="1")
+    off = run([str(installed / "bin" / program), *arguments], tmp_path, STREETFIX_PORT="1")
     assert off.returncode != 0
 
 

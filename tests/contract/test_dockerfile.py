@@ -89,9 +89,7 @@ def test_health_is_asked_at_the_port_that_is_exposed() -> None:
     assert f"STREETFIX_PORT={rest}" in values(stage, "ENV")[0]
     assert f"STREETFIX_GRPC_PORT={grpc}" in values(stage, "ENV")[0]
     health = values(stage, "HEALTHCHECK")[0]
-    code = json.loads(health[health.index("CMD ") + 4 :])[2]
-    compile(code, "HEALTHCHECK", "exec")
-    assert "/readyz" in code
+    assert json.loads(health[health.index("CMD ") + 4 :]) == ["streetfix", "health"]
 
 
 def test_the_command_serves_the_mounted_maps_on_all_addresses_of_the_container() -> None:

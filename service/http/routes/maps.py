@@ -1,5 +1,6 @@
 """GET /v1/maps and what belongs to a map."""
 
+import asyncio
 from typing import Any
 
 from fastapi import APIRouter
@@ -7,9 +8,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.contract import schema
-from service.contract.convert import map_entry_from
+from service.contract.convert import map_entry_from, parsed
 from service.contract.coverage import coverage_geojson
 from service.http.auth import require_operator
+from service.http.body import read_body
 from service.http.routes.localize import problems
 from service.runtime.engine import Engine
 
@@ -22,6 +24,10 @@ _STREETS: dict[int | str, dict[str, Any]] = {
     **problems(404, 422),
 }
 
+_MOST_BYTES = 4096
+_SERVE_VERSION: dict[str, Any] = {
+    "required": True, "content": {"application/json": {"schema": {"$ref": "#/components/schemas/ServeVersion"}}},
+}  # fmt: skip
 _COVERAGE: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "A GeoJSON FeatureCollection with a MultiPolygon of each map; longitude and latitude where the map is "
@@ -46,15 +52,18 @@ def router_for(engine: Engine) -> APIRouter:
         "/v1/maps/{map}/serving",
         operation_id="serveVersion",
         summary="Let another version of a map serve",
-        responses=problems(401, 403, 404, 422),
+        responses=problems(401, 403, 404, 413, 422),
+        openapi_extra={"requestBody": _SERVE_VERSION},
     )
-    async def serve_version(map: str, wanted: schema.ServeVersion, request: Request) -> schema.MapEntry:  # noqa: A002
+    async def serve_version(map: str, request: Request) -> schema.MapEntry:  # noqa: A002
         """Roll back, or forward again, at once and whole; requests that run end on the version they began with.
 
         It needs an operator's key (`streetfix keys --operator`), or a service on loopback without keys. A new bundle in the maps folder
         takes over again, and a restart serves the newest: to keep an old version, take the new one out of the folder.
         """
         require_operator(request, engine.settings)
+        async with asyncio.timeout(engine.settings.request_timeout_s):
+            wanted = parsed(bytes(await read_body(request, max_bytes=_MOST_BYTES)), schema.ServeVersion)
         served = engine.registry.serve(map, wanted.version)
         return map_entry_from(served.bundle, engine.registry.versions(map))
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.contract import convert
 from service.contract.convert import answer_from, parsed, query_from
 from service.contract.schema import LocalizeRequest
 from service.errors import RequestError
@@ -34,6 +35,24 @@ def prior_of(parts_of):
         return encoded.prior, encoded.prior_wgs84
 
     return made
+
+
+@pytest.mark.parametrize("far", [1.1e5, 1.7e308])
+def test_a_transform_beyond_any_robot_is_refused(parts_of, far):
+    T = {"position": {"x": far, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    with pytest.raises(RequestError) as caught:
+        query_of(parts_of(T_vehicle_camera=T))
+    assert caught.value.field == "T_vehicle_camera.position.x"
+
+
+@pytest.mark.parametrize(
+    ("angle", "expected"),
+    [(np.pi, 180.0), (-np.pi, 180.0), (np.nextafter(np.pi, 4), 180.0), (0.0, 0.0), (3 * np.pi / 2, -90.0)],
+)
+def test_headings_end_at_180(angle, expected):
+    found = convert._degrees(angle)
+    assert found == pytest.approx(expected)
+    assert -180 < found <= 180
 
 
 def test_a_request_without_a_prior_has_none(parts_of):

@@ -50,7 +50,7 @@ def test_pictures_and_intrinsics_are_taken_over():
 )  # fmt: skip
 def test_every_camera_model_is_read(model, numbers, expected):
     colour = reading("RGBA32", RGB, params={"model": model, "modelParams": numbers})
-    camera = query_of(request_of([colour, reading("DEPTH", DEPTH)]), None).camera
+    camera = query_of(request_of([colour, reading("DEPTH", DEPTH, params=None)]), None).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
 
 
@@ -76,6 +76,23 @@ def test_rgb_alone_is_told_what_is_missing():
         query_of(request_of([reading("DEPTH", DEPTH)]), None)
     with pytest.raises(RequestError, match="no colour picture"):
         query_of(GeoPoseRequest(), None)
+
+
+@pytest.mark.parametrize(
+    ("params", "size", "fits"),
+    [
+        (PINHOLE, [640, 480], True), ({"model": "SIMPLE_PINHOLE", "modelParams": [153, 160, 120]}, [320, 240], True), (None, None, True),
+        ({"model": "PINHOLE", "modelParams": [380, 380, 320, 240]}, [640, 480], False),
+        ({"model": "PINHOLE", "modelParams": [300, 310, 340, 240]}, [640, 480], False),
+    ],
+)  # fmt: skip
+def test_depth_of_another_view_is_refused_not_misread(params, size, fits):
+    request = request_of([reading("RGBA32", RGB), reading("DEPTH", DEPTH, params=params, size=size)])
+    if fits:
+        query_of(request, None)
+        return
+    with pytest.raises(NotYetSupportedError, match="aligned"):
+        query_of(request, None)
 
 
 def test_the_latest_readings_count():

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import grpc
+import numpy as np
 import pytest
 from google.rpc import error_details_pb2
 from grpc_health.v1 import health_pb2, health_pb2_grpc
@@ -15,9 +16,11 @@ from grpc_status import rpc_status
 from service.errors import AddressError, Kind
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
-from service.grpc.server import SERVICE, GrpcServer
+from service.grpc.reading import SERVICE
+from service.grpc.server import GrpcServer
 from service.grpc.status import CODE_OF_KIND
 from service.runtime.engine import Engine
+from service.runtime.keys import KeyRing
 from service.runtime.settings import Limits, Settings
 
 Parts = Callable[..., dict[str, bytes]]
@@ -217,11 +220,26 @@ def test_what_nobody_foresaw_tells_the_request_id_and_no_more(
     assert dict(caught.value.initial_metadata())["x-request-id"] == "mine-1"
 
 
-def test_health_and_reflection(channel: grpc.Channel) -> None:
+def test_health_follows_readiness(channel: grpc.Channel, engine: Engine) -> None:
     health = health_pb2_grpc.HealthStub(channel)
-    for name in ("", SERVICE):
-        found = health.Check(health_pb2.HealthCheckRequest(service=name))
-        assert found.status == health_pb2.HealthCheckResponse.SERVING
+    kinds = health_pb2.HealthCheckResponse
+    for expected in (kinds.SERVING, kinds.NOT_SERVING):
+        for name in ("", SERVICE):
+            assert health.Check(health_pb2.HealthCheckRequest(service=name)).status == expected
+        engine.drain()
+    with pytest.raises(grpc.RpcError) as caught:
+        health.Check(health_pb2.HealthCheckRequest(service="x" * 10_000))
+    assert caught.value.code() == grpc.StatusCode.NOT_FOUND
+
+
+def test_health_is_not_watched(channel: grpc.Channel) -> None:
+    """A watcher would hold a thread without a key, and the ready-made servicer's lock while it does not read."""
+    with pytest.raises(grpc.RpcError) as caught:
+        next(health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest()))
+    assert caught.value.code() == grpc.StatusCode.UNIMPLEMENTED
+
+
+def test_reflection(channel: grpc.Channel) -> None:
     asked = [reflection_pb2.ServerReflectionRequest(list_services="")]
     (answer,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter(asked))
     assert SERVICE in [service.name for service in answer.list_services_response.service]
@@ -236,6 +254,129 @@ def test_a_port_that_is_taken_is_named(engine: Engine) -> None:
             GrpcServer(engine, host="127.0.0.1", port=server.port)
     finally:
         server.stop(grace_s=0)
+
+
+def raw_call(channel: grpc.Channel, name: str) -> Any:
+    """A call whose messages are bytes of the test's own."""
+    return channel.stream_unary(f"/{SERVICE}/{name}")
+
+
+def test_a_message_that_is_many_little_ones_is_refused_unparsed(channel: grpc.Channel) -> None:
+    """50,000 empty requests of two bytes each would be a hundred times as large in memory."""
+    with pytest.raises(grpc.RpcError) as caught:
+        raw_call(channel, "LocalizeBatch")(iter([b"\x0a\x00" * 50_000]))
+    assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert "more than 64 fields" in caught.value.details()
+
+
+@pytest.mark.parametrize("raw", [b"\xff", b"\x0a\x05ab", b"\x0b", b"\x08" + b"\x80" * 11, b"\x09\x00"])
+def test_bytes_that_are_no_message_are_refused(channel: grpc.Channel, raw: bytes) -> None:
+    with pytest.raises(grpc.RpcError) as caught:
+        raw_call(channel, "Localize")(iter([raw]))
+    assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+
+
+def test_a_call_that_never_sends_its_message_is_ended(channel: grpc.Channel, stub: LocalizationServiceStub) -> None:
+    """More of them than there are threads, and then others are answered again (the service waits two seconds)."""
+    silence = threading.Event()
+
+    def silent() -> Iterator[bytes]:
+        silence.wait(30)
+        yield b""
+
+    calls = [raw_call(channel, "Localize").future(silent()) for _ in range(40)]
+    assert all(call.exception(timeout=20) is not None for call in calls)
+    assert stub.ListMaps(pb.ListMapsRequest(), timeout=10).maps[0].name == "tiny"
+    silence.set()
+
+
+def test_a_stream_keeps_nothing_of_its_frames(
+    stub: LocalizationServiceStub, request_of: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service.grpc import servicer
+    from service.grpc.call import Call
+
+    calls: list[Call] = []
+
+    class Watched(Call):
+        def __init__(self, *arguments: Any, **named: Any) -> None:
+            super().__init__(*arguments, **named)
+            calls.append(self)
+
+    monkeypatch.setattr(servicer, "Call", Watched)
+    frames = [pb.LocalizeStreamRequest(frame=request_of(**({"rgb": b"nothing"} if k % 2 else {}))) for k in range(6)]
+    answers = list(stub.LocalizeStream(iter(frames)))
+    assert [each.outcome.WhichOneof("outcome") for each in answers] == ["answer", "problem"] * 3
+    assert [len(call._under_way) for call in calls] == [0]
+
+
+def test_a_silent_stream_is_ended(bundle_path: Path, request_of: Any) -> None:
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1, grpc_idle_s=0.5))
+    server = GrpcServer(engine, host="127.0.0.1", port=0)
+    server.start()
+    silence = threading.Event()
+
+    def drive() -> Iterator[pb.LocalizeStreamRequest]:
+        yield pb.LocalizeStreamRequest(frame=request_of())
+        silence.wait(20)
+
+    with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
+        answers = LocalizationServiceStub(channel).LocalizeStream(drive())
+        assert next(answers).frames == 1
+        with pytest.raises(grpc.RpcError) as caught:
+            next(answers)
+        assert caught.value.code() == grpc.StatusCode.CANCELLED
+    silence.set()
+    server.stop(grace_s=0)
+    engine.close()
+
+
+def test_without_a_key_nothing_is_parsed_and_nothing_waited_for(bundle_path: Path) -> None:
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1, queue=1, grpc_streams=0))
+    server = GrpcServer(engine, host="127.0.0.1", port=0, keys=KeyRing({}))
+    server.start()
+    silence = threading.Event()
+
+    def silent() -> Iterator[bytes]:
+        silence.wait(30)
+        yield b""
+
+    with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
+        calls = [raw_call(channel, name).future(silent()) for name in ("Localize", "LocalizeBatch") for _ in range(30)]
+        assert {call.exception(timeout=20).code() for call in calls} == {grpc.StatusCode.UNAUTHENTICATED}
+        streams = [LocalizationServiceStub(channel).LocalizeStream(iter([])) for _ in range(3)]
+        for stream in streams:
+            with pytest.raises(grpc.RpcError) as caught:
+                next(stream)
+            assert caught.value.code() == grpc.StatusCode.UNAUTHENTICATED
+    silence.set()
+    assert 'code="unauthorized",face="grpc",method="Localize"} 30.0' in engine.metrics.text().decode()
+    server.stop(grace_s=0)
+    engine.close()
+
+
+def test_a_stream_goes_on_when_another_map_comes_beside_its_own(
+    bundle_path: Path, parts_of: Parts, content_of: Any, tmp_path: Path
+) -> None:
+    from service.contract.convert import parsed, query_from
+    from service.contract.schema import LocalizeRequest
+    from service.localization.localizer import Localizer
+    from service.maps.reader import MapBundle
+    from service.maps.writer import write_bundle
+    from service.runtime.stream import Stream
+
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1))
+    parts = parts_of()
+    query = query_from(parsed(parts["request"], LocalizeRequest), rgb=parts["rgb"], depth=parts["depth"])
+    stream = Stream(engine)
+    assert stream.localize(query, None)[1] == 1
+    write_bundle(tmp_path / "west", content_of(name="west"))
+    engine.registry.mount(Localizer.open(MapBundle.open(tmp_path / "west")))
+    assert stream.localize(query, np.eye(4))[1] == 2
+    write_bundle(tmp_path / "new", content_of(seed=1))
+    engine.registry.mount(Localizer.open(MapBundle.open(tmp_path / "new")))
+    assert stream.localize(query, np.eye(4))[1] == 1  # what was looked up is not of the new version
+    engine.close()
 
 
 def test_every_kind_of_error_has_a_code() -> None:

@@ -98,6 +98,31 @@ def test_the_summary_counts_what_came_of_it():
     assert (found.cpu_ms_per_answer, found.resident_mib) == (None, None)
 
 
+def test_answers_that_come_after_the_load_are_no_throughput():
+    """A service of ten a second, offered twenty: what waits at the end is answered, but not within the second."""
+
+    class Queue(Fake):
+        async def ask(self, payload, timeout_s):
+            if not hasattr(self, "free_at"):
+                self.free_at = time.perf_counter()
+            self.free_at = max(self.free_at, time.perf_counter()) + 0.1
+            await asyncio.sleep(self.free_at - time.perf_counter())
+            return await super().ask(payload, timeout_s)
+
+    load = Load(rate=20, warm_up_s=0, duration_s=1)
+    found = summarise(asyncio.run(drive(Queue(), PAYLOADS, load)), PAYLOADS, load, None, None)
+    assert found.offered_per_s >= 14
+    assert 7 <= found.answered_per_s <= 10
+    assert found.answers > found.answered_per_s
+
+
+def test_a_request_is_given_up_in_time():
+    load = Load(rate=20, warm_up_s=0, duration_s=0.3, timeout_s=0.1)
+    shots = asyncio.run(drive(Fake(takes_s=5), PAYLOADS, load))
+    assert {shot.reply.code for shot in shots} == {"timeout"}
+    assert max(shot.done_s - shot.due_s for shot in shots) < 1
+
+
 def test_answers_to_the_same_request_are_compared():
     load = Load(rate=100, warm_up_s=0, duration_s=0.3)
     shots = asyncio.run(drive(Fake(), PAYLOADS, load))

@@ -1,7 +1,9 @@
+import gc
 import threading
 import time
+import weakref
 from collections.abc import Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future
 
 import pytest
 
@@ -69,6 +71,27 @@ def test_all_places_are_free_again_when_all_is_done() -> None:
             assert time.monotonic() < until
             time.sleep(0.001)
     admission.close()
+
+
+def test_what_was_cancelled_while_it_waited_is_not_kept(blocked: tuple[Admission, threading.Event]) -> None:
+    """Its place is free at once, and so is its memory, although the pool's queue still has it."""
+    admission, _ = blocked
+
+    class Pictures:
+        pass
+
+    def waiting_for(pictures: Pictures) -> "Future[Pictures]":
+        return admission.submit(lambda: pictures)
+
+    pictures = Pictures()
+    gone = weakref.ref(pictures)
+    future = waiting_for(pictures)
+    del pictures
+    assert gone() is not None
+    assert future.cancel()
+    del future
+    gc.collect()
+    assert gone() is None
 
 
 def test_a_closed_pool_refuses() -> None:

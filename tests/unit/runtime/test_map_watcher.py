@@ -124,6 +124,28 @@ def test_what_is_gone_stays_until_the_operator_says_so(watched: Watched) -> None
     assert watched.serving() == "first"
 
 
+def test_a_copy_of_the_same_version_stays_when_its_twin_goes(watched: Watched) -> None:
+    shutil.copytree(watched.folder / "first", watched.folder / "twin")
+    watched.watcher.scan()
+    assert len(watched.registry.versions("tiny")) == 1
+    shutil.rmtree(watched.folder / watched.serving())
+    watched.watcher.scan(drop_missing=True)
+    assert watched.registry.get("tiny") is not None
+
+
+def test_whatever_a_bundle_does_others_are_mounted(watched: Watched) -> None:
+    def fails(localizer: Localizer) -> None:
+        if localizer.bundle.name == "a":
+            raise ZeroDivisionError
+
+    watcher = MapWatcher(watched.registry, [watched.folder], warm=fails)
+    watched.write("a", seed=1, name="a")
+    watched.write("b", seed=1, name="b")
+    told = watcher.scan()
+    assert "is not mounted" in told[0]
+    assert watched.serving("b") == "b"
+
+
 def test_a_folder_that_is_empty_for_the_moment_changes_nothing(watched: Watched) -> None:
     shutil.rmtree(watched.folder)
     assert watched.watcher.scan() == []
