@@ -55,8 +55,8 @@ WHY_MISSED: dict[str, str] = {
         "them by what all frames say there"
     ),
     "sequence.no_landmark.ambiguous": (
-        "with a seed that no choice was made on, and an encoder and thresholds that accept more, the margin of five frames makes the answer "
-        "sure although blocks repeat; calibration knows no repeating street; next: let it"
+        "with a seed that no choice was made on, and thresholds that accept more, the margin of five frames makes the answer sure "
+        "although blocks repeat; calibration knows no repeating street; next: let it"
     ),
     "registration.cpu_ms_per_query.precise": "points 4 ms, search 11, four drawings 5: the next to go is drawing all four candidates",
 }

@@ -102,31 +102,28 @@ async def _run(target: Target, sent: list[Payload], load: Load, pid: int | None,
 
 def table_of(found: list[Summary]) -> Table:
     """For people."""
-    table = Table(title="load")
+    watched = any(each.cpu_ms_per_answer is not None for each in found)
+    table = Table(title="load", caption="right: LOCALIZED answers within 1 m of the truth")
     for name in (
         "load",
-        "offered/s",
         "answered/s",
         "p50 ms",
         "p90 ms",
         "p99 ms",
-        "max ms",
         "refused",
-        "localized",
-        "within 1 m",
-        "CPU ms",
+        "right",
+        *(("CPU ms",) if watched else ()),
     ):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     for each in found:
         ms = each.answered_ms
         table.add_row(
-            f"{each.rate:g}/s" if each.rate is not None else f"{each.concurrency} at a time",
-            f"{each.offered_per_s:.1f}", f"{each.answered_per_s:.1f}",
-            *(f"{ms[name]:.1f}" if ms else "-" for name in ("p50", "p90", "p99", "max")),
+            f"{each.rate:g}/s" if each.rate is not None else f"{each.concurrency} clients",
+            f"{each.answered_per_s:.1f}", *(f"{ms[name]:.1f}" if ms else "-" for name in ("p50", "p90", "p99")),
             ", ".join(f"{count} x {code}" for code, count in sorted(each.errors.items())) or "none",
-            "-" if each.localized is None else f"{each.localized:.1%}", "-" if each.right is None else f"{each.right:.1%}",
-            "-" if each.cpu_ms_per_answer is None else f"{each.cpu_ms_per_answer:.1f}",
+            "-" if each.right is None else f"{each.right:.1%}",
+            *((f"{each.cpu_ms_per_answer:.1f}",) if each.cpu_ms_per_answer is not None else ()),
         )  # fmt: skip
     if wrong := sum(each.inconsistent for each in found):
-        table.caption = f"{wrong} answers differ from another answer to the same request"
+        table.caption = f"{table.caption}; {wrong} answers differ from another answer to the same request"
     return table

@@ -32,7 +32,8 @@ def service(bundle_path: Path) -> Iterator[dict[str, Any]]:
             break
     yield found
     process.send_signal(signal.SIGTERM)
-    assert process.wait(60) == 0
+    process.communicate(timeout=60)
+    assert process.returncode == 0
 
 
 @pytest.fixture(scope="module")
