@@ -35,21 +35,41 @@ WHY_MISSED: dict[str, str] = {
     "full.unseen.stereo.within_1_m": _CHOICE,
     "full.unseen.stereo.median_distance_error_m": _STEREO,
     "full.unseen.stereo.median_heading_error_deg": _STEREO,
-    "full.paper_city.precise.street_accuracy": "46 of 3,130 answers are in another place (107 m off in the mean); 54 are refused, 10 of them right",
-    "full.paper_city.precise.localized": "54 of 3,130 are refused, 44 of them rightly: no candidate of theirs is within 1 m that is supported best",
-    "full.paper_city.precise.mean_distance_error_m": "7 accepted answers are more than 5 m off; without them it is 0.077 m",
+    "full.paper_city.precise.street_accuracy": (
+        "46 of 3,130 answers are in another place (107 m off in the mean); 54 are refused, 10 of them right"
+    ),
+    "full.paper_city.precise.localized": (
+        "54 of 3,130 are refused, 44 of them rightly: no candidate of theirs is within 1 m that is supported best"
+    ),
+    "full.paper_city.precise.mean_distance_error_m": (
+        "7 accepted answers are more than 5 m off; without them it is 0.077 m"
+    ),
     "full.paper_city.precise.median_distance_error_m": "not found; the survey's own poses carry 3 cm of it",
-    "full.paper_city.precise.forced_mean_distance_error_m": "46 answers are 107 m off in the mean: that is 1.57 m of it",
-    "full.paper_city.stereo.street_accuracy": "131 of 3,130 answers are in another place when forced; 226 are refused, 93 of them right",
+    "full.paper_city.precise.forced_mean_distance_error_m": (
+        "46 answers are 107 m off in the mean: that is 1.57 m of it"
+    ),
+    "full.paper_city.stereo.street_accuracy": (
+        "131 of 3,130 answers are in another place when forced; 226 are refused, 93 of them right"
+    ),
     "doubt.covariance_95_coverage": (
         "errors have heavier tails than one factor for all answers covers: a sandwich of patches helped (0.87 -> 0.90 precise), nothing "
         "else that is known of a query tells which answers are worse; fitted on two watch cities of 640 queries a preset"
     ),
-    "doubt.sigma_coverage_gap": "stereo deviations were fitted too wide on the watch cities; next: fit them on the calibration cities",
-    "full.condition.night.within_1_m": "night's noise in colour and depth is no part of the training; 3.7 % are wrong when forced",
-    "full.condition.sideways.within_1_m": "the right place is among the ten nearest in 94 %; 96.0 % are right when forced",
-    "full.condition.blocked_25.within_1_m": "96.0 % are right when forced, 98.0 % have their place among the ten nearest; doubt refuses the rest",
-    "full.condition.blocked_50.within_1_m": "the right place is among the ten nearest in 88 %; 81.7 % are right when forced",
+    "doubt.sigma_coverage_gap": (
+        "stereo deviations were fitted too wide on the watch cities; next: fit them on the calibration cities"
+    ),
+    "full.condition.night.within_1_m": (
+        "night's noise in colour and depth is no part of the training; 3.7 % are wrong when forced"
+    ),
+    "full.condition.sideways.within_1_m": (
+        "the right place is among the ten nearest in 94 %; 96.0 % are right when forced"
+    ),
+    "full.condition.blocked_25.within_1_m": (
+        "96.0 % are right when forced, 98.0 % have their place among the ten nearest; doubt refuses the rest"
+    ),
+    "full.condition.blocked_50.within_1_m": (
+        "the right place is among the ten nearest in 88 %; 81.7 % are right when forced"
+    ),
     "full.condition.depth_15m_sequence5.within_1_m": (
         "starts are ranked by one frame's similarity each, so 16 look-alikes of single frames can crowd the right one out; next: rank "
         "them by what all frames say there"
@@ -58,5 +78,8 @@ WHY_MISSED: dict[str, str] = {
         "with a seed that no choice was made on, and thresholds that accept more, the margin of five frames makes the answer sure "
         "although blocks repeat; calibration knows no repeating street; next: let it"
     ),
-    "registration.cpu_ms_per_query.precise": "25.4 before the covariance's patches and the noise at the surface's range came; where the rest goes was not measured again",
+    "registration.cpu_ms_per_query.precise": (
+        "25.4 before the covariance's patches and the noise at the surface's range came; where the rest goes "
+        "was not measured again"
+    ),
 }
