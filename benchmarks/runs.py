@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.report import ROOT, Report
 from model_training.baselines.raw_range import raw_best_views
@@ -79,24 +80,30 @@ class Runs:
 
     def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str], *, refine: bool = False) -> dict[str, Any]:
         """Evaluate query sets, by retrieval alone or with registration; the answers lie beside for later measures."""
-        mode = "full" if refine else "retrieval"
-        folder = self.work / "predictions" / f"{mode}-{code_hash(*ANSWERING)}" / bundle.path.name / dataset.folder.name
-        folder.mkdir(parents=True, exist_ok=True)
-        localizer, found = Localizer.open(bundle), {}
-        for name in names:
-            kept = folder / f"{name}.npz"
-            if not kept.exists():
-                with bars() as report:
-                    predict(localizer, dataset, name, refine=refine, report=report).save(kept)
-            found[name] = Predictions.load(kept)
+        found = {name: self.predictions(bundle, dataset, name, refine=refine) for name in names}
         classes = [] if bundle.streets is None else [street.name for street in bundle.streets.features]
         return measure(joined(list(found.values())), classes) | {"predictions": found}
+
+    def predictions(
+        self, bundle: MapBundle, dataset: Dataset, name: str, *, refine: bool = True, frames_each: int = 1
+    ) -> Predictions:
+        """Answers to a query set, or to its sequences of so many frames."""
+        mode = ("full" if refine else "retrieval") + (f"-{frames_each}" if frames_each > 1 else "")
+        folder = self.work / "predictions" / f"{mode}-{code_hash(*ANSWERING)}" / bundle.path.name / dataset.folder.name
+        folder.mkdir(parents=True, exist_ok=True)
+        kept = folder / f"{name}.npz"
+        if not kept.exists():
+            with bars() as report:
+                asked = predict(
+                    Localizer.open(bundle), dataset, name, refine=refine, frames_each=frames_each, report=report
+                )
+            asked.save(kept)
+        return Predictions.load(kept)
 
     @staticmethod
     def forced_within(predictions: Predictions, reach_m: float) -> float:
         """Share within a distance, whatever the status."""
-        away = np.linalg.norm(predictions.T_answer[:, :2, 3] - predictions.T_true[:, :2, 3], axis=1)
-        return float((np.nan_to_num(away, nan=np.inf) <= reach_m).mean())
+        return float(within(predictions, reach_m).mean())
 
     def raw(self, bundle: MapBundle, dataset: Dataset, name: str) -> dict[str, tuple[int, int]]:
         """The raw range image: right ones and number of queries by setting, over each third query of a set."""
@@ -114,6 +121,17 @@ class Runs:
                 counts[setting] = (int(right.sum()), len(truth))
             kept.write_text(json.dumps(counts))
         return {setting: (right, count) for setting, (right, count) in json.loads(kept.read_text()).items()}
+
+
+def within(predictions: Predictions, reach_m: float) -> NDArray[np.bool_]:
+    """(n) whether the answer lies within a distance, whatever its status."""
+    away = np.linalg.norm(predictions.T_answer[:, :2, 3] - predictions.T_true[:, :2, 3], axis=1)
+    return np.asarray(np.nan_to_num(away, nan=np.inf) <= reach_m)
+
+
+def accepted_within(predictions: Predictions, reach_m: float) -> NDArray[np.bool_]:
+    """(n) whether the answer was accepted and lies within a distance."""
+    return predictions.localized & within(predictions, reach_m)
 
 
 def pooled(parts: list[dict[str, Any]], key: str) -> tuple[float, int, list[float]]:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from model_training.calibration.fit import RIGHT_M, Asked
+from model_training.calibration.plans import SEQUENCE
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.predict import Predictions, predict
 from service.localization.localizer import Localizer
@@ -15,7 +16,7 @@ Report = Callable[[str, int, int], None]
 def in_the_map(localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = ()) -> list[Asked]:
     """Query sets of the map's own city; all of them, where none are named."""
     return [
-        asked_of(predict(localizer, dataset, name, report=report), name, known=True)
+        asked_of(_predicted(localizer, dataset, name, report), name, known=True)
         for name in names or dataset.query_sets(with_truth=True)
     ]
 
@@ -23,7 +24,7 @@ def in_the_map(localizer: Localizer, dataset: Dataset, report: Report, names: Se
 def of_another_city(localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = ()) -> list[Asked]:
     """Query sets of a city that the map does not show; all of them, where none are named."""
     return [
-        asked_of(predict(localizer, dataset, name, report=report), f"other_city.{preset_of(name)}", known=False)
+        asked_of(_predicted(localizer, dataset, name, report), f"other_city.{preset_of(name)}", known=False)
         for name in names or dataset.query_sets(with_truth=True)
     ]
 
@@ -40,6 +41,13 @@ def where_streets_are_missing(
         found.append(_rows(asked_of(predictions, f"removed_streets.{preset_of(name)}", known=False), outside))
         found.append(_rows(both, ~outside))
     return found
+
+
+def _predicted(localizer: Localizer, dataset: Dataset, name: str, report: Report) -> Predictions:
+    """Sets of sequences are asked sequence by sequence."""
+    return predict(
+        localizer, dataset, name, frames_each=SEQUENCE if name.startswith("sequences_") else 1, report=report
+    )
 
 
 def preset_of(query_set: str) -> str:

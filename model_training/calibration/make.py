@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from model_training.calibration.collect import in_the_map, of_another_city, where_streets_are_missing
 from model_training.calibration.fit import Asked, expected_calibration_error, fit, pooled
-from model_training.calibration.plans import CITIES, calibration_plan
+from model_training.calibration.plans import CITIES, calibration_plan, repeating_plan
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.without_streets import WithoutStreets
 from model_training.mapping.build import BuildSettings, build_map
@@ -49,11 +49,15 @@ def calibrate(
         simulate(plan, work / plan.name, report=report)
         cities.append(Dataset(work / plan.name))
     parts = [_asked(work, encoder, cities, k, anew=anew, report=report) for k in range(CITIES)]
+    street = repeating_plan()
+    simulate(street, work / street.name, report=report)
+    alike = _asked_repeating(work, encoder, Dataset(work / street.name), anew=anew, report=report)
     measured_on: dict[str, str | float] = {
-        "cities": ", ".join(f"seed {city.description.seed}" for city in cities),
+        "cities": ", ".join(f"seed {city.description.seed}" for city in cities)
+        + f", repeating blocks of seed {street.seed}",
         "encoder_sha256": sha256,
     }
-    return fit(pooled(parts), measured_on=measured_on), cross_checks(parts)
+    return fit(pooled([*parts, alike]), measured_on=measured_on), cross_checks(parts, alike)
 
 
 def _localizer(
@@ -74,10 +78,29 @@ def _sparse(work: Path, encoder: Path, dataset: Dataset, report: Report) -> Loca
 
 def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew: bool, report: Report) -> Asked:
     """All queries of one city: of its map, of the next city's, of sparse ones of both, of its map with a third of the streets left out."""
-    kept = work / f"asked-{cities[index].name}-{Encoder.open(encoder).sha256[:12]}.npz"
-    if kept.exists() and not anew:
-        with np.load(kept) as arrays:
-            return Asked(*(arrays[name] for name in Asked.__dataclass_fields__))
+    return _kept(work, encoder, cities[index], lambda: _ask(work, encoder, cities, index, report), anew=anew)
+
+
+def _asked_repeating(work: Path, encoder: Path, street: Dataset, *, anew: bool, report: Report) -> Asked:
+    """A street whose blocks repeat, of its own map, picture by picture and in sequences: what is wrong there looks right."""
+
+    def ask() -> list[Asked]:
+        return in_the_map(_localizer(work, encoder, street, street.name, report), street, report)
+
+    return _kept(work, encoder, street, ask, anew=anew)
+
+
+def _kept(work: Path, encoder: Path, city: Dataset, ask: Callable[[], list[Asked]], *, anew: bool) -> Asked:
+    """Answers of an earlier run, or those of a new one."""
+    kept = work / f"asked-{city.name}-{Encoder.open(encoder).sha256[:12]}.npz"
+    if not kept.exists() or anew:
+        asked = pooled(ask())
+        np.savez_compressed(kept, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
+    with np.load(kept) as arrays:
+        return Asked(*(arrays[name] for name in Asked.__dataclass_fields__))
+
+
+def _ask(work: Path, encoder: Path, cities: list[Dataset], index: int, report: Report) -> list[Asked]:
     own, other = cities[index], cities[(index + 1) % len(cities)]
     partial = WithoutStreets(own.folder)
     found = in_the_map(_localizer(work, encoder, own, own.name, report), own, report)
@@ -85,17 +108,14 @@ def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew
     found += in_the_map(_sparse(work, encoder, own, report), own, report, CLEAR_SETS)
     found += of_another_city(_sparse(work, encoder, other, report), own, report, CLEAR_SETS)
     without = _localizer(work, encoder, partial, f"{own.name}-without-streets", report)
-    found += where_streets_are_missing(without, own, list(CLEAR_SETS), partial.is_outside, report)
-    asked = pooled(found)
-    np.savez_compressed(kept, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
-    return asked
+    return found + where_streets_are_missing(without, own, list(CLEAR_SETS), partial.is_outside, report)
 
 
-def cross_checks(parts: list[Asked]) -> list[str]:
+def cross_checks(parts: list[Asked], alike: Asked) -> list[str]:
     """How well each city is predicted from the others: what calibration can be believed to do elsewhere."""
     lines = []
     for index, held_out in enumerate(parts):
-        calibration = fit(pooled([part for k, part in enumerate(parts) if k != index]), measured_on={})
+        calibration = fit(pooled([alike, *(part for k, part in enumerate(parts) if k != index)]), measured_on={})
         confidence = confidences(calibration, held_out)
         error = expected_calibration_error(confidence, held_out.right)
         lines.append(f"city {index + 1} from the others: expected calibration error {error:.4f}")

@@ -1,7 +1,7 @@
 """Pass 1: what a map answers to every query of a set. New measures then cost no new run."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.evaluation.odometry import as_query
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import heading_of_camera
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
-from service.localization.query import Query
 from service.maps.calibration import FEATURES
 
 RANKED = 10
@@ -31,8 +31,8 @@ class Predictions:
 
     ``T_true`` and ``T_answer`` (n, 4, 4) are T_map_camera, NaN where nothing was answered; ``street_true`` and
     ``street_answer`` (n) are features of the map's streets, -1 for none; ``ranked_xy`` (n, RANKED, 2) are the most similar
-    distinct places, the best first, NaN where there are fewer; ``localized`` (n); ``confidence`` (n), ``evidence`` (n, F) and
-    ``covariance`` (n, 6, 6), NaN where there is none; ``ms`` (n) of decoding and localizing;
+    distinct places, the best first, NaN where there are fewer; ``status`` (n), empty where nothing was answered; ``confidence`` (n),
+    ``evidence`` (n, F) and ``covariance`` (n, 6, 6), NaN where there is none; ``ms`` (n) of decoding and localizing;
     ``stamp_s`` (n) are the truth's own timestamps, seconds.
     """
 
@@ -42,12 +42,17 @@ class Predictions:
     street_answer: NDArray[np.int64]
     ranked_xy: NDArray[np.float64]
     ranked_place: NDArray[np.int64]
-    localized: NDArray[np.bool_]
+    status: NDArray[np.str_]
     confidence: NDArray[np.float64]
     evidence: NDArray[np.float64]
     covariance: NDArray[np.float64]
     ms: NDArray[np.float64]
     stamp_s: NDArray[np.float64]
+
+    @property
+    def localized(self) -> NDArray[np.bool_]:
+        """(n) whether the answer was accepted."""
+        return np.asarray(self.status == "LOCALIZED")
 
     def save(self, path: Path) -> None:
         """Keep them as NPZ, without pickle."""
@@ -70,10 +75,12 @@ def joined(parts: list[Predictions]) -> Predictions:
 
 
 def predict(
-    localizer: Localizer, dataset: Dataset, name: str, *, refine: bool = True, workers: int = 2,
+    localizer: Localizer, dataset: Dataset, name: str, *, refine: bool = True, workers: int = 2, frames_each: int = 1,
     report: Report = lambda *_: None,
 ) -> Predictions:  # fmt: skip
     """Ask every query of a set that has truth; ``refine=False`` asks retrieval alone.
+
+    ``frames_each`` takes so many frames in a row as one question about the last of them, with an odometry that errs.
 
     Raises:
         DatasetError: the set has no truth or no frames.
@@ -83,17 +90,21 @@ def predict(
         raise DatasetError(
             f"query set {name!r} of {dataset.folder} has no poses.txt, so nothing can be measured", field="queries"
         )
+    groups = [frames[k : k + frames_each] for k in range(0, len(frames), frames_each)]
     answers: list[tuple[Answer | None, float]] = []
     with ThreadPoolExecutor(workers) as pool:
         for done, answer in enumerate(
-            _in_order(pool, lambda frame: _ask(localizer, frame, refine=refine), frames, ahead=4 * workers), 1
+            _in_order(
+                pool, lambda k: _ask(localizer, groups[k], k, refine=refine), range(len(groups)), ahead=4 * workers
+            ),
+            1,
         ):
             answers.append(answer)
-            report(f"queries {name}", done, len(frames))
-    return _table(localizer, frames, answers)
+            report(f"queries {name}", done, len(groups))
+    return _table(localizer, [group[-1] for group in groups], answers)
 
 
-def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: list[T], *, ahead: int) -> Iterator[R]:
+def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
     """Results in order, never more than ``ahead`` items in memory."""
     rest = iter(items)
     waiting = [pool.submit(work, item) for item in islice(rest, ahead)]
@@ -102,11 +113,11 @@ def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: list[T], 
         waiting += [pool.submit(work, item) for item in islice(rest, 1)]
 
 
-def _ask(localizer: Localizer, frame: QueryFrame, *, refine: bool) -> tuple[Answer | None, float]:
+def _ask(localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool) -> tuple[Answer | None, float]:
     began = time.perf_counter()
-    query = Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole(), ranked=RANKED, refine=refine)
+    queries, poses = as_query(frames, np.random.default_rng([77, number]), ranked=RANKED, refine=refine)
     try:
-        answer: Answer | None = localizer.localize(query)
+        answer: Answer | None = localizer.localize_frames(queries, poses)
     except NoDepthError:
         answer = None
     return answer, 1e3 * (time.perf_counter() - began)
@@ -117,14 +128,14 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
     T_true = np.array([frame.T_map_camera for frame in frames])
     T_answer, ranked = np.full((count, 4, 4), np.nan), np.full((count, RANKED, 2), np.nan)
     ranked_place = np.full((count, RANKED), -1)
-    street_answer, localized = np.full(count, -1), np.zeros(count, bool)
+    street_answer, status = np.full(count, -1), np.full(count, "", "<U10")
     confidence, evidence = np.full(count, np.nan), np.full((count, len(FEATURES)), np.nan)
     covariance = np.full((count, 6, 6), np.nan)
     for k, (answer, _) in enumerate(answers):
         if answer is None:
             continue
         T_answer[k] = answer.T_map_camera
-        localized[k] = answer.status == "LOCALIZED"
+        status[k] = answer.status
         if answer.confidence is not None:
             confidence[k] = answer.confidence
         if answer.evidence is not None:
@@ -144,7 +155,7 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
         street_answer,
         ranked,
         ranked_place,
-        localized,
+        status,
         confidence,
         evidence,
         covariance,

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict
 from torch.utils.tensorboard import SummaryWriter
 
 from model_training.training.augment import Augmentation, Augmenter
-from model_training.training.batches import City
+from model_training.training.batches import Batch, City
 from model_training.training.encoder_net import EncoderNet, EncoderShape
 from model_training.training.losses import Side, paired_info_nce
 from model_training.training.memory import DescriptorMemory
@@ -136,18 +136,8 @@ def train(
                 wanted = memory.alike(seeds, known, config.alike_each)
             batch = cities[number].draw(config.pairs, rng, wanted)
             count = len(batch.query_xy)
-            rows_seen = augment.cut_rows(batch.rows_seen.to(place), count)
-            surveys = augment.survey(
-                batch.survey_ranges.to(place),
-                batch.survey_intensity.to(place),
-                batch.survey_height_m.to(place),
-                rows_seen,
-            )
-            queries = augment.query(
-                batch.query_ranges.to(place), batch.query_rgb.to(place), batch.query_height_m.to(place), rows_seen
-            )
-            planes = torch.cat([queries, surveys]).contiguous(memory_format=torch.channels_last)
-            side = torch.cat([torch.ones(count, device=place), torch.zeros(count, device=place)])
+            planes, side = views_of(batch, augment, place)
+            count = len(batch.query_xy)
             descriptors = net(planes, side)
             scale = log_scale.exp().clamp(max=config.largest_scale)
             q = Side(descriptors[:count], batch.query_xy.to(place))
@@ -184,6 +174,20 @@ def train(
                 raise KeyboardInterrupt
     trained: EncoderNet = net.eval()
     return trained
+
+
+def views_of(batch: Batch, augment: Augmenter, place: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """A batch as the network sees it: augmented planes, queries before survey views, and their sides."""
+    count = len(batch.query_xy)
+    rows_seen = augment.cut_rows(batch.rows_seen.to(place), count)
+    surveys = augment.survey(
+        batch.survey_ranges.to(place), batch.survey_intensity.to(place), batch.survey_height_m.to(place), rows_seen
+    )
+    queries = augment.query(
+        batch.query_ranges.to(place), batch.query_rgb.to(place), batch.query_height_m.to(place), rows_seen
+    )
+    planes = torch.cat([queries, surveys]).contiguous(memory_format=torch.channels_last)
+    return planes, torch.cat([torch.ones(count, device=place), torch.zeros(count, device=place)])
 
 
 def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:

@@ -24,6 +24,7 @@ _KNOWN = {
     "loadtest": ("Load a running service with a dataset's queries.", "mapping"),
     "demo": ("Map streets, serve the map, ask it where pictures were taken.", "mapping"),
     "train": ("Train an encoder on simulated cities.", "training"),
+    "average": ("Average the weights of two training runs.", "training"),
     "export": ("Make an ONNX encoder from a training's checkpoint.", "training"),
 }
 

@@ -16,7 +16,7 @@ def predictions(errors_m, *, up_m=0.0):
     T_answer[:, 1, 3] = 0.8 * np.array(errors_m)
     return Predictions(
         T_true, T_answer, np.zeros(count, int), np.zeros(count, int), np.zeros((count, RANKED, 2)), np.zeros((count, RANKED), int),
-        np.ones(count, bool), np.full(count, 0.5), np.arange(count * len(FEATURES), dtype=float).reshape(count, -1),
+        np.full(count, "LOCALIZED"), np.full(count, 0.5), np.arange(count * len(FEATURES), dtype=float).reshape(count, -1),
         np.zeros((count, 6, 6)), np.zeros(count), np.zeros(count),
     )  # fmt: skip
 
@@ -54,8 +54,9 @@ def predicted(monkeypatch):
     """What was asked of whom, in order; each set is answered by as many right answers as its name has letters."""
     asked = []
 
-    def predict(localizer, dataset, name, *, report):
+    def predict(localizer, dataset, name, *, frames_each, report):
         asked.append((localizer, dataset, name, report))
+        assert frames_each == (5 if name.startswith("sequences") else 1)
         return predictions([0.0] * len(name))
 
     monkeypatch.setattr(collect, "predict", predict)
@@ -69,6 +70,7 @@ def predicted(monkeypatch):
         ((), ["clear_precise", "clear_stereo", "rain_precise"]),
         (("clear_stereo",), ["clear_stereo"]),
         (["rain_precise", "clear_precise"], ["rain_precise", "clear_precise"]),
+        (("sequences_precise",), ["sequences_precise"]),
     ],
 )
 def test_query_sets_are_asked_as_they_are_named_or_else_all_that_have_truth(predicted, ask, names, expected):

@@ -40,7 +40,7 @@ def test_confidence_is_the_calibrations_and_nothing_where_nothing_was_registered
 
 
 def test_every_city_is_predicted_from_the_others_with_both_presets():
-    lines = cross_checks([city(1), city(2), city(3)])
+    lines = cross_checks([city(1), city(2), city(3)], city(4))
     assert len(lines) == 9
     for index in range(3):
         head, *presets = lines[3 * index : 3 * index + 3]
@@ -57,7 +57,7 @@ def test_every_city_is_predicted_from_the_others_with_both_presets():
 def test_a_city_is_not_predicted_from_itself():
     """The second contradicts the first: each is predicted as wrongly as can be, however well it fits itself."""
     one, other = city(1), city(2, upside_down=True)
-    heads = [line for line in cross_checks([one, other]) if line.startswith("city")]
+    heads = [line for line in cross_checks([one, other], city(3, count=10)) if line.startswith("city")]
     assert min(float(line.rsplit(" ", 1)[1]) for line in heads) > 0.3
     assert len(pooled([one, other])) == 2400
 
@@ -131,6 +131,15 @@ def test_a_sparse_map_has_a_place_every_five_metres_and_any_other_every_metre(wo
         ("three", False, "three-sparse", 5.0),
         ("two", True, "two-without-streets", 1.0),
     ]
+
+
+def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work):
+    street = SimpleNamespace(name="blocks", folder=work.folder / "blocks")
+    first = make._asked_repeating(work.folder, work.encoder, street, anew=False, report=print)
+    again = make._asked_repeating(work.folder, work.encoder, street, anew=False, report=print)
+    assert work.asked == [("in_the_map", "blocks", "blocks", ())]
+    assert work.built == [("blocks", False, "blocks", 1.0)]
+    np.testing.assert_array_equal(first.evidence, again.evidence)
 
 
 def test_the_last_city_is_asked_of_the_first_ones_maps(work):

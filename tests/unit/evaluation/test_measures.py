@@ -28,7 +28,8 @@ def make_predictions(errors_m, *, answered=None, street_answer=None, street_true
     return Predictions(
         T_true, T_answer, np.zeros(count, int) if street_true is None else np.array(street_true),
         np.zeros(count, int) if street_answer is None else np.array(street_answer), ranked, np.full((count, RANKED), -1),
-        ~nothing if answered is None else np.array(answered), np.full(count, np.nan), np.full((count, len(FEATURES)), np.nan),
+        np.where(~nothing if answered is None else np.array(answered), "LOCALIZED", ""),
+        np.full(count, np.nan), np.full((count, len(FEATURES)), np.nan),
         np.full((count, 6, 6), np.nan), np.full(count, 20.0), np.arange(float(count)),
     )  # fmt: skip
 

@@ -1,0 +1,32 @@
+"""``streetfix average``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from model_training.cli.progress import bars
+from model_training.training.average import BATCHES, average
+from service.errors import DatasetError
+
+
+def command(
+    first: Annotated[Path, typer.Argument(help="folder of a training run")],
+    second: Annotated[Path, typer.Argument(help="folder of the run that started from it")],
+    run: Annotated[Path, typer.Option(help="folder of the run to write")],
+    share: Annotated[float, typer.Option(help="of the second run in the mean", min=0, max=1)] = 0.5,
+    packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
+) -> None:
+    """Average two runs' weights, so that the second's gain costs less of what only the first knew.
+
+    \b
+    Example:
+      streetfix average runs/stock runs/second --run runs/mean && streetfix export runs/mean --out encoder.onnx
+    """
+    folders = sorted(folder for folder in packs.glob("*-city-1*") if folder.is_dir())
+    if not folders:
+        raise DatasetError(f"--packs: {packs} holds no training cities; streetfix train makes them", field="packs")
+    with bars() as report:
+        average(first, second, folders, run, share=share, report=lambda done: report("statistics", done, BATCHES))
+    Console().print(f"averaged: {run}; next: streetfix export {run} --out encoder.onnx")
