@@ -1,4 +1,4 @@
-"""Compiles the registration kernel when the package is built; where no C compiler is installed, with one from PyPI."""
+"""Compiles the C files when the package is built; where no C compiler is installed, with one from PyPI."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-FOLDER = Path("service") / "registration"
+SOURCES = (Path("service/registration/kernel.c"), Path("service/imaging/gather.c"))
 FLAGS = ["-O3", "-std=c11", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
 
 
@@ -23,7 +23,7 @@ def compiler() -> list[str] | None:
 
 
 class KernelHook(BuildHookInterface[Any]):
-    """``_kernel.so`` beside its source, in the wheel and in editable installs."""
+    """``_NAME.so`` beside each ``NAME.c``, in the wheel and in editable installs."""
 
     def dependencies(self) -> list[str]:
         """What the build environment must hold beyond hatchling."""
@@ -33,12 +33,13 @@ class KernelHook(BuildHookInterface[Any]):
         """Compile, and mark the wheel as one for this platform and any Python 3."""
         if self.target_name != "wheel":
             return
-        source, library = Path(self.root) / FOLDER / "kernel.c", Path(self.root) / FOLDER / "_kernel.so"
-        part = library.with_suffix(".part")
         command = compiler() or [sys.executable, "-m", "ziglang", "cc"]
-        subprocess.run([*command, *FLAGS, "-o", str(part), str(source), "-lm"], check=True)  # noqa: S603  # no shell; the compiler is the builder's own
-        part.rename(library)
-        build_data["artifacts"].append(f"/{FOLDER.as_posix()}/_kernel.so")
+        for source in SOURCES:
+            library = source.with_name(f"_{source.stem}.so")
+            part = Path(self.root) / library.with_suffix(".part")
+            subprocess.run([*command, *FLAGS, "-o", str(part), str(Path(self.root) / source), "-lm"], check=True)  # noqa: S603  # no shell; the compiler is the builder's own
+            part.rename(Path(self.root) / library)
+            build_data["artifacts"].append(f"/{library.as_posix()}")
         build_data["pure_python"] = False
         from packaging.tags import platform_tags  # comes with hatchling
 

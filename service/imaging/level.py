@@ -5,6 +5,7 @@ a stereo one shows it badly, so the plane is fitted under a prior (gravity or th
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -55,15 +56,11 @@ def level_camera(
         down_camera: gravity in the camera frame, if an IMU measured it.
         nominal_height_m: usual height of the camera above the ground.
     """
-    height, width = depth_m.shape
-    own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
     R = nominal_level(down_camera)
-    step = max(1, width // STEP_PIXELS)
-    v, u = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+    v, u, rays = _rays(camera, *depth_m.shape)
     z = depth_m[v, u].astype(np.float64)
     measured = (z > NEAR_M) & (z < REACH_M)
-    z, u, v = z[measured], u[measured], v[measured]
-    points = np.stack([(u - own.cx) / own.fx * z, (v - own.cy) / own.fy * z, z], axis=1) @ R.T
+    points = (z[measured, None] * rays[measured]) @ R.T
     slope_x, slope_y, ground = _fit_plane(points, nominal_height_m)
     normal = np.array([-slope_x, -slope_y, 1.0])
     normal /= np.linalg.norm(normal)
@@ -77,21 +74,34 @@ def level_camera(
     return CameraLevel(R_level, float(-ground * normal[2]))
 
 
+@lru_cache(maxsize=16)
+def _rays(
+    camera: PinholeCamera, height: int, width: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64[NDArray[np.float64], "n 3"]]:
+    """Rows and columns of the pixels that are read of a picture, and their rays at z = 1; the same for every picture of a camera."""
+    own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
+    step = max(1, width // STEP_PIXELS)
+    v, u = (each.reshape(-1) for each in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+    rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
+    for each in (v, u, rays):
+        each.setflags(write=False)
+    return v, u, rays
+
+
 def _fit_plane(points: NDArray[np.float64], height_m: float) -> tuple[float, float, float]:
     """Slopes and offset of z = a x + b y + c near z = -height; the prior alone where no ground is seen."""
     prior = np.diag([1 / TILT_PRIOR_RAD**2, 1 / TILT_PRIOR_RAD**2, 1 / HEIGHT_PRIOR_M**2])
     mean = np.array([0.0, 0.0, -height_m])
     solution = mean
     near = points[points[:, 2] < -0.3 * height_m]
+    design, z = np.column_stack([near[:, :2], np.ones(len(near))]), near[:, 2]
+    reach = np.hypot(near[:, 0], near[:, 1])
+    certainty = 1.0 / ((NOISE_M + 0.01 * reach) ** 2 * CORRELATED)
     for band_m, band_slope in ((0.5, 0.08), (0.35, 0.05), (0.25, 0.03), (0.2, 0.02), (0.2, 0.02)):
-        design = np.column_stack([near[:, 0], near[:, 1], np.ones(len(near))])
-        residual = near[:, 2] - design @ solution
-        reach = np.hypot(near[:, 0], near[:, 1])
-        keep = np.abs(residual) < band_m + band_slope * reach
+        keep = np.abs(z - design @ solution) < band_m + band_slope * reach
         if not keep.any():
             break
-        A, y = design[keep], near[keep, 2]
-        weight = 1.0 / ((NOISE_M + 0.01 * reach[keep]) ** 2 * CORRELATED)
-        information = A.T @ (A * weight[:, None]) + prior
-        solution = np.linalg.solve(information, A.T @ (weight * y) + prior @ mean)
+        weighted = design * np.where(keep, certainty, 0.0)[:, None]
+        information = weighted.T @ design + prior
+        solution = np.linalg.solve(information, weighted.T @ z + prior @ mean)
     return float(solution[0]), float(solution[1]), float(solution[2])

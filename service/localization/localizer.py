@@ -104,7 +104,7 @@ class Localizer:
         matches = search_views(
             self.bundle, descriptors, turns_rad=views.turns_rad, places=_places_of(query), fewest=self.clusters.views
         )
-        noise = inverse_depth_noise(query.depth_m)
+        noise = inverse_depth_noise(query.depth_m) if query.refine else np.nan  # only registration asks
         return Frame(
             query, np.eye(4), views, descriptors, matches, noise,
             fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from service.maps.reader import MapBundle
 
+#: The list is so many times as long as what is wanted from it (decision log: what a shorter one loses).
+SHORTLIST = 6
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewMatches:
@@ -55,6 +58,8 @@ def search_views(
 ) -> ViewMatches:
     """The views that are most similar to any of a query's turned views.
 
+    The mean of the turned descriptors picks a list from the whole map, and what is on it is compared with each.
+
     Args:
         bundle: the map.
         descriptors: of the turned views.
@@ -65,25 +70,26 @@ def search_views(
     wanted = min(places, bundle.manifest.counts.places)
     count = max(fewest, 4 * wanted)
     while True:
-        similarities, views = bundle.view_index.search(descriptors, count)
-        if len(np.unique(bundle.view_place[views])) >= wanted or views.shape[1] < count:
-            return _best_of_turns(bundle, similarities, views, np.array(turns_rad))
+        shortlist = bundle.view_index.shortlist(descriptors.mean(axis=0), SHORTLIST * count)
+        matches = _most_similar(bundle, descriptors, shortlist, np.array(turns_rad), count)
+        if len(np.unique(matches.place)) >= wanted or len(shortlist) == len(bundle.view_index):
+            return matches
         count *= 2
 
 
-def _best_of_turns(
+def _most_similar(
     bundle: MapBundle,
-    similarities: Float32[NDArray[np.float32], "T n"],
-    views: Int64[NDArray[np.int64], "T n"],
+    descriptors: Float32[NDArray[np.float32], "T D"],
+    views: Int64[NDArray[np.int64], " n"],
     turns_rad: Float64[NDArray[np.float64], " T"],
+    count: int,
 ) -> ViewMatches:
-    """Every view once, at the turn where it is most similar; the best view first."""
-    turn = np.repeat(turns_rad, views.shape[1])
-    order = np.argsort(-similarities.reshape(-1), kind="stable")
-    flat = views.reshape(-1)[order]
-    _, first = np.unique(flat, return_index=True)
-    kept = order[np.sort(first)]
-    return _matches(bundle, similarities.reshape(-1)[kept], views.reshape(-1)[kept], turn[kept])
+    """The best ``count`` of some views, each at the turn where it is most similar; the best first."""
+    similarities = bundle.view_index.vectors(views) @ descriptors.T
+    turn = similarities.argmax(axis=1)
+    best = similarities[np.arange(len(views)), turn]
+    order = np.argsort(-best, kind="stable")[:count]
+    return _matches(bundle, best[order], views[order], turns_rad[turn[order]])
 
 
 def _matches(

@@ -173,9 +173,9 @@ def test_a_view_found_at_two_turns_is_kept_once_at_the_better_one_and_its_headin
     matches = search_views(bundle, descriptors, turns_rad=turns, places=3, fewest=bundle.manifest.counts.views)
     assert len(np.unique(matches.view)) == len(matches) == bundle.manifest.counts.views
     assert (np.diff(matches.similarity) <= 0).all()
-    by_turn = bundle.view_index.search(descriptors, bundle.manifest.counts.views)
+    by_turn = bundle.view_index.vectors(np.arange(bundle.manifest.counts.views)) @ descriptors.T
     for view, similarity, heading in zip(matches.view, matches.similarity, matches.heading_rad, strict=True):
-        each = [float(s[np.flatnonzero(v == view)[0]]) for s, v in zip(*by_turn, strict=True)]
+        each = by_turn[view].tolist()
         assert similarity == pytest.approx(max(each), abs=1e-6)
         assert heading == pytest.approx(float(bundle.view_heading_rad[view]) - turns[int(np.argmax(each))])
 

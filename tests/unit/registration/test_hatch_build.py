@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
+C_FILES = ("service/registration/kernel.c", "service/imaging/gather.c")
 T = TypeVar("T")
 
 
@@ -73,10 +74,10 @@ def test_only_a_machine_without_a_compiler_needs_one_from_the_package_index(hook
 
 @pytest.fixture
 def tree(tmp_path):
-    """A source tree of the kernel alone."""
-    folder = tmp_path / "service" / "registration"
-    folder.mkdir(parents=True)
-    shutil.copy(ROOT / "service" / "registration" / "kernel.c", folder)
+    """A source tree of the C files alone."""
+    for source in C_FILES:
+        (tmp_path / source).parent.mkdir(parents=True)
+        shutil.copy(ROOT / source, tmp_path / source)
     return tmp_path
 
 
@@ -100,17 +101,17 @@ def commands(hook, monkeypatch):
 
 
 @pytest.mark.parametrize(("CC", "command"), [("icx", ["icx"]), (None, [sys.executable, "-m", "ziglang", "cc"])])
-def test_the_kernel_is_compiled_beside_its_source(hook, machine, commands, tree, CC, command):
+def test_each_file_is_compiled_beside_its_source(hook, machine, commands, tree, CC, command):
     machine(*([CC] if CC else []), CC=CC)
     data = built(hook, tree)
-    [(arguments, check)] = commands
-    folder = tree / "service" / "registration"
-    assert arguments[: len(command)] == command
-    assert {str(folder / "kernel.c"), "-shared", "-O3"} <= set(arguments)
-    assert arguments[-1] == "-lm"
-    assert check
-    assert sorted(each.name for each in folder.iterdir()) == ["_kernel.so", "kernel.c"]
-    assert data["artifacts"] == ["/service/registration/_kernel.so"]
+    for source, (arguments, check) in zip(C_FILES, commands, strict=True):
+        assert arguments[: len(command)] == command
+        assert {str(tree / source), "-shared", "-O3"} <= set(arguments)
+        assert arguments[-1] == "-lm"
+        assert check
+        folder = tree / Path(source).parent
+        assert sorted(each.name for each in folder.iterdir()) == [f"_{Path(source).stem}.so", Path(source).name]
+    assert data["artifacts"] == ["/service/registration/_kernel.so", "/service/imaging/_gather.so"]
 
 
 def test_the_wheel_is_for_this_platform_and_any_python_3(hook, machine, commands, tree):
@@ -135,3 +136,4 @@ def test_the_compiled_library_has_what_the_kernel_calls(hook, monkeypatch, tree)
     library = ctypes.CDLL(str(tree / "service" / "registration" / "_kernel.so"))
     for name in ("align", "mark", "fill", "render"):
         assert hasattr(library, f"streetfix_{name}")
+    assert hasattr(ctypes.CDLL(str(tree / "service" / "imaging" / "_gather.so")), "streetfix_gather")

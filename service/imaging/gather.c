@@ -1,0 +1,107 @@
+/* Resamples a depth and a colour picture onto the cells of a view grid: each cell looks along several rays, its range is
+ * the median of those that meet a measurement, its colour the mean of those that meet a pixel.
+ *
+ * Rays lie sample by sample (all cells' first rays, then all second ones ...), so that every loop over cells is one
+ * over neighbours in memory. Sizes and pointers are checked in Python; pixels outside a picture are never read. */
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+enum { SAMPLES = 9, BLOCK = 128 };
+
+typedef struct {
+    int64_t height, width;
+    double fx, fy, cx, cy;
+} Picture;
+
+/* Where each ray of a block meets a picture: flat index of the pixel, -1 outside. Rounds half to even, as rint does. */
+static void pixels(const float *x, const float *y, const float *z, int64_t count, const Picture *p, int32_t *index) {
+    const float fx = (float)p->fx, fy = (float)p->fy, cx = (float)p->cx, cy = (float)p->cy;
+    const float w = (float)p->width, h = (float)p->height;
+    const float magic = 12582912.0f; /* 1.5 * 2^23: adding it leaves no room for a fraction */
+    const int32_t width = (int32_t)p->width;
+    for (int64_t i = 0; i < count; i++) {
+        const int ahead = z[i] > 1e-3f;
+        const float inverse = 1.0f / (ahead ? z[i] : 1.0f);
+        float u = x[i] * inverse * fx + cx, v = y[i] * inverse * fy + cy;
+        u = u > -2.0f ? u : -2.0f;
+        u = u < w + 2.0f ? u : w + 2.0f;
+        v = v > -2.0f ? v : -2.0f;
+        v = v < h + 2.0f ? v : h + 2.0f;
+        u = (u + magic) - magic;
+        v = (v + magic) - magic;
+        const int inside = ahead & (u >= 0.0f) & (u < w) & (v >= 0.0f) & (v < h);
+        index[i] = inside ? (int32_t)v * width + (int32_t)u : -1;
+    }
+}
+
+static void order(float *a, float *b, int64_t count) {
+    for (int64_t i = 0; i < count; i++) {
+        const float low = a[i] < b[i] ? a[i] : b[i], high = a[i] < b[i] ? b[i] : a[i];
+        a[i] = low;
+        b[i] = high;
+    }
+}
+
+/* Floyd's network of 25 comparators for nine (Knuth, The Art of Computer Programming 3, 5.3.4). */
+static const int NETWORK[25][2] = {{0, 1}, {3, 4}, {6, 7}, {1, 2}, {4, 5}, {7, 8}, {0, 1}, {3, 4}, {6, 7},
+                                   {0, 3}, {3, 6}, {0, 3}, {1, 4}, {4, 7}, {1, 4}, {2, 5}, {5, 8}, {2, 5},
+                                   {1, 3}, {5, 7}, {2, 6}, {4, 6}, {2, 4}, {2, 3}, {5, 6}};
+
+/* rays: SAMPLES x 3 x cells, level frame; R: camera from level, row by row; ranges and seen: cells; colour: cells x 3. */
+void streetfix_gather(const float *rays, int64_t cells, const double *R, const float *depth, const Picture *depth_picture,
+                      const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range, int64_t fewest,
+                      float *ranges, float *colour, uint8_t *seen) {
+    float r[9];
+    for (int k = 0; k < 9; k++) r[k] = (float)R[k];
+    const int same = memcmp(depth_picture, rgb_picture, sizeof(Picture)) == 0;
+    const float least = (float)min_range, most = (float)max_range;
+    for (int64_t first = 0; first < cells; first += BLOCK) {
+        const int64_t count = cells - first < BLOCK ? cells - first : BLOCK;
+        float distance[SAMPLES][BLOCK], x[BLOCK], y[BLOCK], z[BLOCK];
+        int32_t at[BLOCK], at_rgb[BLOCK], measured[BLOCK], coloured[BLOCK], sum[3][BLOCK];
+        memset(measured, 0, sizeof measured);
+        memset(coloured, 0, sizeof coloured);
+        memset(sum, 0, sizeof sum);
+        memset(seen + first, 0, (size_t)count);
+        for (int s = 0; s < SAMPLES; s++) {
+            const float *lx = rays + (int64_t)(3 * s) * cells + first, *ly = lx + cells, *lz = ly + cells;
+            for (int64_t i = 0; i < count; i++) {
+                x[i] = r[0] * lx[i] + r[1] * ly[i] + r[2] * lz[i];
+                y[i] = r[3] * lx[i] + r[4] * ly[i] + r[5] * lz[i];
+                z[i] = r[6] * lx[i] + r[7] * ly[i] + r[8] * lz[i];
+            }
+            pixels(x, y, z, count, depth_picture, at);
+            if (!same) pixels(x, y, z, count, rgb_picture, at_rgb);
+            const int32_t *of_colour = same ? at : at_rgb;
+            for (int64_t i = 0; i < count; i++) {
+                float found = INFINITY;
+                if (at[i] >= 0) {
+                    seen[first + i] = 1;
+                    /* A ray of unit length has its depth at z / ray_z. */
+                    const float d = depth[at[i]] / z[i];
+                    if (d >= least && d <= most) {
+                        found = d;
+                        measured[i]++;
+                    }
+                }
+                distance[s][i] = found;
+                if (of_colour[i] >= 0) {
+                    const uint8_t *pixel = rgb + 3 * (int64_t)of_colour[i];
+                    sum[0][i] += pixel[0];
+                    sum[1][i] += pixel[1];
+                    sum[2][i] += pixel[2];
+                    coloured[i]++;
+                }
+            }
+        }
+        for (int k = 0; k < 25; k++) order(distance[NETWORK[k][0]], distance[NETWORK[k][1]], count);
+        for (int64_t i = 0; i < count; i++) {
+            const int32_t many = measured[i];
+            ranges[first + i] = many >= fewest && many > 0 ? distance[(many - 1) / 2][i] : 0.0f;
+            const float by = (float)(coloured[i] > 0 ? coloured[i] : 1);
+            for (int c = 0; c < 3; c++) colour[3 * (first + i) + c] = (float)sum[c][i] / by;
+        }
+    }
+}

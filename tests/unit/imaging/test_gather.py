@@ -1,0 +1,100 @@
+"""The compiled gather against the same said in NumPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
+
+from service.errors import StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z
+from service.imaging import gather as module
+from service.imaging.gather import FEWEST_SAMPLES, _sub_rays, gather
+from service.imaging.view_grid import ViewGrid
+
+GRID = ViewGrid(rows=5, columns=37)  # neither a whole block of cells nor a whole number of rows in one
+
+
+def plain(rgb, depth_m, camera, R, grid):
+    """Ray by ray; float32 throughout, as the kernel."""
+    rays = _sub_rays(grid).transpose(2, 0, 1).astype(np.float64) @ R.T
+    cells = len(rays)
+    ranges, colour, seen = np.zeros(cells), np.zeros((cells, 3)), np.zeros(cells, bool)
+    for cell in range(cells):
+        found, colours = [], []
+        for ray in rays[cell]:
+            for picture, kind in ((depth_m, "depth"), (rgb, "rgb")):
+                own = camera.scaled_to(picture.shape[1], picture.shape[0])
+                if ray[2] <= 1e-3:
+                    continue
+                u, v = np.rint(ray[0] / ray[2] * own.fx + own.cx), np.rint(ray[1] / ray[2] * own.fy + own.cy)
+                if not (0 <= u < picture.shape[1] and 0 <= v < picture.shape[0]):
+                    continue
+                value = picture[int(v), int(u)]
+                if kind == "rgb":
+                    colours.append(value)
+                else:
+                    seen[cell] = True
+                    if grid.min_range_m <= value / ray[2] <= grid.max_range_m:
+                        found.append(value / ray[2])
+        if len(found) >= FEWEST_SAMPLES:
+            ranges[cell] = sorted(found)[(len(found) - 1) // 2]
+        if colours:
+            colour[cell] = np.mean(colours, axis=0)
+    shape = (grid.rows, grid.columns)
+    return ranges.reshape(shape), colour.reshape(*shape, 3), seen.reshape(shape)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1), turn=st.floats(-3.2, 3.2), tilt=st.floats(-0.4, 0.4), own_size=st.booleans(),
+    holes=st.floats(0, 1),
+)  # fmt: skip
+def test_the_kernel_says_what_plain_numpy_says(seed, turn, tilt, own_size, holes):
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera(64, 48, 31.7, 31.9, 31.3, 23.1)
+    rgb = rng.integers(0, 256, (48, 64, 3), np.uint8)
+    depth_m = rng.uniform(0.1, 60, (48, 64) if own_size else (24, 32)).astype(np.float32)
+    depth_m[rng.random(depth_m.shape) < holes] = 0
+    pitch = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+    R = R_BODY_OPTICAL.T @ pitch @ rotation_z(turn)
+    found, expected = gather(rgb, depth_m, camera, R, GRID), plain(rgb, depth_m, camera, R, GRID)
+    # A ray that falls just between two pixels may go either way: one of a thousand, here none or one cell.
+    for one, other in zip(found, expected, strict=True):
+        assert np.mean(~np.isclose(one, other, rtol=1e-4, atol=1e-3)) <= 2 / found[2].size
+    assert found[2].dtype == np.bool_
+
+
+def test_what_is_not_finite_is_no_measurement():
+    camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+    rgb = np.full((48, 64, 3), 255, np.uint8)
+    for value in (np.nan, np.inf, -np.inf, -3.0, 0.0, 1e30):
+        ranges, colour, seen = gather(rgb, np.full((48, 64), value, np.float32), camera, R_BODY_OPTICAL.T, GRID)
+        assert not ranges.any()
+        assert seen.any()
+        np.testing.assert_array_equal(np.unique(colour[seen]), 255)
+
+
+@pytest.mark.parametrize("focal", [1e-6, 1e6])
+@pytest.mark.parametrize("centre", [-1e6, 1e6])
+def test_absurd_intrinsics_read_no_pixel_that_is_not_there(focal, centre):
+    camera = PinholeCamera(64, 48, focal, focal, centre, centre)
+    ranges, _, seen = gather(
+        np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), camera, R_BODY_OPTICAL.T, GRID
+    )
+    assert ranges.shape == seen.shape == (GRID.rows, GRID.columns)
+
+
+def test_pictures_that_are_none_are_refused():
+    camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+    with pytest.raises((ValueError, TypeCheckError)):  # whichever looks first
+        gather(np.zeros((48, 64), np.uint8), np.ones((48, 64), np.float32), camera, R_BODY_OPTICAL.T, GRID)
+
+
+def test_a_missing_library_says_what_to_do(monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "LIBRARY", tmp_path / "_gather.so")
+    module._library.cache_clear()
+    with pytest.raises(StreetfixError, match=r"_gather\.so is missing .* install the package again"):
+        module._library()
+    module._library.cache_clear()
