@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.errors import UnsupportedFormatError
 from service.imaging.picture_headers import ImageLimits, damaged, format_of, header_of, require_bytes, require_pixels
+from service.imaging.png16 import is_plain_grey16, read_grey16
 
 #: ``auto`` (as None) tells by the first bytes; ``carla`` is CARLA's depth in the three channels of an 8-bit PNG.
 DepthEncoding = Literal["auto", "carla"]
@@ -87,6 +88,8 @@ def _png16(data: bytes, limits: ImageLimits) -> Values:
             'picture of CARLA, encoding "carla")'
         )
     require_pixels(header.height, header.width, limits, field=_FIELD)
+    if is_plain_grey16(data):
+        return read_grey16(data, header.height, header.width, field=_FIELD)
     return _of_size(opencv_decode(data, cv2.IMREAD_UNCHANGED, field=_FIELD), header.height, header.width)
 
 

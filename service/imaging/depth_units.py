@@ -51,16 +51,19 @@ def depth_from_values(
     height, width = values.shape
     scaled = camera.scaled_to(width, height)
     with np.errstate(all="ignore"):
-        depth: NDArray[np.float32] = values.astype(np.float32) * np.float32(scale_m)
+        depth: NDArray[np.float32] = np.multiply(values, np.float32(scale_m), dtype=np.float32)
         if kind == "disparity":
             baseline_m = _require_positive(baseline_m, "depth.baseline_m", "metres between the cameras")
             depth = np.divide(np.float32(scaled.fx * baseline_m), depth)
+        elif kind == "z" and np.issubdtype(values.dtype, np.unsignedinteger):
+            # What is stored is finite, not negative, and 0 where nothing was measured.
+            return depth if max_range_m is None else np.where(depth <= max_range_m, depth, np.float32(0))
         usable = np.isfinite(depth) & (depth > 0)
         if max_range_m is not None:
             usable &= depth <= max_range_m
         if kind == "range":
             depth = np.divide(depth, ray_lengths(scaled).astype(np.float32))
-    return np.where(usable, depth, 0).astype(np.float32)
+    return np.where(usable, depth, np.float32(0)).astype(np.float32, copy=False)
 
 
 def ray_lengths(camera: PinholeCamera) -> Float64[NDArray[np.float64], "H W"]:

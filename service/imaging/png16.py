@@ -1,0 +1,78 @@
+"""16-bit grey PNG, a depth camera's own format, in under half of the time that a general decoder takes.
+
+It inflates with ISA-L and takes the filters off in compiled code; what a PNG may be besides (interlaced, of other samples) is left
+to OpenCV. Pixels are the same (a test compares them).
+"""
+
+import ctypes
+import struct
+from ctypes import c_int64, c_void_p
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from isal import isal_zlib
+from jaxtyping import UInt16
+from numpy.typing import NDArray
+
+from service.errors import StreetfixError
+from service.imaging.picture_headers import damaged
+
+LIBRARY = Path(__file__).with_name("_unfilter.so")
+_SIGNATURE_BYTES = 8
+_FIRST_CHUNK = struct.Struct(">I4sIIBBBBB")
+
+
+def is_plain_grey16(data: bytes) -> bool:
+    """Whether ``read_grey16`` reads it: 16-bit grey, not interlaced."""
+    length, kind, _, _, bits, colour, compression, filters, interlace = _FIRST_CHUNK.unpack_from(data, _SIGNATURE_BYTES)
+    return (length, kind, bits, colour, compression, filters, interlace) == (13, b"IHDR", 16, 0, 0, 0, 0)
+
+
+def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[NDArray[np.uint16], "H W"]:
+    """Pixels of a PNG that ``is_plain_grey16``, whose chunks were seen to end within the data.
+
+    Args:
+        data: the file.
+        height: as its header says, checked against the limits.
+        width: the same.
+        field: to name in errors.
+
+    Raises:
+        DecodeError: a checksum does not fit, or the pixels are damaged or cut off.
+    """
+    needed = height * (1 + 2 * width)
+    inflate, parts, left = isal_zlib.decompressobj(), [], needed + 1
+    view, at = memoryview(data), _SIGNATURE_BYTES
+    try:
+        while True:
+            length, kind = struct.unpack_from(">I4s", data, at)
+            end = at + 8 + length
+            if isal_zlib.crc32(view[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+                raise damaged(field, f"the checksum of its chunk {kind.hex(' ')} does not fit")
+            if kind == b"IDAT" and left > 0:
+                parts.append(inflate.decompress(view[at + 8 : end], left))
+                left -= len(parts[-1])
+            elif kind == b"IEND":
+                break
+            at = end + 4
+    except (isal_zlib.IsalError, struct.error) as error:
+        raise damaged(field, "its pixels are damaged or cut off") from error
+    raw = bytearray().join(parts)
+    if len(raw) != needed:
+        raise damaged(field, f"it holds {len(raw)} bytes of pixels where {width}x{height} need {needed}")
+    out = np.empty((height, width), np.uint16)
+    rows = _library().streetfix_unfilter((ctypes.c_char * needed).from_buffer(raw), height, width, out.ctypes.data)
+    if rows != height:
+        raise damaged(field, f"row {rows} has an unknown filter")
+    return out
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    if not LIBRARY.exists():
+        raise StreetfixError(f"{LIBRARY.name} is missing beside {__file__}: install the package again (pip install .)")
+    library = ctypes.CDLL(str(LIBRARY))
+    library.streetfix_unfilter.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
+    library.streetfix_unfilter.restype = c_int64
+    return library

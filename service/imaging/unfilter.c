@@ -1,0 +1,60 @@
+/* Takes the filters off the rows of a 16-bit grey PNG (RFC 2083, section 6): out has height x width native values.
+ * raw holds height rows of one filter byte and 2 x width sample bytes, the higher one first; Python has checked its size.
+ * Returns the number of rows before the first whose filter is unknown. */
+
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+static uint8_t paeth(int a, int b, int c) {
+    const int pa = abs(b - c), pb = abs(a - c), pc = abs(a + b - 2 * c);
+    const int least = pa <= pb ? a : b;
+    return (uint8_t)((pa <= pb ? pa : pb) <= pc ? least : c);
+}
+
+int64_t streetfix_unfilter(uint8_t *raw, int64_t height, int64_t width, uint16_t *out) {
+    const int64_t bytes = 2 * width;
+    const uint8_t *before = NULL; /* the row above, unfiltered in place; none is zeros */
+    for (int64_t y = 0; y < height; y++) {
+        uint8_t *row = raw + y * (bytes + 1) + 1;
+        switch (row[-1]) {
+            case 0:
+                break;
+            case 1:
+                for (int64_t k = 2; k < bytes; k++) row[k] = (uint8_t)(row[k] + row[k - 2]);
+                break;
+            case 2:
+                if (before)
+                    for (int64_t k = 0; k < bytes; k++) row[k] = (uint8_t)(row[k] + before[k]);
+                break;
+            case 3:
+                for (int64_t k = 0; k < bytes; k++) {
+                    const int left = k < 2 ? 0 : row[k - 2], up = before ? before[k] : 0;
+                    row[k] = (uint8_t)(row[k] + (left + up) / 2);
+                }
+                break;
+            case 4: {
+                if (!before) {
+                    for (int64_t k = 2; k < bytes; k++) row[k] = (uint8_t)(row[k] + row[k - 2]);
+                    break;
+                }
+                int a0 = 0, a1 = 0, c0 = 0, c1 = 0; /* left and above left, of both bytes of a sample */
+                for (int64_t k = 0; k < bytes; k += 2) {
+                    const int b0 = before[k], b1 = before[k + 1];
+                    a0 = (uint8_t)(row[k] + paeth(a0, b0, c0));
+                    a1 = (uint8_t)(row[k + 1] + paeth(a1, b1, c1));
+                    row[k] = (uint8_t)a0;
+                    row[k + 1] = (uint8_t)a1;
+                    c0 = b0;
+                    c1 = b1;
+                }
+                break;
+            }
+            default:
+                return y;
+        }
+        for (int64_t x = 0; x < width; x++) out[y * width + x] = (uint16_t)(row[2 * x] << 8 | row[2 * x + 1]);
+        before = row;
+    }
+    return height;
+}
