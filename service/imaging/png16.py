@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from isal import isal_zlib
+from isal.igzip_lib import IsalError
 from jaxtyping import UInt16
 from numpy.typing import NDArray
 
@@ -56,7 +57,7 @@ def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[N
             elif kind == b"IEND":
                 break
             at = end + 4
-    except (isal_zlib.IsalError, struct.error) as error:
+    except (IsalError, struct.error) as error:
         raise damaged(field, "its pixels are damaged or cut off") from error
     raw = bytearray().join(parts)
     if len(raw) != needed:
