@@ -57,7 +57,7 @@ def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[N
             elif kind == b"IEND":
                 break
             at = end + 4
-    except (IsalError, struct.error) as error:
+    except (IsalError, struct.error) as error:  # type: ignore[misc]  # its stub takes the class for an instance
         raise damaged(field, "its pixels are damaged or cut off") from error
     raw = bytearray().join(parts)
     if len(raw) != needed:
