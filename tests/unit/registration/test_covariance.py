@@ -20,7 +20,7 @@ NOISE = 1e-3
 def counted(monkeypatch):
     """What these tests count on."""
     numbers = {
-        "AT_NOISE": NOISE, "INDEPENDENT": 2.0, "INDEPENDENT_POWER": 0.5, "SHARED": 3.0, "SHARED_POWER": 0.25, "_AXES": np.ones(6),
+        "AT_NOISE": NOISE, "INDEPENDENT": 2.0, "INDEPENDENT_POWER": 0.5, "SHARED": 3.0, "_AXES": np.ones(6),
         "_AXES_POWER": np.zeros(6), "LEAST": NOISE / 16, "MOST": 16 * NOISE, "_FLOOR": FLOOR,
     }  # fmt: skip
     for name, value in numbers.items():
@@ -44,18 +44,17 @@ def without_floor(information, scatter, noise=NOISE):
 
 
 @pytest.mark.parametrize(
-    ("noise", "independent", "shared"),
-    [(1e-3, 2.0, 3.0), (16e-3, 8.0, 6.0), (0.5, 8.0, 6.0), (1e-3 / 16, 0.5, 1.5), (1e-5, 0.5, 1.5), (0.0, 0.5, 1.5)],
+    ("noise", "independent"), [(1e-3, 2.0), (16e-3, 8.0), (0.5, 8.0), (1e-3 / 16, 0.5), (1e-5, 0.5), (0.0, 0.5)]
 )
-def test_deviations_of_points_and_of_patches_are_stretched_by_factors_of_the_noise_within_limits(
-    noise, independent, shared
+def test_deviations_of_points_are_stretched_by_a_factor_of_the_noise_within_limits_and_of_patches_by_one(
+    noise, independent
 ):
     """A centimetre by the points' information, two by the patches' scatter: their variances add, and that of the floor.
 
-    By the square and the fourth root of the noise, 2 and 3 at a thousandth, never below a sixteenth of that or above 16 times.
+    Points by the square root of the noise, twice at a thousandth, never below a sixteenth of that or above 16 times.
     """
     found = covariance_of(1e4 * np.eye(8), 4e4 * np.eye(8), noise)
-    expected = (independent * 0.01) ** 2 + (shared * 0.02) ** 2 + FLOOR[:2] ** 2
+    expected = (independent * 0.01) ** 2 + (3.0 * 0.02) ** 2 + FLOOR[:2] ** 2
     np.testing.assert_allclose(np.diag(found)[:2], expected, rtol=1e-3)
 
 
@@ -110,7 +109,7 @@ def test_more_disagreement_means_more_variance_in_every_direction(information, s
 @given(informations, informations, noises)
 def test_more_information_of_patches_that_agree_means_less_variance_in_every_direction(information, more, noise):
     gained = covariance_of(information, NONE, noise) - covariance_of(information + more, NONE, noise)
-    assert np.linalg.eigvalsh(gained).min() > -1e-6
+    assert np.linalg.eigvalsh(gained).min() > -1e-8 * max(1.0, gained.max())
 
 
 @pytest.mark.parametrize("patches", [0.0, 1.0, 30.0])
