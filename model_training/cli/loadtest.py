@@ -38,6 +38,9 @@ def command(
     timeout: Annotated[float, typer.Option(help="seconds until a request is given up", min=0.01)] = 30.0,
     pairs: Annotated[int, typer.Option(help="different picture pairs, sent in turn", min=1)] = 50,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="full answers, or retrieval alone")] = True,
+    cheap_depth: Annotated[
+        bool, typer.Option("--cheap-depth", help="send depth as raw16+zstd, the cheapest to decode")
+    ] = False,
     key: Annotated[
         str | None, typer.Option("--api-key", envvar="STREETFIX_API_KEY", help="where the service asks for one")
     ] = None,
@@ -57,7 +60,7 @@ def command(
         raise RequestError("--rate and --concurrency: give one of them", field="rate")
     if any(each <= 0 for each in rate or ()):
         raise RequestError("--rate: it must be positive", field="rate")
-    sent = payloads(Dataset(dataset), queries, map_name=map_name, refine=refine, most=pairs)
+    sent = payloads(Dataset(dataset), queries, map_name=map_name, refine=refine, most=pairs, cheap_depth=cheap_depth)
     load = Load(rate=None, warm_up_s=warm_up, duration_s=duration, timeout_s=timeout)
     runs = [replace(load, rate=each) for each in rate or ()] or [
         replace(load, concurrency=each) for each in concurrency or [1]

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset, QueryFrame
 from service.errors import DatasetError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.imaging.depth_formats import read_depth_values, write_raw16
+from service.imaging.picture_headers import DEFAULT_LIMITS
 
 _KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
 
@@ -33,7 +35,9 @@ class Payload:
     true_m: Float64[NDArray[np.float64], "3"] | None
 
 
-def payloads(dataset: Dataset, queries: str | None, *, map_name: str | None, refine: bool, most: int) -> list[Payload]:
+def payloads(
+    dataset: Dataset, queries: str | None, *, map_name: str | None, refine: bool, most: int, cheap_depth: bool = False
+) -> list[Payload]:
     """Requests of a query set, in its order.
 
     Args:
@@ -42,6 +46,7 @@ def payloads(dataset: Dataset, queries: str | None, *, map_name: str | None, ref
         map_name: which map to ask; None where the service has one.
         refine: whether to ask for registration.
         most: no more than this many, evenly spread.
+        cheap_depth: send depth as raw16+zstd, the cheapest to encode and to decode, instead of as the file is.
 
     Raises:
         DatasetError: there is no such set, or it is empty.
@@ -56,11 +61,13 @@ def payloads(dataset: Dataset, queries: str | None, *, map_name: str | None, ref
     if not frames:
         raise DatasetError(f"{dataset.folder}: the query set {queries or names[0]} is empty", field="queries")
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))
-    return [_payload(frames[k], map_name, refine) for k in chosen]
+    return [_payload(frames[k], map_name, refine, cheap_depth) for k in chosen]
 
 
-def _payload(frame: QueryFrame, map_name: str | None, refine: bool) -> Payload:
+def _payload(frame: QueryFrame, map_name: str | None, refine: bool, cheap_depth: bool) -> Payload:
     rgb, depth, camera = frame.rgb_path.read_bytes(), frame.depth_path.read_bytes(), frame.camera
+    if cheap_depth:
+        depth = _as_raw16(depth, frame)
     names = ("width", "height", "fx", "fy", "cx", "cy")
     intrinsics = {name: getattr(camera, name) for name in names}
     spec = camera.depth
@@ -87,3 +94,13 @@ def _payload(frame: QueryFrame, map_name: str | None, refine: bool) -> Payload:
     )  # fmt: skip
     true_m = None if frame.T_map_camera is None else frame.T_map_camera[:3, 3].copy()
     return Payload(body + f"--{boundary}--\r\n".encode(), f"multipart/form-data; boundary={boundary}", message, true_m)
+
+
+def _as_raw16(depth: bytes, frame: QueryFrame) -> bytes:
+    values = read_depth_values(depth, encoding=None, limits=DEFAULT_LIMITS)
+    if values.dtype != np.uint16:
+        raise DatasetError(
+            f"{frame.depth_path}: raw16+zstd holds 16-bit values, these are {values.dtype}; send depth as it is",
+            field="cheap_depth",
+        )
+    return write_raw16(values)

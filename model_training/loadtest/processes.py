@@ -23,19 +23,39 @@ def usage(pid: int) -> Usage:
     Raises:
         RequestError: there is no such process, or this system has no /proc.
     """
-    parents = {}
+    table = _table()
+    tree = _tree(table, pid)
+    pages = sum(table[each][2] for each in tree)
+    return Usage(sum(table[each][1] for each in tree), pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+
+
+def descendants(pid: int) -> set[int]:
+    """A process and all that came of it.
+
+    Raises:
+        RequestError: there is no such process, or this system has no /proc.
+    """
+    return _tree(_table(), pid)
+
+
+def _table() -> dict[int, tuple[int, float, int]]:
+    """Parent, processor seconds and resident pages of every process."""
+    found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             fields = (folder / "stat").read_text().rpartition(")")[2].split()
         except OSError:  # ended meanwhile
             continue
-        parents[int(folder.name)] = (int(fields[1]), (int(fields[11]) + int(fields[12])) / _TICKS, int(fields[21]))
-    if pid not in parents:
+        found[int(folder.name)] = (int(fields[1]), (int(fields[11]) + int(fields[12])) / _TICKS, int(fields[21]))
+    return found
+
+
+def _tree(table: dict[int, tuple[int, float, int]], pid: int) -> set[int]:
+    if pid not in table:
         raise RequestError(f"--pid {pid}: there is no such process here; give the service's own", field="pid")
     tree, grew = {pid}, True
     while grew:
-        children = {child for child, (parent, _, _) in parents.items() if parent in tree} - tree
+        children = {child for child, (parent, _, _) in table.items() if parent in tree} - tree
         tree |= children
         grew = bool(children)
-    pages = sum(parents[each][2] for each in tree)
-    return Usage(sum(parents[each][1] for each in tree), pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+    return tree

@@ -1,8 +1,10 @@
 """``streetfix serve``: open the maps, listen, answer until told to stop."""
 
 import math
+import os
 import signal
 import socket
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,12 +17,15 @@ from service.errors import AddressError, BundleError
 
 if TYPE_CHECKING:
     from service.cli.certificates import Certificates
+    from service.runtime.choices import Choices
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
     from service.runtime.map_registry import MapRegistry
     from service.runtime.settings import Settings
 
 _BACKLOG = 128
+#: Where Prometheus' client library keeps what several processes count together.
+METRICS_FOLDER = "PROMETHEUS_MULTIPROC_DIR"
 
 
 def command(
@@ -35,6 +40,9 @@ def command(
     ] = None,
     threads: Annotated[int | None, typer.Option(help="Requests worked on at once.  [default: the cores]")] = None,
     queue: Annotated[int | None, typer.Option(help="Requests that may wait before 503.  [default: 64]")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that share the ports and the maps.  [default: 1]")
+    ] = None,
     check: Annotated[
         bool,
         typer.Option(
@@ -60,7 +68,7 @@ def command(
     (check_only if check else serve)(
         load_settings(
             maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
-            false_accept_rate=false_accept_rate,
+            workers=workers, false_accept_rate=false_accept_rate,
         )
     )  # fmt: skip
 
@@ -97,6 +105,65 @@ def serve(settings: "Settings") -> None:
         BundleError: a map is missing, damaged or mismatched, or none is given.
         AddressError: the address is taken or not ours.
     """
+    if not settings.maps:
+        raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
+    with _listen(settings.host, settings.port) as listener:
+        if settings.workers == 1:
+            _answer(settings, listener)
+        else:
+            _answer_by_workers(settings, listener)
+    typer.echo("stopped")
+
+
+def _answer_by_workers(settings: "Settings", listener: socket.socket) -> None:
+    """Several processes on one listening socket; what they count together, and what an operator chose, lies in a folder of theirs."""
+    from service.cli.workers import supervise
+    from service.runtime.choices import Choices
+
+    with tempfile.TemporaryDirectory(prefix="streetfix-") as folder, _shared_port(settings) as grpc_port:
+        counts = Path(folder) / "metrics"
+        counts.mkdir()
+        os.environ[METRICS_FOLDER] = str(counts)  # Prometheus' client looks here when it is imported, which workers do
+        shared = settings.model_copy(update={"grpc_port": grpc_port})
+        choices = Path(folder) / "choices.json"
+
+        def work(number: int, ready: Callable[[], None]) -> None:
+            _answer(shared, listener, choices=Choices(choices), ready=ready, says_where=number == 0)
+
+        def fell(pid: int) -> None:
+            for path in counts.glob(f"gauge_live*_{pid}.db"):  # what it had in hand it has no more
+                path.unlink(missing_ok=True)
+
+        code = supervise(settings.workers, work, fell=fell)
+    if code:
+        raise typer.Exit(code)
+
+
+@contextmanager
+def _shared_port(settings: "Settings") -> Iterator[int | None]:
+    """The port of gRPC, held for the workers, each of which listens on it; chosen by the system where it is 0."""
+    if settings.grpc_port is None:
+        yield None
+        return
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    with socket.socket(family) as holder:
+        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        try:
+            holder.bind((settings.host, settings.grpc_port))
+        except OSError as error:
+            raise _cannot_listen(settings.host, settings.grpc_port, error) from error
+        yield holder.getsockname()[1]
+
+
+def _answer(
+    settings: "Settings",
+    listener: socket.socket,
+    *,
+    choices: "Choices | None" = None,
+    ready: Callable[[], None] = lambda: None,
+    says_where: bool = True,
+) -> None:
+    """Open the maps and answer, in this process."""
     import uvicorn
 
     from service.cli.certificates import Certificates
@@ -106,28 +173,26 @@ def serve(settings: "Settings") -> None:
     from service.runtime.keys import KeyRing
     from service.runtime.logs import set_up
 
-    if not settings.maps:
-        raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
     set_up(style=settings.log_style, level=settings.log_level)
     keys = None if settings.api_keys is None else KeyRing.open(settings.api_keys)
     tls = None if settings.tls_certificate is None else Certificates.read(settings)
-    engine = Engine.open(settings)
+    engine = Engine.open(settings, choices=choices)
     try:
-        with _listen(settings.host, settings.port) as listener:
-            config = uvicorn.Config(
-                create_app(engine, keys), log_config=None, access_log=False, lifespan="off",
-                timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
-            )  # fmt: skip
-            with _grpc(engine, keys, tls) as (grpc_port, leave), _watching(engine):
-                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave)
-                # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
-                for number in (signal.SIGINT, signal.SIGTERM):
-                    signal.signal(number, server.handle_exit)
+        config = uvicorn.Config(
+            create_app(engine, keys), log_config=None, access_log=False, lifespan="off",
+            timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
+        )  # fmt: skip
+        with _grpc(engine, keys, tls) as (grpc_port, leave), _watching(engine):
+            server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave)
+            # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, server.handle_exit)
+            ready()
+            if says_where:
                 _say_where(engine.registry, listener, grpc_port, "http" if tls is None else "https")
-                server.run(sockets=[listener])
+            server.run(sockets=[listener])
     finally:
         engine.close()
-    typer.echo("stopped")
 
 
 @contextmanager
@@ -155,7 +220,7 @@ def _watching(engine: "Engine") -> Iterator[None]:
     """Mount new bundles inside: every so often, and on SIGHUP."""
     from service.runtime.map_watcher import MapWatcher
 
-    watcher = MapWatcher(engine.registry, engine.settings.maps, warm=engine.warm)
+    watcher = MapWatcher(engine.registry, engine.settings.maps, warm=engine.warm, after=engine.follow_choices)
     watcher.start(engine.settings.watch_s or threading.TIMEOUT_MAX)
     before = signal.signal(signal.SIGHUP, lambda *_: watcher.look_now()) if hasattr(signal, "SIGHUP") else None
     try:
@@ -171,9 +236,11 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port), family=family, backlog=_BACKLOG)
     except OSError as error:
-        raise AddressError(
-            f"cannot listen on {host}:{port} ({error.strerror}); choose another --host or --port"
-        ) from error
+        raise _cannot_listen(host, port, error) from error
+
+
+def _cannot_listen(host: str, port: int, error: OSError) -> AddressError:
+    return AddressError(f"cannot listen on {host}:{port} ({error.strerror}); choose another --host or --port")
 
 
 def _say_where(registry: "MapRegistry", listener: socket.socket, grpc_port: int | None, scheme: str) -> None:

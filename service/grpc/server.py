@@ -55,7 +55,7 @@ class GrpcServer:
             options=[
                 ("grpc.max_receive_message_length", settings.limits.max_request_bytes),
                 ("grpc.max_send_message_length", -1),
-                ("grpc.so_reuseport", 0),
+                ("grpc.so_reuseport", int(settings.workers > 1)),  # else a taken port would go unnoticed
                 ("grpc.keepalive_time_ms", 30_000),  # a robot that lost its link must not keep its stream
                 ("grpc.keepalive_timeout_ms", 10_000),
             ],

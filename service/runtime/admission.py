@@ -18,7 +18,14 @@ class Admission:
         self._lock = threading.Lock()
         self._taken = 0
         self._working = 0
+        self._told_working: Callable[[float], None] = lambda _: None
+        self._told_waiting: Callable[[float], None] = lambda _: None
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="streetfix", initializer=initializer)
+
+    def watch(self, working: Callable[[float], None], waiting: Callable[[float], None]) -> None:
+        """Tell the numbers of tasks at work and waiting whenever they change."""
+        self._told_working, self._told_waiting = working, waiting
+        self._tell()
 
     @property
     def working(self) -> int:
@@ -40,6 +47,7 @@ class Admission:
             if self._taken == self.capacity:
                 raise BusyError(f"{self.capacity} requests are being worked on or wait already; try again in a second")
             self._taken += 1
+            self._tell()
         # In a cell that is emptied when the work is over: a cancelled future stays in the pool's queue until a worker comes by, and
         # must not keep a request's pictures there.
         cell: list[Callable[[], T]] = [task]
@@ -64,12 +72,19 @@ class Admission:
     def _run(self, cell: list[Callable[[], T]]) -> T:
         with self._lock:
             self._working += 1
+            self._tell()
         try:
             return cell.pop()()
         finally:
             with self._lock:
                 self._working -= 1
+                self._tell()
 
     def _give_back(self) -> None:
         with self._lock:
             self._taken -= 1
+            self._tell()
+
+    def _tell(self) -> None:
+        self._told_working(self._working)
+        self._told_waiting(max(0, self._taken - self._working))

@@ -1,12 +1,15 @@
 """The composition root: settings in, a running engine out; every face calls this and nothing below it."""
 
+import logging
+import os
+import signal
 from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import RequestError, StreetfixError
+from service.errors import RequestError, StreetfixError, UnknownMapError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
 from service.localization.answer import Answer
@@ -16,10 +19,13 @@ from service.localization.prior import Prior
 from service.localization.query import Query
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
+from service.runtime.choices import Choices
 from service.runtime.map_registry import MapRegistry
 from service.runtime.metrics import Metrics
 from service.runtime.settings import Settings
 from service.runtime.threads import limit_pools, usable_cores
+
+_log = logging.getLogger("streetfix.engine")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,25 +66,56 @@ class Located:
 
 
 class Engine:
-    """Open maps and the workers that serve them."""
+    """Open maps and the threads that serve them.
 
-    def __init__(self, registry: MapRegistry, settings: Settings) -> None:
+    Args:
+        registry: of the maps.
+        settings: checked.
+        choices: shared with other processes that serve the same maps; None where there are none.
+    """
+
+    def __init__(self, registry: MapRegistry, settings: Settings, choices: Choices | None = None) -> None:
         self.registry = registry
         self.settings = settings
-        self.threads = settings.threads or usable_cores()
+        self._choices = choices
+        self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.metrics = Metrics(self.admission, registry)
         self.is_draining = False
 
     @classmethod
-    def open(cls, settings: Settings) -> "Engine":
+    def open(cls, settings: Settings, choices: Choices | None = None) -> "Engine":
         """Open all maps of the settings.
+
+        Args:
+            settings: checked.
+            choices: as of the engine.
 
         Raises:
             BundleError: a map is missing, damaged or mismatched.
         """
         limit_pools()
-        return cls(MapRegistry.open(settings.maps), settings)
+        return cls(MapRegistry.open(settings.maps), settings, choices)
+
+    def serve_version(self, name: str, version: str) -> Localizer:
+        """Let another open version of a map serve, in every worker.
+
+        Raises:
+            UnknownMapError: no such map or version is open.
+        """
+        served = self.registry.serve(name, version)
+        if self._choices is not None:
+            self._choices.choose(name, version)
+            os.kill(os.getppid(), signal.SIGHUP)  # the parent passes it on, and every worker looks
+        return served
+
+    def follow_choices(self) -> None:
+        """Let those versions serve that were chosen in other workers."""
+        for name, version in () if self._choices is None else self._choices.news():
+            try:
+                self.registry.serve(name, version)
+            except UnknownMapError:  # taken out meanwhile
+                _log.warning("choice_not_open name=%s version=%s", name, version)
 
     @property
     def is_ready(self) -> bool:

@@ -22,12 +22,21 @@ class MapWatcher:
         registry: where bundles are mounted.
         paths: bundles, or folders that hold some, as the service was started with.
         warm: called with every new map before it serves, so that its first request is no slower than the next.
+        after: called after every look.
     """
 
-    def __init__(self, registry: MapRegistry, paths: Sequence[Path], *, warm: Callable[[Localizer], None]) -> None:
+    def __init__(
+        self,
+        registry: MapRegistry,
+        paths: Sequence[Path],
+        *,
+        warm: Callable[[Localizer], None],
+        after: Callable[[], None] = lambda: None,
+    ) -> None:
         self._registry = registry
         self._paths = tuple(paths)
         self._warm = warm
+        self._after = after
         self._stop, self._told = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._seen: dict[Path, Stamp] = {}
@@ -90,6 +99,7 @@ class MapWatcher:
             self._told.clear()
             try:
                 self.scan(drop_missing=told)
+                self._after()
             except Exception:  # a defect here must not end the watching, nor the service
                 _log.exception("map_scan_failed")
 

@@ -1,11 +1,13 @@
 """What an operator watches, for Prometheus; nothing of a request but its figures."""
 
+import os
 from collections.abc import Iterable, Iterator
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.gc_collector import GCCollector
+from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
@@ -22,7 +24,9 @@ _STAGES = ("decode", "fuse", "encode", "search", "register")
 
 
 class Metrics:
-    """Counters and histograms of one process, with a registry of their own.
+    """Counters and histograms with a registry of their own: of one process, or of all workers of a service together.
+
+    Which of the two is Prometheus' client library's own setting, an environment variable that `serve --workers` sets.
 
     Args:
         admission: whose queue is watched.
@@ -31,9 +35,16 @@ class Metrics:
 
     def __init__(self, admission: Admission, maps: MapRegistry) -> None:
         self._registry = CollectorRegistry()
-        for collector in (ProcessCollector, PlatformCollector, GCCollector):
-            collector(registry=self._registry)
-        self._registry.register(_Now(admission, maps))
+        self._maps = _Maps(maps)
+        self._is_one_of_several = "PROMETHEUS_MULTIPROC_DIR" in os.environ
+        if not self._is_one_of_several:
+            for collector in (ProcessCollector, PlatformCollector, GCCollector):
+                collector(registry=self._registry)
+            self._registry.register(self._maps)
+        working = self._gauge("streetfix_working", "Requests that a thread works on now.")
+        waiting = self._gauge("streetfix_waiting", "Requests that wait for a thread.")
+        self._gauge("streetfix_capacity", "Requests that may be worked on or wait at once.").set(admission.capacity)
+        admission.watch(working.set, waiting.set)
         self._requests = Counter(
             "streetfix_requests",
             "Requests answered, by what became of them.",
@@ -62,6 +73,10 @@ class Metrics:
             registry=self._registry,
         )
 
+    def _gauge(self, name: str, what: str) -> Gauge:
+        """Of several processes the sum over those that live."""
+        return Gauge(name, what, registry=self._registry, multiprocess_mode="livesum")
+
     def answered(self, answer: Answer, bundle: MapBundle, *, frames: int) -> None:
         """Count an answer and its stages."""
         self._answers.labels(bundle.name, answer.status).inc()
@@ -86,22 +101,22 @@ class Metrics:
 
     def text(self) -> bytes:
         """In Prometheus' text format."""
-        return generate_latest(self._registry)
+        if not self._is_one_of_several:
+            return generate_latest(self._registry)
+        together = CollectorRegistry()
+        MultiProcessCollector(together)  # type: ignore[no-untyped-call]  # the library leaves it untyped
+        together.register(self._maps)
+        return generate_latest(together)
 
 
-class _Now(Collector):
-    """What is true at the moment of asking."""
+class _Maps(Collector):
+    """What is mounted at the moment of asking."""
 
-    def __init__(self, admission: Admission, maps: MapRegistry) -> None:
-        self._admission = admission
+    def __init__(self, maps: MapRegistry) -> None:
         self._maps = maps
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        """Queue and maps."""
-        admission = self._admission
-        yield _gauge("streetfix_working", "Requests that a worker runs now.", admission.working)
-        yield _gauge("streetfix_waiting", "Requests that wait for a worker.", admission.waiting)
-        yield _gauge("streetfix_capacity", "Requests that may be worked on or wait at once.", admission.capacity)
+        """The version that serves of each map."""
         maps = GaugeMetricFamily(
             "streetfix_map", "Mounted maps; the value is their number of places.", labels=["map", "version"]
         )
@@ -113,12 +128,6 @@ class _Now(Collector):
     def describe(self) -> Iterable[GaugeMetricFamily]:
         """Nothing that could clash."""
         return ()
-
-
-def _gauge(name: str, what: str, value: float) -> GaugeMetricFamily:
-    family = GaugeMetricFamily(name, what)
-    family.add_metric([], value)
-    return family
 
 
 def _milliseconds(timings: Timings, stage: str) -> float:

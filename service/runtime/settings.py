@@ -62,8 +62,16 @@ class Settings(BaseSettings):
     grace_s: float = Field(
         20.0, ge=0, le=3600, description="how long running requests may take to end when the service stops"
     )
-    threads: int | None = Field(None, ge=1, le=256, description="requests worked on at once; default: the usable cores")
-    queue: int = Field(64, ge=0, le=100_000, description="requests that may wait for a thread before 503")
+    workers: int = Field(
+        1, ge=1, le=64, description="processes that answer on the same ports; maps are in memory once for all of them"
+    )
+    threads: int | None = Field(
+        None,
+        ge=1,
+        le=256,
+        description="requests that a process works on at once; default: its share of the usable cores",
+    )
+    queue: int = Field(64, ge=0, le=100_000, description="requests that may wait in a process before 503")
     request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
     false_accept_rate: float = Field(
         FALSE_ACCEPT_RATE, gt=0, lt=1,

@@ -64,7 +64,7 @@ def router_for(engine: Engine) -> APIRouter:
         require_operator(request, engine.settings)
         async with asyncio.timeout(engine.settings.request_timeout_s):
             wanted = parsed(bytes(await read_body(request, max_bytes=_MOST_BYTES)), schema.ServeVersion)
-        served = engine.registry.serve(map, wanted.version)
+        served = engine.serve_version(map, wanted.version)
         return map_entry_from(served.bundle, engine.registry.versions(map))
 
     @router.get(

@@ -109,7 +109,7 @@ def test_more_disagreement_means_more_variance_in_every_direction(information, s
 @given(informations, informations, noises)
 def test_more_information_of_patches_that_agree_means_less_variance_in_every_direction(information, more, noise):
     gained = covariance_of(information, NONE, noise) - covariance_of(information + more, NONE, noise)
-    assert np.linalg.eigvalsh(gained).min() > -1e-8 * max(1.0, gained.max())
+    assert np.linalg.eigvalsh(gained).min() > -1e-6 * max(1.0, gained.max())  # a rank of one, a million times the prior
 
 
 @pytest.mark.parametrize("patches", [0.0, 1.0, 30.0])

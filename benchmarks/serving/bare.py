@@ -1,0 +1,74 @@
+"""The bare pipeline: decode, fuse, encode, search, register in a loop, with nothing round it. What a service is compared with.
+
+``python -m benchmarks.serving.bare BUNDLE DATASET QUERIES PAIRS`` opens everything, then does what each line on its input says -
+``full SECONDS`` or ``retrieval SECONDS``, with ``fast`` for the cheapest depth encoding - and answers with a line of JSON.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from service.runtime.threads import limit_pools, limit_pools_before_import
+
+limit_pools_before_import()
+
+from numpy.typing import NDArray  # noqa: E402  # after the pools' limits
+
+from model_training.datasets.dataset import Dataset, QueryFrame  # noqa: E402  # after the pools' limits
+from service.imaging.decode import decode_depth, decode_rgb  # noqa: E402
+from service.imaging.depth_formats import read_depth_values, write_raw16  # noqa: E402
+from service.imaging.picture_headers import DEFAULT_LIMITS  # noqa: E402
+from service.localization.encoder import Encoder  # noqa: E402
+from service.localization.localizer import Localizer  # noqa: E402
+from service.localization.query import Query  # noqa: E402
+from service.maps.reader import MapBundle  # noqa: E402
+
+
+def main() -> None:
+    """Open, then obey."""
+    bundle, folder, queries, pairs = sys.argv[1:]
+    limit_pools()
+    opened = MapBundle.open(Path(bundle))
+    localizer = Localizer(opened, Encoder.open(opened.encoder_bytes()))
+    frames = list(Dataset(Path(folder)).queries(queries))
+    chosen = frames[:: max(1, len(frames) // int(pairs))][: int(pairs)]
+    slow = [(each, each.rgb_path.read_bytes(), each.depth_path.read_bytes()) for each in chosen]
+    fast = [(each, rgb, write_raw16(_values(each))) for each, rgb, _ in slow]
+    for refine in (True, False):
+        for each in slow[:5]:
+            ask(localizer, *each, refine=refine)
+    print(json.dumps({"ready": True}), flush=True)
+    for line in sys.stdin:
+        words = line.split()
+        given = fast if "fast" in words else slow
+        done, began, cpu = 0, time.perf_counter(), time.process_time()
+        while time.perf_counter() - began < float(words[1]):
+            ask(localizer, *given[done % len(given)], refine=words[0] == "full")
+            done += 1
+        spent = time.process_time() - cpu
+        told = {"cpu_ms": 1e3 * spent / done, "per_s": done / (time.perf_counter() - began), "n": done}
+        print(json.dumps(told), flush=True)
+
+
+def ask(localizer: Localizer, frame: QueryFrame, rgb: bytes, depth: bytes, *, refine: bool) -> None:
+    """One request's work."""
+    camera, spec = frame.camera.pinhole(), frame.camera.depth
+    localizer.localize(
+        Query(
+            rgb=decode_rgb(rgb), camera=camera, refine=refine,
+            depth_m=decode_depth(
+                depth, camera=camera, scale_m=spec.scale_m, kind=spec.kind, baseline_m=spec.baseline_m,
+                max_range_m=spec.max_range_m,
+            ),
+        )
+    )  # fmt: skip
+
+
+def _values(frame: QueryFrame) -> NDArray[Any]:
+    return read_depth_values(frame.depth_path.read_bytes(), encoding=None, limits=DEFAULT_LIMITS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Overload, swaps and the end of the service while others ask."""
+
+import itertools
+import json
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+from benchmarks.report import Report
+from benchmarks.serving.loads import closed, load, opened
+from benchmarks.serving.machines import Server
+from benchmarks.serving.ratios import MANY, Site
+from model_training.loadtest.drive import Load
+from service.maps.manifest import FILE as MANIFEST_FILE
+
+SWAPS = 50
+
+
+def overload_rows(report: Report, site: Site, *, seconds: float, core: int | None) -> None:
+    """Full requests at five times the rate that saturates: what is answered, how fast the rest is refused, and health meanwhile."""
+    sent = site.payloads(refine=True)
+    threads = {} if core is None else {"threads": 1}
+    with Server(site.bundle, core=core, **threads) as server:
+        peak, _ = load(server, "rest", sent, closed(20, MANY))
+        with _health(server.url) as waited_ms:
+            found, _ = load(server, "rest", sent, opened(seconds, 5 * peak.answered_per_s))
+    report.row("overload.peak_per_s", peak.answered_per_s, "1/s")
+    report.row("overload.offered_per_s", found.offered_per_s, "1/s")
+    report.row("overload.goodput_over_peak", found.answered_per_s / peak.answered_per_s, "ratio", bar=0.95)
+    refused = {code: count for code, count in found.errors.items() if code != "503"}
+    report.row("overload.refusal_p99_ms", found.refused_ms.get("p99"), "ms", bar=50, better="lower", n=found.errors.get("503", 0),
+               why=f"not refused but failed: {refused}" if refused else None)  # fmt: skip
+    report.row(
+        "overload.health_p99_ms", float(np.percentile(waited_ms, 99)), "ms", bar=50, better="lower", n=len(waited_ms)
+    )
+
+
+@contextmanager
+def _health(url: str) -> Iterator[list[float]]:
+    """Both health endpoints, twenty times a second, on connections of their own; a failure counts as 10 s."""
+    waited_ms: list[float] = []
+    over = threading.Event()
+
+    def ask() -> None:
+        with httpx.Client(base_url=url, timeout=10) as client:
+            for path in itertools.cycle(("/livez", "/readyz")):
+                if over.is_set():
+                    return
+                began = time.perf_counter()
+                try:
+                    good = client.get(path).status_code == 200
+                except httpx.HTTPError:
+                    good = False
+                waited_ms.append(1e3 * (time.perf_counter() - began) if good else 10_000.0)
+                over.wait(0.05)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        yield waited_ms
+    finally:
+        over.set()
+        thread.join()
+
+
+def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
+    """Fifty new versions of the map, one after the other, each mounted on SIGHUP while four clients ask."""
+    sent = site.payloads(refine=True)
+    with tempfile.TemporaryDirectory(dir=site.bundle.parent) as name:
+        folder = Path(name)
+        newest = _version_of(site.bundle, folder, 0)
+        with Server(folder, core=core) as server:
+            failed, answers, stop = [], [], threading.Event()
+            clients = [
+                threading.Thread(
+                    target=_ask_until, args=(server.url, sent[k].body, sent[k].content_type, stop, answers, failed)
+                )
+                for k in range(4)
+            ]
+            for client in clients:
+                client.start()
+            for number in range(1, SWAPS + 1):
+                oldest, newest = newest, _version_of(site.bundle, folder, number)
+                server.process.send_signal(signal.SIGHUP)
+                _until_served(server.url, f"bench-{number}")
+                shutil.rmtree(oldest)
+            stop.set()
+            for client in clients:
+                client.join()
+    versions = set(answers)
+    report.row("swap.versions_that_answered", len(versions), "count")
+    report.row("swap.failed_requests", len(failed), "count", bar=0, better="lower", n=len(answers) + len(failed),
+               why=f"first: {failed[0]}" if failed else None)  # fmt: skip
+
+
+def _version_of(bundle: Path, folder: Path, number: int) -> Path:
+    """The same map as another version; files are linked, the manifest is its own."""
+    part, out = folder / f".part-{number}", folder / f"v{number}"
+    shutil.copytree(bundle, part, copy_function=lambda a, b: Path(b).hardlink_to(a))
+    manifest = json.loads((part / MANIFEST_FILE).read_text())
+    manifest |= {"version": f"bench-{number}", "made_at": datetime.now(UTC).isoformat()}
+    (part / MANIFEST_FILE).unlink()
+    (part / MANIFEST_FILE).write_text(json.dumps(manifest))
+    part.rename(out)
+    return out
+
+
+def _until_served(url: str, version: str) -> None:
+    until = time.monotonic() + 120
+    while httpx.get(f"{url}/v1/maps", timeout=60).json()["maps"][0]["version"] != version:
+        if time.monotonic() > until:
+            raise RuntimeError(f"version {version} is not served")
+        time.sleep(0.02)
+
+
+def _ask_until(
+    url: str, body: bytes, content_type: str, stop: threading.Event, answers: list[str], failed: list[str]
+) -> None:
+    with httpx.Client(base_url=url, timeout=60) as client:
+        while not stop.is_set():
+            try:
+                found = client.post("/v1/localize", content=body, headers={"Content-Type": content_type})
+            except httpx.HTTPError as error:
+                failed.append(repr(error))
+                continue
+            if found.status_code == 200:
+                answers.append(found.json()["map"]["version"])
+            else:
+                failed.append(f"{found.status_code} {found.text[:200]}")
+
+
+def sigterm_rows(report: Report, site: Site, *, core: int | None) -> None:
+    """Clients that stop asking when readiness goes, as a balancer's do; every request before that is answered."""
+    sent, answers, failed, stop = site.payloads(refine=True), list[str](), list[str](), threading.Event()
+    with Server(site.bundle, core=core, drain_s=3) as server:
+        clients = [
+            threading.Thread(
+                target=_ask_until, args=(server.url, sent[k].body, sent[k].content_type, stop, answers, failed)
+            )
+            for k in range(4)
+        ]
+        for client in clients:
+            client.start()
+        time.sleep(3)
+        server.process.send_signal(signal.SIGTERM)
+        with httpx.Client(base_url=server.url, timeout=10) as watcher:
+            while watcher.get("/readyz").status_code == 200:
+                time.sleep(0.05)
+        stop.set()
+        for client in clients:
+            client.join()
+        code = server.process.wait(60)
+    report.row("sigterm.failed_requests", len(failed), "count", bar=0, better="lower", n=len(answers) + len(failed),
+               why=f"first: {failed[0]}" if failed else None)  # fmt: skip
+    report.row("sigterm.exit_code", code, "count", bar=0, better="lower")
+
+
+def soak_rows(report: Report, site: Site, *, minutes: float, core: int | None) -> None:
+    """Memory over time at 80 % of the rate that saturates; the first sixth is warm-up."""
+    sent = site.payloads(refine=True)
+    threads = {} if core is None else {"threads": 1}
+    with Server(site.bundle, core=core, **threads) as server:
+        peak, _ = load(server, "rest", sent, closed(15, MANY))
+        at_s, resident = [], []
+        over = threading.Event()
+
+        def watch() -> None:
+            began = time.monotonic()
+            while not over.wait(5.0):
+                at_s.append(time.monotonic() - began)
+                resident.append(server.used.resident_mib)
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        how = Load(rate=0.8 * peak.answered_per_s, warm_up_s=0.0, duration_s=60 * minutes)
+        found, _ = load(server, "rest", sent, how)
+        over.set()
+        watcher.join()
+    late = np.array(at_s) >= 10 * minutes
+    slope = float(np.polyfit(np.array(at_s)[late] / 3600, np.array(resident)[late], 1)[0])
+    report.row("soak.slope_mib_per_hour", slope, "MiB/h", bar=5, better="lower", n=found.answers,
+               why=None if minutes >= 30 else f"of {minutes:g} minutes only")  # fmt: skip
+    report.row("soak.failed_requests", sum(found.errors.values()), "count", n=found.answers)

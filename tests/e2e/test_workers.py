@@ -1,0 +1,146 @@
+"""Several processes on the same ports: one falls, the others answer; what one is told, all do; what all count is one number."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from model_training.loadtest.processes import descendants
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+from service.maps.content import BundleContent
+from service.maps.writer import write_bundle
+
+COMMAND = [sys.executable, "-c", "from service.cli.main import main; main()", "serve"]
+Parts = Callable[..., dict[str, bytes]]
+WORKERS = 2
+
+
+class Service:
+    def __init__(self, folder: Path) -> None:
+        self.process = subprocess.Popen(
+            [*COMMAND, str(folder), "--workers", str(WORKERS), "--port", "0", "--grpc-port", "0"], text=True,
+            env={"PATH": ""}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        found: dict[str, str] = {}
+        for line in self.process.stdout or ():
+            if match := re.search(r"serving( gRPC)? at (\S+)", line):
+                found["grpc" if match[1] else "url"] = match[2]
+                if "url" in found:
+                    break
+        self.url, self.grpc = found["url"], found["grpc"]
+        until = time.monotonic() + 60
+        while len(self.workers) < WORKERS:
+            assert time.monotonic() < until
+        self.until(lambda: self.metric("streetfix_capacity") == WORKERS * (1 + 64))
+
+    @property
+    def workers(self) -> set[int]:
+        return descendants(self.process.pid) - {self.process.pid}
+
+    def metric(self, name: str, **labels: str) -> float:
+        """Sum over samples of a name that have these labels."""
+        text = httpx.get(f"{self.url}/metrics", timeout=30).text
+        samples = [each for family in text_string_to_metric_families(text) for each in family.samples]
+        return sum(s.value for s in samples if s.name == name and labels.items() <= s.labels.items())
+
+    @staticmethod
+    def until(true: Callable[[], bool]) -> None:
+        end = time.monotonic() + 60
+        while not true():
+            assert time.monotonic() < end
+            time.sleep(0.05)
+
+
+@pytest.fixture
+def folder(content_of: Callable[..., BundleContent], tmp_path: Path) -> Path:
+    write_bundle(tmp_path / "maps" / "v0", content_of(seed=0))
+    return tmp_path / "maps"
+
+
+@pytest.fixture
+def service(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
+    monkeypatch.setenv("STREETFIX_THREADS", "1")
+    running = Service(folder)
+    yield running
+    if running.process.poll() is None:
+        running.process.send_signal(signal.SIGTERM)
+    running.process.communicate(timeout=60)
+
+
+def post(url: str, parts: dict[str, bytes]) -> httpx.Response:
+    return httpx.post(f"{url}/v1/localize", files={name: (name, data) for name, data in parts.items()}, timeout=30)
+
+
+def test_a_worker_that_falls_is_started_again_and_the_others_answer_meanwhile(
+    service: Service, parts_of: Parts
+) -> None:
+    before = service.workers
+    os.kill(min(before), signal.SIGKILL)
+    assert {post(service.url, parts_of()).status_code for _ in range(6)} == {200}
+    service.until(lambda: len(service.workers) == WORKERS and service.workers != before)
+    service.until(lambda: service.metric("streetfix_capacity") == WORKERS * (1 + 64))
+    assert post(service.url, parts_of()).status_code == 200
+    service.process.send_signal(signal.SIGTERM)
+    _, told = service.process.communicate(timeout=60)
+    assert service.process.returncode == 0
+    assert "ended by itself and is started again" in told
+
+
+def test_all_workers_count_together(service: Service, parts_of: Parts) -> None:
+    assert {post(service.url, parts_of()).status_code for _ in range(8)} == {200}
+    assert service.metric("streetfix_answers_total") == 8
+    assert service.metric("streetfix_stage_seconds_count", stage="decode") == 8
+    assert service.metric("streetfix_working") == service.metric("streetfix_waiting") == 0
+    assert service.metric("streetfix_map") > 0
+
+
+def test_both_faces_answer_on_one_port_each(service: Service, parts_of: Parts) -> None:
+    with grpc.insecure_channel(service.grpc) as channel:
+        maps = LocalizationServiceStub(channel).ListMaps(pb.ListMapsRequest(), timeout=30).maps
+    assert [each.name for each in maps] == [each["name"] for each in httpx.get(f"{service.url}/v1/maps").json()["maps"]]
+
+
+def test_a_version_that_an_operator_chooses_serves_in_every_worker(
+    service: Service, folder: Path, content_of: Callable[..., BundleContent]
+) -> None:
+    def entry() -> dict[str, Any]:
+        (found,) = httpx.get(f"{service.url}/v1/maps", timeout=30).json()["maps"]
+        return dict(found)
+
+    old = entry()
+    write_bundle(folder / "v1", content_of(seed=1))
+    service.process.send_signal(signal.SIGHUP)
+    # New connections come to either worker: so many in a row are those of both.
+    service.until(lambda: all(entry()["version"] != old["version"] for _ in range(12)))
+    done = httpx.put(f"{service.url}/v1/maps/{old['name']}/serving", json={"version": old["version"]}, timeout=30)
+    assert done.status_code == 200
+    service.until(lambda: all(entry()["version"] == old["version"] for _ in range(12)))
+
+
+def test_workers_leave_with_their_parent(service: Service) -> None:
+    workers = service.workers
+    service.process.kill()
+    service.process.wait(30)
+    service.until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
+
+
+def test_a_map_that_cannot_be_opened_ends_the_service_with_its_message(folder: Path) -> None:
+    (folder / "v0" / "manifest.json").write_text("{}")
+    done = subprocess.run(
+        [*COMMAND, str(folder), "--workers", "2", "--port", "0"], env={"PATH": ""}, capture_output=True, text=True, timeout=60,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "manifest.json" in done.stderr
+    assert "Traceback" not in done.stderr
