@@ -1,7 +1,6 @@
 """Overload, swaps and the end of the service while others ask."""
 
 import itertools
-import json
 import shutil
 import signal
 import tempfile
@@ -21,6 +20,7 @@ from benchmarks.serving.machines import Server
 from benchmarks.serving.ratios import MANY, Site
 from model_training.loadtest.drive import Load
 from service.maps.manifest import FILE as MANIFEST_FILE
+from service.maps.manifest import read_manifest
 
 SWAPS = 50
 
@@ -77,7 +77,7 @@ def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
     sent = site.payloads(refine=True)
     with tempfile.TemporaryDirectory(dir=site.bundle.parent) as name:
         folder = Path(name)
-        newest = _version_of(site.bundle, folder, 0)
+        newest, _ = _version_of(site.bundle, folder, 0)
         with Server(folder, core=core) as server:
             failed, answers, stop = [], [], threading.Event()
             clients = [
@@ -89,9 +89,10 @@ def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
             for client in clients:
                 client.start()
             for number in range(1, SWAPS + 1):
-                oldest, newest = newest, _version_of(site.bundle, folder, number)
+                oldest = newest
+                newest, version = _version_of(site.bundle, folder, number)
                 server.process.send_signal(signal.SIGHUP)
-                _until_served(server.url, f"bench-{number}")
+                _until_served(server.url, version)
                 shutil.rmtree(oldest)
             stop.set()
             for client in clients:
@@ -102,16 +103,17 @@ def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
                why=f"first: {failed[0]}" if failed else None)  # fmt: skip
 
 
-def _version_of(bundle: Path, folder: Path, number: int) -> Path:
+def _version_of(bundle: Path, folder: Path, number: int) -> tuple[Path, str]:
     """The same map as another version; files are linked, the manifest is its own."""
     part, out = folder / f".part-{number}", folder / f"v{number}"
     shutil.copytree(bundle, part, copy_function=lambda a, b: Path(b).hardlink_to(a))
-    manifest = json.loads((part / MANIFEST_FILE).read_text())
-    manifest |= {"version": f"bench-{number}", "made_at": datetime.now(UTC).isoformat()}
-    (part / MANIFEST_FILE).unlink()
-    (part / MANIFEST_FILE).write_text(json.dumps(manifest))
+    manifest = (
+        read_manifest(part).model_copy(update={"made_at": datetime.now(UTC), "licence": f"bench {number}"}).stamped()
+    )
+    (part / MANIFEST_FILE).unlink()  # a link: the map's own must stay
+    (part / MANIFEST_FILE).write_bytes(manifest.to_bytes())
     part.rename(out)
-    return out
+    return out, manifest.version
 
 
 def _until_served(url: str, version: str) -> None:

@@ -17,7 +17,7 @@ from service.maps.calibration import (
 )
 
 RIGHT_M = 1.0
-RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.05, 0.1)
+RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
 #: Strength of the ridge, in queries; the one that lost least when each city was predicted from the other.
 RIDGE = 3.0
 

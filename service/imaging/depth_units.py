@@ -16,6 +16,8 @@ Depth = Float32[NDArray[np.float32], "H W"]
 
 #: Metres for each value of CARLA's 24-bit depth: its far plane lies at 1000 m.
 CARLA_SCALE_M = 1000 / (2**24 - 1)
+#: What is said to be nearer or further away, no camera has seen: it is no measurement, and squares and inverses stay numbers.
+LEAST_M, MOST_M = 1e-4, 1e6
 #: Metres for each value of a 16-bit picture where the request names no scale: millimetres, as RGB-D cameras write.
 INTEGER_SCALE_M = 0.001
 
@@ -57,8 +59,11 @@ def depth_from_values(
             depth = np.divide(np.float32(scaled.fx * baseline_m), depth)
         elif kind == "z" and np.issubdtype(values.dtype, np.unsignedinteger):
             # What is stored is finite, not negative, and 0 where nothing was measured.
-            return depth if max_range_m is None else np.where(depth <= max_range_m, depth, np.float32(0))
-        usable = np.isfinite(depth) & (depth > 0)
+            limit_m = MOST_M if max_range_m is None else min(max_range_m, MOST_M)
+            if scale_m >= LEAST_M and float(np.iinfo(values.dtype).max) * scale_m <= limit_m:
+                return depth
+            return np.where((depth >= LEAST_M) & (depth <= limit_m), depth, np.float32(0))
+        usable = np.isfinite(depth) & (depth >= LEAST_M) & (depth <= MOST_M)
         if max_range_m is not None:
             usable &= depth <= max_range_m
         if kind == "range":

@@ -12,7 +12,7 @@ from service.localization.prior import Prior
 
 MOST_NEIGHBOURS = 50
 #: Of calibration's strangers, whatever their kind; at this rate an answer is accepted that is about as likely right as not.
-FALSE_ACCEPT_RATE = 0.01
+FALSE_ACCEPT_RATE = 0.03
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,0 +1,274 @@
+"""What is handed bytes from outside: each target takes any bytes, and only our own errors may come of them."""
+
+import contextlib
+import hashlib
+import json
+import shutil
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from google.protobuf.message import DecodeError as ProtoError
+from pydantic import ValidationError
+
+from service.contract import schema
+from service.contract.convert import parsed, query_from, sequence_from
+from service.contract.oscp import GeoPoseRequest, query_of
+from service.errors import StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.messages import request_from, sequence_request_from
+from service.http.body import split_multipart
+from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
+from service.imaging.depth_formats import write_raw16
+from service.imaging.depth_units import depth_from_values
+from service.localization.localizer import Localizer
+from service.localization.query import Query
+from service.maps.manifest import FILE as MANIFEST_FILE
+from service.maps.manifest import Manifest, read_manifest
+from service.maps.reader import MapBundle
+
+LIMITS = ImageLimits(max_bytes=2**20, max_pixels=2**20)
+CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+_DOCUMENT = {
+    "camera": {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [0, 0]},
+    "depth": {"scale_m": 0.001, "kind": "disparity", "encoding": "auto", "baseline_m": 0.12, "max_range_m": 40},
+    "gravity": {"x": 0, "y": 9.8, "z": 0.1}, "map": "tiny@1", "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.01},
+    "prior": {"position": {"x": 1, "y": 2, "std_m": 3}, "heading_deg": 10, "heading_std_deg": 20},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Target:
+    """One.
+
+    Attributes:
+        take: what is done with the bytes; it raises what is no error of ours.
+        seeds: good bytes, which the fuzzer changes.
+        share: of all inputs; what is slow gets fewer.
+    """
+
+    take: Callable[[bytes], object]
+    seeds: tuple[bytes, ...]
+    share: float
+
+
+def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
+    """All of them.
+
+    Args:
+        bundle: a small map that opens.
+        scratch: folder for damaged copies of it.
+    """
+    rng = np.random.default_rng(0)
+    depth = (rng.integers(0, 4, (48, 64)) * 1000 + 2000).astype(np.uint16)
+    rgb = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    request = json.dumps(_DOCUMENT).encode()
+    frame = {key: value for key, value in _DOCUMENT.items() if key in ("camera", "depth", "gravity")}
+    T = {"position": {"x": 0, "y": 0, "z": -1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+    sequence = json.dumps({"frames": [frame, frame | {"T_reference_camera": T}]}).encode()
+    multipart = b"--b\r\n" + b"\r\n--b\r\n".join(
+        f'Content-Disposition: form-data; name="{name}"; filename="x"\r\n\r\n'.encode() + data
+        for name, data in (("rgb", b"123"), ("depth", b"456"), ("request", b"{}"))
+    ) + b"\r\n--b--\r\n"  # fmt: skip
+    return {
+        "multipart": Target(_multipart, (multipart,), 0.30),
+        "request_json": Target(_request, (request,), 0.18),
+        "sequence_json": Target(_sequence, (sequence,), 0.06),
+        "oscp_json": Target(_oscp, (_oscp_seed(),), 0.06),
+        "grpc_request": Target(_grpc, (_grpc_seed(),), 0.15),
+        "depth": Target(_depth, (*_depth_seeds(depth),), 0.14),
+        "depth_png_rows": Target(_png_rows, (_rows_of(depth[:12, :16]),), 0.05),
+        "colour": Target(lambda data: decode_rgb(data, limits=LIMITS), (*_colour_seeds(rgb),), 0.04),
+        "bundle": Target(_bundle_of(bundle, scratch), (b"\x00\x00\x00\x00", b"\x05\x00\x00\x00"), 0.005),
+        "pictures": Target(
+            _pictures_of(bundle),
+            (struct.pack("<6d", 32, 32, 31.5, 23.5, 9.8, 0.1) + _tiny_query().depth_m.tobytes(),),
+            0.015,
+        ),
+    }
+
+
+def survives(take: Callable[[bytes], object], data: bytes) -> None:
+    """Do it; our own errors are answers."""
+    with contextlib.suppress(StreetfixError):
+        take(data)
+
+
+def _multipart(data: bytes) -> None:
+    first, _, rest = data.partition(b"\n")
+    kind = "multipart/form-data; boundary=b" if data.startswith(b"--b") else first.decode("latin-1")[:200]
+    split_multipart(bytearray(data if data.startswith(b"--b") else rest), kind, max_parts=8)
+
+
+def _request(data: bytes) -> None:
+    query_from(parsed(data, schema.LocalizeRequest), rgb=b"", depth=b"")
+
+
+def _sequence(data: bytes) -> None:
+    request = parsed(data, schema.SequenceRequest)
+    sequence_from(request, [(b"", b"")] * len(request.frames))
+
+
+def _oscp(data: bytes) -> None:
+    with contextlib.suppress(ValidationError):  # the route turns it into a problem
+        query_of(parsed(data, GeoPoseRequest), None)
+
+
+def _grpc(data: bytes) -> None:
+    with contextlib.suppress(ProtoError):
+        query_from(request_from(pb.LocalizeRequest.FromString(data)), rgb=b"", depth=b"")
+    with contextlib.suppress(ProtoError):
+        request = sequence_request_from(pb.LocalizeSequenceRequest.FromString(data))
+        sequence_from(request, [(b"", b"")] * len(request.frames))
+
+
+def _depth(data: bytes) -> None:
+    """The first byte says how it is to be read."""
+    if not data:
+        return
+    how, data = data[0], data[1:]
+    kind = ("z", "range", "disparity")[how % 3]
+    decode_depth(
+        data, camera=CAMERA, encoding="carla" if how & 8 else None, scale_m=0.001 if how & 16 else None, kind=kind,  # type: ignore[arg-type]
+        baseline_m=0.1, max_range_m=40.0 if how & 32 else None, limits=LIMITS,
+    )  # fmt: skip
+
+
+def _depth_seeds(depth: np.ndarray) -> list[bytes]:
+    metres = (depth / 1000).astype(np.float32)
+    npy = (
+        b"\x93NUMPY\x01\x00"
+        + struct.pack("<H", 118)
+        + b"{'descr': '<f4', 'fortran_order': False, 'shape': (48, 64), }".ljust(117)
+        + b"\n"
+    )
+    colour = np.dstack([depth & 255, depth >> 8, 0 * depth]).astype(np.uint8)
+    good = [
+        (b"\x00", _encoded(".png", depth)), (b"\x30", _encoded(".tiff", metres)), (b"\x01", npy + metres.tobytes()),
+        (b"\x02", write_raw16(depth)), (b"\x08", _encoded(".png", colour)),
+    ]  # fmt: skip
+    return [how + data for how, data in good]
+
+
+def _colour_seeds(rgb: np.ndarray) -> list[bytes]:
+    return [_encoded(name, rgb) for name in (".jpg", ".png", ".webp")]
+
+
+def _encoded(name: str, picture: np.ndarray) -> bytes:
+    return cv2.imencode(name, picture)[1].tobytes()
+
+
+def _rows_of(depth: np.ndarray) -> bytes:
+    height, width = depth.shape
+    return struct.pack(">BB", height, width) + b"".join(
+        bytes([y % 5]) + depth[y].astype(">u2").tobytes() for y in range(height)
+    )
+
+
+def _png_rows(data: bytes) -> None:
+    """Rows behind right checksums, where changed files do not come."""
+    if len(data) < 2:
+        return
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", data[1], data[0], 16, 0, 0, 0, 0)
+    png = (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data[2:], 1)) + chunk(b"IEND", b"")
+    )
+    decode_depth(png, camera=CAMERA, limits=LIMITS)
+
+
+def _oscp_seed() -> bytes:
+    camera = {"sensorId": "c", "timestamp": 1, "privacy": {}, "sequenceNumber": 1, "imageFormat": "RGBA32", "size": [64, 48],
+              "imageBytes": "AAAA", "params": {"model": "PINHOLE", "modelParams": [32, 32, 31.5, 23.5]}}  # fmt: skip
+    depth = camera | {"imageFormat": "DEPTH", "sensorId": "d"}
+    readings = {"cameraReadings": [camera, depth], "accelerometerReadings": [{"x": 0, "y": 9.8, "z": 0}]}
+    return json.dumps(
+        {"id": "1", "timestamp": "1", "type": "geopose", "sensors": [], "sensorReadings": readings}
+    ).encode()
+
+
+def _grpc_seed() -> bytes:
+    message = pb.LocalizeRequest(
+        rgb=b"1", depth=b"2", map="tiny", camera=pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5),
+        depth_format=pb.DepthFormat(scale_m=0.001, kind=pb.DEPTH_KIND_DISPARITY, baseline_m=0.1, max_range_m=40.0),
+        options=pb.Options(refine=True, neighbours=5),
+    )  # fmt: skip
+    return message.SerializeToString()
+
+
+def _bundle_of(bundle: Path, scratch: Path) -> Callable[[bytes], None]:
+    """Changes one file of a bundle, as a forger would who makes the manifest agree; what opens must answer, or refuse."""
+    files = sorted(path.relative_to(bundle) for path in bundle.rglob("*") if path.is_file())
+    pristine = {name: (bundle / name).read_bytes() for name in files}
+    own = scratch / "bundle"
+    shutil.copytree(bundle, own, dirs_exist_ok=True)
+    query = _tiny_query()
+
+    def take(data: bytes) -> None:
+        if len(data) < 4:
+            return
+        name = files[data[0] % len(files)]
+        content = bytearray(pristine[name])
+        at = struct.unpack("<I", data[:4])[0] // 256 % len(content)
+        content[at : at + len(data) - 4] = data[4:]
+        try:
+            (own / name).write_bytes(content)
+            if name.name != MANIFEST_FILE:
+                _agree(own, name, bytes(content))
+            Localizer.open(MapBundle.open(own)).localize(query)
+        finally:
+            for each in {name, Path(MANIFEST_FILE)}:
+                (own / each).write_bytes(pristine[each])
+
+    return take
+
+
+def _agree(own: Path, name: Path, content: bytes) -> None:
+    """Make the manifest say what the file is now."""
+    manifest = read_manifest(own)
+    document = manifest.model_dump(mode="json")
+    document["files"][name.as_posix()] = {"sha256": hashlib.sha256(content).hexdigest(), "size": len(content)}
+    (own / MANIFEST_FILE).write_bytes(Manifest.model_validate(document).stamped().to_bytes())
+
+
+def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
+    """Any intrinsics, gravity and depth that pass the edge."""
+    localizer = Localizer.open(MapBundle.open(bundle))
+    good = _tiny_query()
+
+    def take(data: bytes) -> None:
+        if len(data) < 56:
+            return
+        fx, fy, cx, cy, down, aside = struct.unpack("<6d", data[:48])
+        document = {
+            "camera": {"width": 64, "height": 48, "fx": fx, "fy": fy, "cx": cx, "cy": cy},
+            "gravity": {"x": aside, "y": down, "z": 0.0},
+        }  # fmt: skip
+        try:
+            request = schema.LocalizeRequest.model_validate(document)
+        except ValidationError:
+            return
+        asked = query_from(request, rgb=b"", depth=b"")
+        raw = np.frombuffer(data[48 : 48 + (len(data) - 48) // 4 * 4], np.float32)
+        depth_m = depth_from_values(
+            np.resize(raw, (48, 64)), scale_m=1.0, kind="z", camera=asked.camera, baseline_m=None, max_range_m=None
+        )
+        localizer.localize(Query(rgb=good.rgb, depth_m=depth_m, camera=asked.camera, down_camera=asked.down_camera))
+
+    return take
+
+
+def _tiny_query() -> Query:
+    rng = np.random.default_rng(3)
+    down = np.maximum((np.arange(48) - CAMERA.cy) / CAMERA.fy, 1e-6)[:, None]
+    walls = np.repeat(rng.uniform(4, 15, 16), 4)[None, :].repeat(48, axis=0)
+    depth_m = np.minimum(walls, 1.5 / down).astype(np.float32)
+    return Query(rgb=rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), depth_m=depth_m, camera=CAMERA)

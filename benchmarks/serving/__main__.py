@@ -1,0 +1,84 @@
+"""``make bench-serving``: the service against the bare pipeline, under overload, swaps, signals and hostile clients.
+
+The paper's city, its survey thinned at a metre, the stock encoder; server on one core, load generator on the other. Everything
+that is simulated or built is kept under ``--work``, where ``make evaluate`` keeps it too. Run it on an idle machine.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from benchmarks.plans import paper_plan
+from benchmarks.report import ROOT, Report
+from benchmarks.runs import Runs
+from benchmarks.serving.fire import overload_rows, sigterm_rows, soak_rows, swap_rows
+from benchmarks.serving.hostile import hostile_rows
+from benchmarks.serving.machines import LOADING_CORE, SERVED_CORE, pin
+from benchmarks.serving.ratios import Site, ratio_rows, tail_rows
+from benchmarks.serving.sizes import size_rows
+from model_training.stock import ENCODER
+from service.maps.reader import MapBundle
+
+QUERIES, PAIRS = "drive1_precise", 50
+
+
+def site_from(arguments: argparse.Namespace) -> Site:
+    """What is served: as told, else the paper's city."""
+    if arguments.map is not None:
+        return Site(arguments.map, arguments.dataset, arguments.queries, PAIRS)
+    runs = Runs(arguments.work, ENCODER)
+    dataset = runs.dataset(paper_plan())
+    return Site(runs.bundle(dataset).path, dataset.folder, arguments.queries, PAIRS)
+
+
+def main() -> None:
+    """Parse, measure, write the report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate")
+    parser.add_argument("--map", type=Path, help="another bundle than the paper's city, with --dataset")
+    parser.add_argument("--dataset", type=Path)
+    parser.add_argument("--queries", default=QUERIES)
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each round")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--soak-minutes", type=float, default=30.0)
+    parser.add_argument(
+        "--only", nargs="+", help="parts: ratios tail overload swap sigterm sizes hostile both_cores soak"
+    )
+    arguments = parser.parse_args()
+    site = site_from(arguments)
+    report = Report(
+        "serving", "make bench-serving" + (f' ARGS="--only {" ".join(arguments.only)}"' if arguments.only else "")
+    )
+    if arguments.only:
+        report.keep_others()
+    counts = MapBundle.open(site.bundle, verify=False).manifest.counts
+    report.notes["map"] = (
+        f"Map {site.bundle.name}: {counts.places} places, {counts.views} views, {counts.cloud_points} points."
+    )
+    report.notes["requests"] = (
+        f"{PAIRS} pairs of {site.queries}, 640x480 JPEG and 16-bit PNG; server on core {SERVED_CORE}, load on {LOADING_CORE}."
+    )
+    core, seconds = SERVED_CORE, arguments.seconds
+    parts: dict[str, Callable[[], object]] = {
+        "ratios": lambda: ratio_rows(report, site, seconds=seconds, rounds=arguments.rounds, core=core),
+        "tail": lambda: tail_rows(report, site, seconds=seconds, core=core),
+        "overload": lambda: overload_rows(report, site, seconds=6 * seconds, core=core),
+        "swap": lambda: swap_rows(report, site, core=core),
+        "sigterm": lambda: sigterm_rows(report, site, core=core),
+        "sizes": lambda: size_rows(report, site, core=core),
+        "hostile": lambda: hostile_rows(report, site, core=core),
+        "both_cores": lambda: ratio_rows(report, site, seconds=seconds, rounds=1, core=None, suffix=".both_cores"),
+        "soak": lambda: soak_rows(report, site, minutes=arguments.soak_minutes, core=core),
+    }
+    if unknown := set(arguments.only or ()) - set(parts):
+        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(parts)}")
+    for name, part in parts.items():
+        if arguments.only and name not in arguments.only:
+            continue
+        pin(0, None if name == "both_cores" else LOADING_CORE)
+        part()
+        print(f"written: {report.write()}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
