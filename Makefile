@@ -28,7 +28,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check format generate lock evaluate bench-training reports encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test check format generate release-proto lock evaluate bench-training bench-serving fuzz sbom audit reports encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -49,6 +49,7 @@ check: .venv/.torch ## lint, types, layers, and the contracts as the code says t
 	$(BIN)/lint-imports
 	$(BIN)/python -m service.http.openapi --check
 	cd proto && ../$(BIN)/buf lint
+	cd proto && ../$(BIN)/buf breaking --against released.binpb
 
 format: .venv/.torch ## put the code in shape
 	$(BIN)/ruff check --fix
@@ -58,6 +59,9 @@ generate: .venv/.torch ## write openapi/openapi.json from the code, and the gRPC
 	$(BIN)/python -m service.http.openapi
 	$(BIN)/python -m grpc_tools.protoc -I service/grpc/generated=proto --python_out=. --pyi_out=. --grpc_python_out=. \
 		service/grpc/generated/streetfix/v1/localization.proto
+
+release-proto: .venv/.torch ## what later messages must stay compatible with: done once a release, by hand
+	cd proto && ../$(BIN)/buf build --output released.binpb
 
 lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
 	$(COMPILE) --extra dev --group oracle $(ARGS) --output-file locks/dev.txt
@@ -70,19 +74,34 @@ evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json
 bench-training: .venv/.torch ## measure training and simulation -> reports/training.json
 	$(BIN)/python -m benchmarks.training $(ARGS)
 
+bench-serving: .venv/.torch ## measure the service under load -> reports/serving.json; ARGS="--only ratios tail" measures parts
+	$(BIN)/python -m benchmarks.serving $(ARGS)
+
+fuzz: .venv/.torch ## a million inputs over all that takes bytes from outside -> reports/serving.json
+	$(INSTALL) 'atheris>=3,<4'
+	$(BIN)/python -m benchmarks.fuzz $(ARGS)
+
+sbom: .venv/.uv ## software bill of materials of the service's lock file -> out/sbom.json (CycloneDX)
+	mkdir -p out
+	$(UV) tool run --from 'cyclonedx-bom==7.3.1' cyclonedx-py requirements locks/service.txt --output-reproducible -o out/sbom.json
+
+audit: .venv/.uv ## known vulnerabilities of the locked packages; what cannot be looked up fails too
+	$(UV) tool run --from 'pip-audit==2.10.1' pip-audit --strict --disable-pip --require-hashes --requirement locks/service.txt
+
 reports: .venv/.torch ## all reports as one page with plots
 	$(BIN)/python -m benchmarks.render $(ARGS)
 
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS)
 	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --start-from runs/stock
-	$(BIN)/streetfix export runs/second --out model_training/stock/encoder.onnx
+	$(BIN)/streetfix average runs/stock runs/second --run runs/mean
+	$(BIN)/streetfix export runs/mean --out model_training/stock/encoder.onnx
 
 calibration: .venv/.torch ## ask calibration cities and fit confidence anew, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)
 
 paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there
-	$(BIN)/streetfix train --recipe paper --start-from runs/second --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper
+	$(BIN)/streetfix train --recipe paper --start-from runs/mean --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper
 	$(BIN)/streetfix export runs/paper --out runs/paper/encoder.onnx
 
 install-demo: .venv/.mapping ## what the demo needs, and no more
