@@ -43,6 +43,10 @@ def command(
     workers: Annotated[
         int | None, typer.Option(help="Processes that share the ports and the maps.  [default: 1]")
     ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Settings file, TOML; the environment and flags go above it.", show_default=False),
+    ] = None,
     check: Annotated[
         bool,
         typer.Option(
@@ -56,7 +60,8 @@ def command(
 ) -> None:
     """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
 
-    Every option can be set as STREETFIX_HOST, STREETFIX_PORT and so on, the maps as STREETFIX_MAPS (':' between).
+    Every option can be set as STREETFIX_HOST, STREETFIX_PORT and so on, the maps as STREETFIX_MAPS (':' between); or in a TOML
+    file that --config or STREETFIX_CONFIG names.
 
     Example: streetfix serve maps/paper-city --port 8000 --grpc-port 50051
     """
@@ -67,7 +72,7 @@ def command(
 
     (check_only if check else serve)(
         load_settings(
-            maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
+            config, maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
             workers=workers, false_accept_rate=false_accept_rate,
         )
     )  # fmt: skip

@@ -5,7 +5,6 @@ Every reader checks the size that the header states against the limits before it
 
 import io
 import struct
-import tokenize
 from typing import Any, Literal
 
 import cv2
@@ -15,6 +14,7 @@ from jaxtyping import Shaped
 from numpy.typing import NDArray
 
 from service.errors import UnsupportedFormatError
+from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.imaging.picture_headers import ImageLimits, damaged, format_of, header_of, require_bytes, require_pixels
 from service.imaging.png16 import is_plain_grey16, read_grey16
 
@@ -126,7 +126,7 @@ def _npy(data: bytes, limits: ImageLimits) -> Values:
         if reader is None:
             raise _unsupported(f"NPY version {version[0]}.{version[1]} is for structured arrays")
         shape, is_fortran, dtype = reader(stream, max_header_size=_MAX_NPY_HEADER_BYTES)
-    except (ValueError, TypeError, SyntaxError, EOFError, MemoryError, RecursionError, tokenize.TokenError) as error:
+    except NPY_HEADER_ERRORS as error:
         raise damaged(_FIELD, "its NPY header is damaged") from error
     if dtype.hasobject or dtype.str[1:] not in _NPY_DTYPES:
         raise _unsupported(f"NPY of type {dtype} is not read; save float32 (or float16, float64, uint16)")

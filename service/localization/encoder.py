@@ -19,6 +19,13 @@ from service.imaging.view_grid import PLANES
 Side = Literal["survey", "query"]
 Descriptors = Float32[NDArray[np.float32], "B D"]
 
+#: What runs the network: ONNX Runtime's names of the providers that a setting chooses between.
+Provider = Literal["cpu", "cuda", "openvino"]
+_PROVIDERS: dict[Provider, str] = {
+    "cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider",
+}  # fmt: skip
+#: Packages that bring them, in place of ``onnxruntime``.
+_PACKAGES: dict[Provider, str] = {"cpu": "onnxruntime", "cuda": "onnxruntime-gpu", "openvino": "onnxruntime-openvino"}
 #: Of one run: whole requests run side by side, and inner pools only get in their way.
 THREADS = 1
 
@@ -47,16 +54,18 @@ class Encoder:
         self.trained_on = tuple(session.get_modelmeta().custom_metadata_map.get("trained_on", "").split())
 
     @staticmethod
-    def open(source: Path | bytes, *, threads: int = THREADS) -> "Encoder":
+    def open(source: Path | bytes, *, threads: int = THREADS, provider: Provider = "cpu") -> "Encoder":
         """Open an ONNX file, or its bytes.
 
         Args:
             source: where it is.
             threads: of one run; whole requests run side by side, so one is best for a service.
+            provider: what runs it.
 
         Raises:
-            EncoderError: it cannot be read, or is no encoder of ours.
+            EncoderError: it cannot be read, is no encoder of ours, or the provider is not installed.
         """
+        require_provider(provider)
         try:
             data = source if isinstance(source, bytes) else source.read_bytes()
         except OSError as error:  # its text names the file
@@ -67,7 +76,7 @@ class Encoder:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
         try:
-            session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            session = onnxruntime.InferenceSession(data, options, providers=[_PROVIDERS[provider]])
         except Exception as error:  # ONNX Runtime raises a family of its own that has no common root
             raise EncoderError(f"the encoder is no ONNX model that runs here: {error}", field="encoder") from error
         return Encoder(session, hashlib.sha256(data).hexdigest())
@@ -83,3 +92,19 @@ class Encoder:
         (descriptors,) = self._session.run(["descriptor"], {"planes": planes, "side": flags})
         result: Descriptors = descriptors
         return result
+
+
+def require_provider(provider: Provider) -> None:
+    """Refuse a provider that this installation of ONNX Runtime does not have; it would fall back to the processor in silence.
+
+    Raises:
+        EncoderError: naming those there are.
+    """
+    there = onnxruntime.get_available_providers()
+    if _PROVIDERS[provider] not in there:
+        known = ", ".join(name for name, full in _PROVIDERS.items() if full in there)
+        raise EncoderError(
+            f"provider: ONNX Runtime has no {provider!r} here (it has {known}); install {_PACKAGES[provider]} instead of "
+            "onnxruntime, or choose another",
+            field="provider",
+        )

@@ -10,7 +10,7 @@ from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews, query_views
 from service.localization.answer import Answer, Timings
 from service.localization.decide import decide
-from service.localization.encoder import Encoder
+from service.localization.encoder import Encoder, Provider
 from service.localization.evidence import evidence_of
 from service.localization.frames import Frame
 from service.localization.hypotheses import ClusterSettings, Hypothesis, cluster
@@ -59,9 +59,13 @@ class Localizer:
         self.turns_rad = TURNS_RAD
 
     @classmethod
-    def open(cls, bundle: MapBundle) -> "Localizer":
-        """With the encoder that lies in the bundle."""
-        return cls(bundle, Encoder.open(bundle.encoder_bytes()))
+    def open(cls, bundle: MapBundle, *, provider: Provider = "cpu") -> "Localizer":
+        """With the encoder that lies in the bundle.
+
+        Raises:
+            EncoderError: the provider is not installed.
+        """
+        return cls(bundle, Encoder.open(bundle.encoder_bytes(), provider=provider))
 
     def localize(self, query: Query) -> Answer:
         """Answer a query.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from service.errors import BundleError
 from service.geometry.earth import Georeference
+from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.imaging.view_grid import ViewGrid
 from service.maps import content as parts
 from service.maps import index, streets
@@ -136,7 +137,7 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
 def _load(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, *NPY_HEADER_ERRORS) as error:
         raise _defect(path, f"it is no array of ours ({error})") from error
     if expected is not None and (array.dtype != expected or array.ndim != 1):
         raise _defect(path, f"it holds {array.dtype} in {array.ndim} dimensions")

@@ -95,7 +95,7 @@ class Engine:
             BundleError: a map is missing, damaged or mismatched.
         """
         limit_pools()
-        return cls(MapRegistry.open(settings.maps), settings, choices)
+        return cls(MapRegistry.open(settings.maps, provider=settings.provider), settings, choices)
 
     def serve_version(self, name: str, version: str) -> Localizer:
         """Let another open version of a map serve, in every worker.

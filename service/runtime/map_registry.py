@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.errors import BundleError, UnknownMapError
+from service.localization.encoder import Provider
 from service.localization.localizer import Localizer
 from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.reader import MapBundle
@@ -28,7 +29,8 @@ class MapRegistry:
     A request keeps the localizer it got; a version that was taken out lives as long as a request has it.
     """
 
-    def __init__(self, localizers: Sequence[Localizer] = ()) -> None:
+    def __init__(self, localizers: Sequence[Localizer] = (), *, provider: Provider = "cpu") -> None:
+        self.provider = provider
         self._maps: dict[str, _Map] = {}
         self._changing = threading.Lock()
         for localizer in localizers:
@@ -42,19 +44,21 @@ class MapRegistry:
             self.mount(localizer)
 
     @classmethod
-    def open(cls, paths: Sequence[Path]) -> "MapRegistry":
+    def open(cls, paths: Sequence[Path], *, provider: Provider = "cpu") -> "MapRegistry":
         """Open and verify every bundle.
 
         Args:
             paths: bundles, or folders that hold some.
+            provider: what runs their encoders.
 
         Raises:
+            EncoderError: the provider is not installed.
             BundleError: one is missing, damaged or mismatched, two are the same version of a map, or there is none at all.
         """
         bundles = [bundle for path in paths for bundle in bundle_paths(path)]
         if not bundles:
             raise BundleError("there is no map to serve: give a folder that build-map wrote")
-        return cls([Localizer.open(MapBundle.open(path)) for path in bundles])
+        return cls([Localizer.open(MapBundle.open(path), provider=provider) for path in bundles], provider=provider)
 
     def __len__(self) -> int:
         return len(self._maps)

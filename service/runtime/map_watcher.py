@@ -59,7 +59,7 @@ class MapWatcher:
             if self._seen.get(path) == stamp or self._failed.get(path) == stamp:
                 continue
             try:
-                localizer = Localizer.open(MapBundle.open(path))
+                localizer = Localizer.open(MapBundle.open(path), provider=self._registry.provider)
                 self._warm(localizer)
             except Exception as error:  # whatever it is, this bundle does not serve, and the others are looked at
                 self._failed[path] = stamp

@@ -1,15 +1,27 @@
-"""Settings of a service: defaults < environment ``STREETFIX_*`` < flags. Made once, in the command line."""
+"""Settings of a service: defaults < file (TOML) < environment ``STREETFIX_*`` < flags. Made once, in the command line."""
 
+import os
+import tomllib
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic_settings import (
+    BaseSettings,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
 
 from service.errors import RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
+from service.localization.encoder import Provider
 from service.localization.query import FALSE_ACCEPT_RATE
+
+#: Names the settings file where no flag does.
+_CONFIG = "STREETFIX_CONFIG"
 
 
 class Limits(BaseModel):
@@ -71,6 +83,9 @@ class Settings(BaseSettings):
         le=256,
         description="requests that a process works on at once; default: its share of the usable cores",
     )
+    provider: Provider = Field(
+        "cpu", description="what runs the encoder: ONNX Runtime's provider, where it is installed"
+    )
     queue: int = Field(64, ge=0, le=100_000, description="requests that may wait in a process before 503")
     request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
     false_accept_rate: float = Field(
@@ -109,17 +124,47 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def load_settings(**flags: object) -> Settings:
-    """Settings from the environment, with flags that are not None above it.
+def load_settings(config: Path | None = None, **flags: object) -> Settings:
+    """Settings from a file, the environment above it, and flags that are not None above both.
+
+    Args:
+        config: TOML; else the file that ``STREETFIX_CONFIG`` names, if any.
+        flags: by name.
 
     Raises:
-        RequestError: a value makes no sense; its name is in the message.
+        RequestError: the file cannot be read, or a value makes no sense; its name is in the message.
     """
-    given = {name: value for name, value in flags.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
+    named = config or (Path(os.environ[_CONFIG]) if os.environ.get(_CONFIG) else None)
     try:
-        return Settings.model_validate(Settings(**given))  # type: ignore[arg-type]  # checked by pydantic
+        return Settings.model_validate(_with_file(named)(**given).model_dump())
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         what = f"setting {where}: {first['msg']} (it is {first['input']!r})" if where else f"settings: {first['msg']}"
         raise RequestError(what, field=where) from error
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise RequestError(
+            f"settings file {named}: {error}; write TOML such as  port = 8000", field="config"
+        ) from error
+
+
+def _with_file(path: Path | None) -> type[Settings]:
+    if path is None:
+        return Settings
+    file = path
+
+    class FromFile(Settings):
+        """Looks into the file after the environment."""
+
+        @classmethod
+        def settings_customise_sources(
+            cls, settings_cls: type[BaseSettings], init_settings: PydanticBaseSettingsSource,
+            env_settings: PydanticBaseSettingsSource, dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
+            file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
+        ) -> tuple[PydanticBaseSettingsSource, ...]:  # fmt: skip
+            """In the order of their weight."""
+            with file.open("rb"):  # a missing file would be passed over in silence
+                return init_settings, env_settings, TomlConfigSettingsSource(settings_cls, file)
+
+    return FromFile

@@ -228,3 +228,14 @@ def test_a_georeference_of_anything_but_numbers_is_refused(bundle_copy: Path) ->
     edit_manifest(bundle_copy, edit, stamp=False)
     with pytest.raises(BundleError, match=r"georeference\.latitude_deg"):
         MapBundle.open(bundle_copy)
+
+
+@pytest.mark.parametrize("name", ["places.npy", "views.npy", "cloud/surfels.npy"])
+@pytest.mark.parametrize("byte", [0, 123, 255])
+def test_an_array_whose_header_is_no_text_is_refused(bundle_copy: Path, name: str, byte: int) -> None:
+    """Found by fuzzing: NumPy's reader of headers raises what Python's tokenizer does."""
+    data = bytearray((bundle_copy / name).read_bytes())
+    data[43] = byte
+    replace_file(bundle_copy, name, bytes(data))
+    with pytest.raises(BundleError, match=f"{name}"):
+        MapBundle.open(bundle_copy)

@@ -42,3 +42,36 @@ def test_an_unknown_setting_is_refused() -> None:
 def test_settings_cannot_be_changed() -> None:
     with pytest.raises(ValidationError):
         Settings().port = 1  # type: ignore[misc]  # that is the point
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "streetfix.toml"
+    path.write_text('port = 9000\nqueue = 3\nmaps = ["/maps/a", "/maps/b"]\n[limits]\nmax_pixels = 1000\n')
+    return path
+
+
+def test_a_file_goes_below_the_environment_and_flags(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_QUEUE", "4")
+    settings = load_settings(file, port=9001)
+    assert (settings.port, settings.queue, settings.limits.max_pixels) == (9001, 4, 1000)
+    assert settings.maps == (Path("/maps/a"), Path("/maps/b"))
+    assert settings.host == "127.0.0.1"
+    assert type(settings) is Settings
+
+
+def test_the_environment_may_name_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_CONFIG", str(file))
+    assert load_settings().port == 9000
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("prot = 1", "setting prot"), ("port = 70000", "setting port"), ("port 9000", "streetfix.toml"), (None, "streetfix.toml")],
+)  # fmt: skip
+def test_a_file_that_makes_no_sense_is_refused_with_what_is_wrong(file: Path, text: str | None, says: str) -> None:
+    file.unlink()
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(RequestError, match=says):
+        load_settings(file)
