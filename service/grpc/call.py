@@ -10,6 +10,7 @@ import grpc
 
 from service.errors import DeadlineError
 from service.runtime.admission import Admission
+from service.runtime.tracing import RequestSpan
 
 T = TypeVar("T")
 
@@ -20,10 +21,14 @@ class Call:
     Args:
         admission: of the engine.
         context: of the call.
+        span: of its trace.
         timeout_s: that the service allows; the caller's deadline may be shorter.
     """
 
-    def __init__(self, admission: Admission, context: grpc.ServicerContext, *, timeout_s: float) -> None:
+    def __init__(
+        self, admission: Admission, context: grpc.ServicerContext, span: RequestSpan, *, timeout_s: float
+    ) -> None:
+        self.span = span
         self._admission = admission
         self._context = context
         self._timeout_s = timeout_s

@@ -23,6 +23,7 @@ from service.grpc.status import fail, problem_message, refuse
 from service.runtime.engine import Engine, Located
 from service.runtime.logs import log_request
 from service.runtime.stream import Stream
+from service.runtime.tracing import RequestSpan
 
 REQUEST_ID = "x-request-id"
 _ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -39,7 +40,7 @@ class Servicer(LocalizationServiceServicer):
     def Localize(self, request: pb.LocalizeRequest, context: grpc.ServicerContext) -> pb.LocalizeResponse:
         """One pair."""
         with self._answering("Localize", context) as call:
-            return call.run(lambda: self._localize(request))
+            return call.run(lambda: self._localize(request, call.span))
 
     def LocalizeBatch(
         self, request: pb.LocalizeBatchRequest, context: grpc.ServicerContext
@@ -62,7 +63,9 @@ class Servicer(LocalizationServiceServicer):
 
             def work() -> Located:
                 pictures = [(frame.rgb, frame.depth) for frame in request.frames]
-                return self._engine.localize_sequence(*sequence_from(sequence_request_from(request), pictures))
+                located = self._engine.localize_sequence(*sequence_from(sequence_request_from(request), pictures))
+                call.span.stages(located.answer.timings)
+                return located
 
             return pb.LocalizeSequenceResponse(answer=answer_message(answer_from(call.run(work))))
 
@@ -103,14 +106,16 @@ class Servicer(LocalizationServiceServicer):
             asked = [registry.get(request.map)] if request.HasField("map") else list(registry)
             return pb.GetCoverageResponse(geojson=coverage_geojson([localizer.bundle for localizer in asked]))
 
-    def _localize(self, request: pb.LocalizeRequest) -> pb.LocalizeResponse:
+    def _localize(self, request: pb.LocalizeRequest, span: RequestSpan) -> pb.LocalizeResponse:
         query = query_from(request_from(request), rgb=request.rgb, depth=request.depth)
-        return answer_message(answer_from(self._engine.localize(query)))
+        located = self._engine.localize(query)
+        span.stages(located.answer.timings)
+        return answer_message(answer_from(located))
 
     def _begin(self, call: Call, request: pb.LocalizeRequest) -> Future[pb.LocalizeResponse]:
         """One request of a batch; refused ones come back as failed."""
         try:
-            return call.submit(lambda: self._localize(request))
+            return call.submit(lambda: self._localize(request, call.span))
         except BusyError as error:
             refused: Future[pb.LocalizeResponse] = Future()
             refused.set_exception(error)
@@ -133,7 +138,9 @@ class Servicer(LocalizationServiceServicer):
                 name = "previous_from_camera"
                 with fields_under(name):
                     odometry = transform_of(transform_from(request.previous_from_camera), name)
-            return stream.localize(query, odometry)
+            located, frames = stream.localize(query, odometry)
+            call.span.stages(located.answer.timings)
+            return located, frames
 
         began, code = perf_counter(), "OK"
         call.begin_again()
@@ -160,8 +167,9 @@ class Servicer(LocalizationServiceServicer):
         request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
         context.send_initial_metadata(((REQUEST_ID, request_id),))
         began, code = perf_counter(), "OK"
+        span = self._engine.tracing.begin("grpc", metadata.get("traceparent"))
         try:
-            yield Call(self._engine.admission, context, timeout_s=self._engine.settings.request_timeout_s)
+            yield Call(self._engine.admission, context, span, timeout_s=self._engine.settings.request_timeout_s)
         except StreetfixError as error:
             code = error.code
             refuse(context, error)
@@ -174,6 +182,7 @@ class Servicer(LocalizationServiceServicer):
         finally:
             seconds = perf_counter() - began
             self._engine.metrics.requested("grpc", method, code, None if lives_long else seconds)
+            span.end(method, code, failed=code in ("INTERNAL", "deadline"))
             log_request(
                 face="grpc", method=method, code=code, seconds=seconds, request_id=request_id,
                 traceparent=metadata.get("traceparent"),

@@ -42,7 +42,9 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
     app.include_router(health.router_for(engine, version))
     if keys is not None:
         app.add_middleware(AuthMiddleware, keys=keys)
-    app.add_middleware(RequestIdMiddleware, requested=engine.metrics.requested)  # outermost: the last one added
+    app.add_middleware(
+        RequestIdMiddleware, requested=engine.metrics.requested, tracing=engine.tracing
+    )  # outermost: the last one added
     problems.install(app)
     app.openapi = lambda: _openapi_of(app)  # type: ignore[method-assign]  # FastAPI's documented way
     return app

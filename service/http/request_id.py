@@ -3,6 +3,7 @@
 import re
 import uuid
 from collections.abc import Callable
+from http import HTTPStatus
 from time import perf_counter
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -11,6 +12,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.problems import internal_error
 from service.runtime.logs import log_request
+from service.runtime.tracing import Tracing
 
 HEADER = "X-Request-Id"
 #: As other servers count a caller that went away before the answer.
@@ -21,9 +23,10 @@ _ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 class RequestIdMiddleware:
     """Takes the caller's ``X-Request-Id`` if it is a plain one, else makes one; answers unforeseen errors with 500."""
 
-    def __init__(self, app: ASGIApp, requested: Callable[[str, str, str, float], None]) -> None:
+    def __init__(self, app: ASGIApp, requested: Callable[[str, str, str, float], None], tracing: Tracing) -> None:
         self._app = app
         self._requested = requested
+        self._tracing = tracing
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
@@ -34,6 +37,7 @@ class RequestIdMiddleware:
         given = headers.get(HEADER, "")
         request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = request_id
+        span = scope["state"]["span"] = self._tracing.begin("rest", headers.get("traceparent"))
         started, began, status = False, perf_counter(), 0
 
         async def send_with_id(message: Message) -> None:
@@ -56,6 +60,7 @@ class RequestIdMiddleware:
             operation = getattr(scope.get("route"), "operation_id", None) or "none"
             seconds = perf_counter() - began
             self._requested("rest", operation, str(status), seconds)
+            span.end(operation, str(status), failed=status >= HTTPStatus.INTERNAL_SERVER_ERROR)
             log_request(
                 face="rest", method=operation, code=str(status), seconds=seconds, request_id=request_id,
                 traceparent=headers.get("traceparent"),

@@ -31,19 +31,21 @@ def write_index(path: Path, descriptors: Descriptors) -> None:
     faiss.write_index(index, str(path))
 
 
-def _eight_bits(index: faiss.Index) -> faiss.Index:
-    """The same vectors with whole numbers of eight bits for components: a scan of them waits a quarter as long for memory."""
+def _eight_bits(index: faiss.Index) -> tuple[float, faiss.Index]:
+    """The same vectors with whole numbers of eight bits for components: a scan of them waits a quarter as long for memory.
+
+    And the largest component's size; where it is not finite, nothing else is.
+    """
     coarse = faiss.IndexScalarQuantizer(
         index.d, faiss.ScalarQuantizer.QT_8bit_direct_signed, faiss.METRIC_INNER_PRODUCT
     )
-    if index.ntotal == 0:
-        return coarse
     chunks = [range(first, min(first + _CHUNK, index.ntotal)) for first in range(0, index.ntotal, _CHUNK)]
-    largest = max(float(np.abs(index.reconstruct_n(chunk.start, len(chunk))).max()) for chunk in chunks)
-    for chunk in chunks:
+    sizes = [float(np.abs(index.reconstruct_n(chunk.start, len(chunk))).max()) for chunk in chunks]
+    largest = float(np.max(sizes, initial=0.0))
+    for chunk in chunks if np.isfinite(largest) else ():
         vectors = index.reconstruct_n(chunk.start, len(chunk))
         coarse.add(np.rint(vectors * np.float32(_LEVELS / max(largest, 1e-9))))
-    return coarse
+    return largest, coarse
 
 
 class ViewIndex:
@@ -51,7 +53,7 @@ class ViewIndex:
 
     def __init__(self, index: faiss.Index) -> None:
         self._index = index
-        self._coarse = _eight_bits(index)
+        self.largest, self._coarse = _eight_bits(index)
 
     @classmethod
     def open(cls, path: Path) -> "ViewIndex":
@@ -72,7 +74,10 @@ class ViewIndex:
                 f"{path}: the index is a {kind.__name__}, not a flat index of inner products; build the bundle again",
                 field=FILE,
             )
-        return cls(index)
+        found = cls(index)
+        if not np.isfinite(found.largest):
+            raise BundleError(f"{path}: a descriptor is not finite; copy or build the bundle again", field=FILE)
+        return found
 
     def __len__(self) -> int:
         return int(self._index.ntotal)

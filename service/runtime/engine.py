@@ -24,6 +24,7 @@ from service.runtime.map_registry import MapRegistry
 from service.runtime.metrics import Metrics
 from service.runtime.settings import Settings
 from service.runtime.threads import limit_pools, usable_cores
+from service.runtime.tracing import Tracing
 
 _log = logging.getLogger("streetfix.engine")
 
@@ -81,6 +82,7 @@ class Engine:
         self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.metrics = Metrics(self.admission, registry)
+        self.tracing = Tracing.open(settings.traces_endpoint, share=settings.traces_share)
         self.is_draining = False
 
     @classmethod

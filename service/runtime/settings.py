@@ -66,6 +66,12 @@ class Settings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "warning", description="info: a line for each request"
     )
+    traces_endpoint: str | None = Field(
+        None, description="OpenTelemetry collector, as http://127.0.0.1:4318/v1/traces; needs streetfix[otel]"
+    )
+    traces_share: float = Field(
+        0.05, ge=0, le=1, description="share of the requests without a trace of their own that get one"
+    )
     grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
     grpc_idle_s: float = Field(300.0, gt=0, le=86400, description="a stream that sends no frame for so long is ended")
     drain_s: float = Field(

@@ -20,6 +20,7 @@ from service.http.outcome import BatchAnswer, Outcome
 from service.http.parts import document_of, numbered_pictures, require_parts
 from service.http.problems import MEDIA_TYPE, problem_of
 from service.runtime.engine import Engine, Located
+from service.runtime.tracing import RequestSpan
 
 _REQUEST_BODY: dict[str, Any] = {
     "required": True,
@@ -125,7 +126,7 @@ def router_for(asking: Asking) -> APIRouter:
         async def answer(body: bytearray) -> Response:
             headers = request.headers
             given = Given(
-                body, headers.get("content-type", ""), request.state.request_id,
+                body, headers.get("content-type", ""), request.state.request_id, request.state.span,
                 geopose_alone=work is not _batch and wants_geopose(headers.get("accept", "")),
             )  # fmt: skip
             media_type = GEOPOSE if given.geopose_alone else "application/json"
@@ -143,6 +144,7 @@ class Given:
     body: bytearray
     content_type: str
     request_id: str
+    span: RequestSpan
     geopose_alone: bool = False
 
     def parts(self, most: int) -> dict[str, bytes]:
@@ -184,7 +186,9 @@ async def _batch(engine: Engine, given: Given) -> bytes:
 
     async def one(number: int, request: schema.LocalizeRequest, rgb: bytes, depth: bytes) -> Outcome:
         def work() -> schema.LocalizeAnswer:
-            return answer_from(engine.localize(query_from(request, rgb=rgb, depth=depth)))
+            located = engine.localize(query_from(request, rgb=rgb, depth=depth))
+            given.span.stages(located.answer.timings)
+            return answer_from(located)
 
         try:
             with fields_under(f"requests.{number}"):
@@ -198,6 +202,7 @@ async def _batch(engine: Engine, given: Given) -> bytes:
 
 
 def _written(located: Located, given: Given) -> bytes:
+    given.span.stages(located.answer.timings)
     answer = answer_from(located)
     if not given.geopose_alone:
         return answer.model_dump_json(by_alias=True).encode()

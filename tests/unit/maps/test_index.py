@@ -76,3 +76,13 @@ def test_another_metric_is_refused(tmp_path: Path) -> None:
     faiss.write_index(faiss.IndexFlatL2(8), str(tmp_path / "i"))
     with pytest.raises(BundleError, match="inner products"):
         ViewIndex.open(tmp_path / "i")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_descriptors_that_are_no_numbers_are_refused(tmp_path: Path, value: float) -> None:
+    """Found by fuzzing."""
+    descriptors = unit_vectors(20, 8)
+    descriptors[17, 3] = value
+    write_index(tmp_path / "i", descriptors)
+    with pytest.raises(BundleError, match="not finite"):
+        ViewIndex.open(tmp_path / "i")
