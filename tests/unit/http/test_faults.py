@@ -1,0 +1,72 @@
+"""What goes wrong inside one request stays inside it."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import httpx
+import pytest
+from onnxruntime.capi.onnxruntime_pybind11_state import RuntimeException
+
+from service.imaging import decode
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
+
+Parts = Callable[..., dict[str, bytes]]
+
+
+@pytest.fixture
+def engine(bundle_path: Path) -> Iterator[Engine]:
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=2, queue=4, request_timeout_s=5.0))
+    yield engine
+    engine.close()
+
+
+def post(client: httpx.Client, parts: dict[str, bytes]) -> httpx.Response:
+    return client.post("/v1/localize", files={name: (name, data) for name, data in parts.items()})
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeException("a kernel failed"), cv2.error("bad memory"), MemoryError(), RuntimeError("FAISS: no")]
+)
+def test_a_native_librarys_exception_ends_its_own_request_alone(
+    engine: Engine, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:  # fmt: skip
+    client, (localizer,) = client_of(engine), engine.registry
+    encode = localizer.encoder.encode
+
+    def fails(*_: object, **__: object) -> None:
+        raise error
+
+    localizer.encoder = SimpleNamespace(encode=fails)
+    failed = post(client, parts_of())
+    localizer.encoder = SimpleNamespace(encode=encode)
+    assert (failed.status_code, failed.json()["code"]) == (500, "internal")
+    assert str(error) not in failed.text or not str(error)
+    assert post(client, parts_of()).status_code == 200
+    assert (engine.admission.working, engine.admission.waiting) == (0, 0)
+
+
+def test_a_stuck_request_is_told_so_and_the_others_are_answered(
+    engine: Engine, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of two threads hangs in a decoder; its caller waits no longer than a request may take."""
+    client, hangs, goes_on, real = client_of(engine), threading.Event(), threading.Event(), decode.opencv_decode
+
+    def stuck(data: bytes, flags: int, *, field: str) -> object:
+        if not hangs.is_set():
+            hangs.set()
+            goes_on.wait(60)
+        return real(data, flags, field=field)
+
+    monkeypatch.setattr(decode, "opencv_decode", stuck)
+    found: list[httpx.Response] = []
+    first = threading.Thread(target=lambda: found.append(post(client_of(engine), parts_of())))
+    first.start()
+    assert hangs.wait(30)
+    assert [post(client, parts_of()).status_code for _ in range(3)] == [200, 200, 200]
+    first.join(30)
+    goes_on.set()
+    assert (found[0].status_code, found[0].json()["code"]) == (504, "deadline")
