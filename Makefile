@@ -13,7 +13,7 @@ PAPER_STEPS ?= 400
 DATA ?= ../shared/data/kitti_stereo
 
 # Compiled when the package is installed.
-KERNEL := hatch_build.py service/registration/kernel.c service/imaging/gather.c service/imaging/unfilter.c
+KERNEL := hatch_build.py service/registration/kernel.c service/imaging/gather.c service/imaging/depth16.c
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check

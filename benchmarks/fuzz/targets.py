@@ -134,7 +134,7 @@ def _depth(data: bytes) -> None:
     how, data = data[0], data[1:]
     kind = ("z", "range", "disparity")[how % 3]
     decode_depth(
-        data, camera=CAMERA, encoding="carla" if how & 8 else None, scale_m=0.001 if how & 16 else None, kind=kind,  # type: ignore[arg-type]
+        data, camera=CAMERA, encoding="carla" if how & 8 else "compressed_depth" if how & 64 else None, scale_m=0.001 if how & 16 else None, kind=kind,  # type: ignore[arg-type]
         baseline_m=0.1, max_range_m=40.0 if how & 32 else None, limits=LIMITS,
     )  # fmt: skip
 
@@ -150,7 +150,8 @@ def _depth_seeds(depth: np.ndarray) -> list[bytes]:
     colour = np.dstack([depth & 255, depth >> 8, 0 * depth]).astype(np.uint8)
     good = [
         (b"\x00", _encoded(".png", depth)), (b"\x30", _encoded(".tiff", metres)), (b"\x01", npy + metres.tobytes()),
-        (b"\x02", write_raw16(depth)), (b"\x08", _encoded(".png", colour)),
+        (b"\x02", write_raw16(depth)), (b"\x08", _encoded(".png", colour)), (b"\x40", bytes(12) + _encoded(".png", depth)),
+        (b"\x40", bytes(12) + struct.pack("<ii", 64, 48) + b"\x00\x00\x86\x88"),
     ]  # fmt: skip
     return [how + data for how, data in good]
 

@@ -70,7 +70,10 @@ class Depth(_Strict):
     kind: Literal["z", "range", "disparity"] = Field(
         "z", description="along the optical axis, along the ray, or disparity"
     )
-    encoding: Literal["auto", "carla"] = Field("auto", description="carla: depth in the 24 bits of a colour PNG")
+    encoding: Literal["auto", "carla", "compressed_depth"] = Field(
+        "auto",
+        description="carla: depth in the 24 bits of a colour PNG; compressed_depth: data of a ROS compressedDepth message, PNG or RVL",
+    )
     max_range_m: float | None = Field(None, gt=0, le=1e5, description="what lies beyond is no measurement")
     baseline_m: float | None = Field(
         None, gt=0, le=100, description="of the stereo rig; needed for disparity; the rig's disparity offset is then estimated too"

@@ -70,7 +70,8 @@ def decode_depth(
     Args:
         data: the encoded picture.
         camera: the camera whose request this is; the picture may be a uniformly resized one of its.
-        encoding: ``carla`` for CARLA's 24-bit PNG; auto or None tell by the first bytes.
+        encoding: ``carla`` for CARLA's 24-bit PNG, ``compressed_depth`` for the data of ROS' compressedDepth; auto or None tell by
+            the first bytes.
         scale_m: metres (disparity: pixels) for each stored unit, obeyed in every format. Where it is None, the format
             decides: 0.001 for 16-bit integers, 1 for floating values, and for CARLA 1000 m for all 24 bits.
         kind: what is stored: z, range along the ray, or disparity.

@@ -17,9 +17,11 @@ from service.errors import UnsupportedFormatError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.imaging.picture_headers import ImageLimits, damaged, format_of, header_of, require_bytes, require_pixels
 from service.imaging.png16 import is_plain_grey16, read_grey16
+from service.imaging.ros_depth import read_ros_depth
 
-#: ``auto`` (as None) tells by the first bytes; ``carla`` is CARLA's depth in the three channels of an 8-bit PNG.
-DepthEncoding = Literal["auto", "carla"]
+#: ``auto`` (as None) tells by the first bytes; ``carla`` is CARLA's depth in the three channels of an 8-bit PNG;
+#: ``compressed_depth`` is the data of a ROS message of compressed_depth_image_transport, PNG or RVL.
+DepthEncoding = Literal["auto", "carla", "compressed_depth"]
 Values = Shaped[NDArray[Any], "H W"]
 
 #: CARLA's far plane: it means "nothing hit", and so no measurement.
@@ -49,6 +51,8 @@ def read_depth_values(data: bytes, *, encoding: DepthEncoding | None, limits: Im
         TooLargeError: more bytes or pixels than the limits allow.
     """
     require_bytes(data, limits, field=_FIELD)
+    if encoding == "compressed_depth":
+        return read_ros_depth(data, limits, field=_FIELD)
     format_ = format_of(data, field=_FIELD)
     if encoding == "carla":
         return _carla(data, format_, limits)

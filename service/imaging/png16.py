@@ -6,9 +6,6 @@ to OpenCV. Pixels are the same (a test compares them).
 
 import ctypes
 import struct
-from ctypes import c_int64, c_void_p
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 from isal import isal_zlib
@@ -16,10 +13,9 @@ from isal.igzip_lib import IsalError
 from jaxtyping import UInt16
 from numpy.typing import NDArray
 
-from service.errors import StreetfixError
+from service.imaging.depth16 import library
 from service.imaging.picture_headers import damaged
 
-LIBRARY = Path(__file__).with_name("_unfilter.so")
 _SIGNATURE_BYTES = 8
 _FIRST_CHUNK = struct.Struct(">I4sIIBBBBB")
 
@@ -63,17 +59,7 @@ def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[N
     if len(raw) != needed:
         raise damaged(field, f"it holds {len(raw)} bytes of pixels where {width}x{height} need {needed}")
     out = np.empty((height, width), np.uint16)
-    rows = _library().streetfix_unfilter((ctypes.c_char * needed).from_buffer(raw), height, width, out.ctypes.data)
+    rows = library().streetfix_unfilter((ctypes.c_char * needed).from_buffer(raw), height, width, out.ctypes.data)
     if rows != height:
         raise damaged(field, f"row {rows} has an unknown filter")
     return out
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    if not LIBRARY.exists():
-        raise StreetfixError(f"{LIBRARY.name} is missing beside {__file__}: install the package again (pip install .)")
-    library = ctypes.CDLL(str(LIBRARY))
-    library.streetfix_unfilter.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
-    library.streetfix_unfilter.restype = c_int64
-    return library

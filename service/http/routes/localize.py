@@ -36,7 +36,7 @@ _REQUEST_BODY: dict[str, Any] = {
                         "type": "string",
                         "format": "binary",
                         "description": "16-bit PNG, TIFF, NPY or raw16+zstd (SFD1, the cheapest); "
-                        "CARLA's 24-bit PNG with depth.encoding = carla",
+                        "CARLA's 24-bit PNG with depth.encoding = carla, ROS' compressedDepth with compressed_depth",
                     },
                     "request": {"$ref": "#/components/schemas/LocalizeRequest"},
                 },

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import DecodeError, StreetfixError
+from service.imaging import depth16
 from service.imaging import png16 as module
 from service.imaging.depth_formats import read_depth_values
 from service.imaging.picture_headers import DEFAULT_LIMITS
@@ -125,8 +126,8 @@ def test_a_bomb_is_inflated_no_further_than_the_picture_needs(monkeypatch):
 
 
 def test_a_missing_library_says_what_to_do(monkeypatch, tmp_path):
-    monkeypatch.setattr(module, "LIBRARY", tmp_path / "_unfilter.so")
-    module._library.cache_clear()
-    with pytest.raises(StreetfixError, match=r"_unfilter\.so is missing .* install the package again"):
-        module._library()
-    module._library.cache_clear()
+    monkeypatch.setattr(depth16, "LIBRARY", tmp_path / "_depth16.so")
+    depth16.library.cache_clear()
+    with pytest.raises(StreetfixError, match=r"_depth16\.so is missing .* install the package again"):
+        depth16.library()
+    depth16.library.cache_clear()

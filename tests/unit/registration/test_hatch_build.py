@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
-C_FILES = ("service/registration/kernel.c", "service/imaging/gather.c", "service/imaging/unfilter.c")
+C_FILES = ("service/registration/kernel.c", "service/imaging/gather.c", "service/imaging/depth16.c")
 T = TypeVar("T")
 
 
@@ -114,7 +114,7 @@ def test_each_file_is_compiled_beside_its_source(hook, machine, commands, tree, 
     assert data["artifacts"] == [
         "/service/registration/_kernel.so",
         "/service/imaging/_gather.so",
-        "/service/imaging/_unfilter.so",
+        "/service/imaging/_depth16.so",
     ]
 
 

@@ -23,6 +23,7 @@ class DepthEncoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     DEPTH_ENCODING_UNSPECIFIED: _ClassVar[DepthEncoding]
     DEPTH_ENCODING_CARLA: _ClassVar[DepthEncoding]
+    DEPTH_ENCODING_COMPRESSED_DEPTH: _ClassVar[DepthEncoding]
 
 class LocalizationStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -44,6 +45,7 @@ DEPTH_KIND_RANGE: DepthKind
 DEPTH_KIND_DISPARITY: DepthKind
 DEPTH_ENCODING_UNSPECIFIED: DepthEncoding
 DEPTH_ENCODING_CARLA: DepthEncoding
+DEPTH_ENCODING_COMPRESSED_DEPTH: DepthEncoding
 LOCALIZATION_STATUS_UNSPECIFIED: LocalizationStatus
 LOCALIZATION_STATUS_LOCALIZED: LocalizationStatus
 LOCALIZATION_STATUS_AMBIGUOUS: LocalizationStatus

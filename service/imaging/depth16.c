@@ -1,3 +1,5 @@
+/* Two lossless codecs of 16-bit depth pictures. */
+
 /* Takes the filters off the rows of a 16-bit grey PNG (RFC 2083, section 6): out has height x width native values.
  * raw holds height rows of one filter byte and 2 x width sample bytes, the higher one first; Python has checked its size.
  * Returns the number of rows before the first whose filter is unknown. */
@@ -57,4 +59,56 @@ int64_t streetfix_unfilter(uint8_t *raw, int64_t height, int64_t width, uint16_t
         before = row;
     }
     return height;
+}
+
+/* Nibbles of 32-bit words, the highest first; a number is groups of three bits, the lowest first, the fourth says that more follow. */
+typedef struct {
+    const uint8_t *at, *end;
+    uint32_t word;
+    int left, bad;
+} Nibbles;
+
+static uint32_t number_of(Nibbles *n) {
+    uint32_t value = 0;
+    for (int shift = 0; shift < 32; shift += 3) {
+        if (n->left == 0) {
+            if (n->end - n->at < 4) {
+                n->bad = 1;
+                return 0;
+            }
+            n->word = (uint32_t)n->at[0] | (uint32_t)n->at[1] << 8 | (uint32_t)n->at[2] << 16 | (uint32_t)n->at[3] << 24;
+            n->at += 4;
+            n->left = 8;
+        }
+        const uint32_t nibble = n->word >> 28;
+        n->word <<= 4;
+        n->left--;
+        value |= (nibble & 7) << shift;
+        if (!(nibble & 8)) return value;
+    }
+    n->bad = 1;
+    return 0;
+}
+
+/* RVL (Wilson, ISS 2017), as ROS' compressedDepth carries it: runs of zeros, and of differences in zigzag.
+ * Returns the number of pixels that were read; fewer than there are if the data are damaged or end early. */
+int64_t streetfix_rvl(const uint8_t *data, int64_t length, int64_t pixels, uint16_t *out) {
+    Nibbles n = {data, data + length, 0, 0, 0};
+    int64_t done = 0;
+    uint32_t before = 0;
+    while (done < pixels) {
+        const uint32_t zeros = number_of(&n);
+        if (n.bad || zeros > (uint64_t)(pixels - done)) return done;
+        memset(out + done, 0, zeros * sizeof *out);
+        done += zeros;
+        const uint32_t values = number_of(&n);
+        if (n.bad || values > (uint64_t)(pixels - done) || (zeros == 0 && values == 0)) return done;
+        for (uint32_t k = 0; k < values; k++) {
+            const uint32_t zigzag = number_of(&n);
+            if (n.bad) return done;
+            before += (zigzag >> 1) ^ (0u - (zigzag & 1));
+            out[done++] = (uint16_t)before;
+        }
+    }
+    return done;
 }

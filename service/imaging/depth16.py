@@ -1,0 +1,26 @@
+"""The compiled codecs of 16-bit depth."""
+
+import ctypes
+from ctypes import c_int64, c_void_p
+from functools import cache
+from pathlib import Path
+
+from service.errors import StreetfixError
+
+LIBRARY = Path(__file__).with_name("_depth16.so")
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Loaded once.
+
+    Raises:
+        StreetfixError: it was not compiled.
+    """
+    if not LIBRARY.exists():
+        raise StreetfixError(f"{LIBRARY.name} is missing beside {__file__}: install the package again (pip install .)")
+    found = ctypes.CDLL(str(LIBRARY))
+    found.streetfix_unfilter.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
+    found.streetfix_rvl.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
+    found.streetfix_unfilter.restype = found.streetfix_rvl.restype = c_int64
+    return found
