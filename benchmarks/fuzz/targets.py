@@ -23,7 +23,7 @@ from service.geometry.camera import PinholeCamera
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.messages import request_from, sequence_request_from
 from service.http.body import split_multipart
-from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
+from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb
 from service.imaging.depth_formats import write_raw16
 from service.imaging.depth_units import depth_from_values
 from service.localization.localizer import Localizer
@@ -132,10 +132,11 @@ def _depth(data: bytes) -> None:
     if not data:
         return
     how, data = data[0], data[1:]
-    kind = ("z", "range", "disparity")[how % 3]
+    kind: DepthKind = ("z", "range", "disparity")[how % 3]  # type: ignore[assignment]  # an index of three
+    encoding: DepthEncoding = "carla" if how & 8 else "compressed_depth" if how & 64 else "auto"
     decode_depth(
-        data, camera=CAMERA, encoding="carla" if how & 8 else "compressed_depth" if how & 64 else None, scale_m=0.001 if how & 16 else None, kind=kind,  # type: ignore[arg-type]
-        baseline_m=0.1, max_range_m=40.0 if how & 32 else None, limits=LIMITS,
+        data, camera=CAMERA, encoding=encoding, scale_m=0.001 if how & 16 else None, kind=kind, baseline_m=0.1,
+        max_range_m=40.0 if how & 32 else None, limits=LIMITS,
     )  # fmt: skip
 
 
