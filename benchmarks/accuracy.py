@@ -7,7 +7,6 @@ finished is kept under ``--work`` and reused, so an interrupted run goes on.
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from benchmarks.conditions import condition_rows
 from benchmarks.doubt import doubt_rows
@@ -23,7 +22,6 @@ from benchmarks.weather import weather_rows
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.stock import ENCODER
 from service.localization.encoder import Encoder
-
 
 #: Query sets of the unseen cities: how their rows are called, and the bar of R@1.
 UNSEEN = {
