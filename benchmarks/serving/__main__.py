@@ -31,6 +31,17 @@ def site_from(arguments: argparse.Namespace) -> Site:
     return Site(runs.bundle(dataset).path, dataset.folder, arguments.queries, PAIRS)
 
 
+def peer_rows(report: Report) -> None:
+    """The same pipeline hosted by others: rows without a value until somebody measures them."""
+    why = "LitServe, BentoML, MLServer and Ray Serve have not been measured with this pipeline yet"
+    for row, bar in (
+        ("throughput_over_best.retrieval", 1.2),
+        ("throughput_over_best.full", 1.02),
+        ("p99_under_best", 1.0),
+    ):
+        report.row(f"peers.{row}", None, "ratio", bar=bar, better="lower" if "p99" in row else "higher", why=why)
+
+
 def main() -> None:
     """Parse, measure, write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -68,6 +79,7 @@ def main() -> None:
         "sizes": lambda: size_rows(report, site, core=core),
         "hostile": lambda: hostile_rows(report, site, core=core),
         "both_cores": lambda: ratio_rows(report, site, seconds=seconds, rounds=1, core=None, suffix=".both_cores"),
+        "peers": lambda: peer_rows(report),
         "soak": lambda: soak_rows(report, site, minutes=arguments.soak_minutes, core=core),
     }
     if unknown := set(arguments.only or ()) - set(parts):
