@@ -5,6 +5,7 @@ that is simulated or built is kept under ``--work``, where ``make evaluate`` kee
 """
 
 import argparse
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -57,9 +58,8 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     site = site_from(arguments)
-    report = Report(
-        "serving", "make bench-serving" + (f' ARGS="--only {" ".join(arguments.only)}"' if arguments.only else "")
-    )
+    told = " ".join(sys.argv[1:])
+    report = Report("serving", "make bench-serving" + (f' ARGS="{told}"' if told else ""))
     if arguments.only:
         report.keep_others()
     counts = MapBundle.open(site.bundle, verify=False).manifest.counts
