@@ -17,13 +17,14 @@ from benchmarks.report import ROOT
 from model_training.loadtest.processes import Usage, usage
 
 SERVED_CORE, LOADING_CORE = 0, 1
+_CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 _SERVE = [sys.executable, "-c", "from service.cli.main import main; main()", "serve"]
 
 
 def pin(pid: int, core: int | None) -> None:
     """Keep a process, and what it starts, on one core; None lets it have all."""
-    if core is not None and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(pid, {core})
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(pid, _CORES if core is None else {core})
 
 
 class Server:

@@ -112,28 +112,37 @@ def serve(settings: "Settings") -> None:
     """
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
-    with _listen(settings.host, settings.port) as listener:
-        if settings.workers == 1:
+    if settings.workers == 1:
+        with _listen(settings.host, settings.port) as listener:
             _answer(settings, listener)
-        else:
-            _answer_by_workers(settings, listener)
+    else:
+        _answer_by_workers(settings)
     typer.echo("stopped")
 
 
-def _answer_by_workers(settings: "Settings", listener: socket.socket) -> None:
-    """Several processes on one listening socket; what they count together, and what an operator chose, lies in a folder of theirs."""
+def _answer_by_workers(settings: "Settings") -> None:
+    """Several processes on the same ports; what they count together, and what an operator chose, lies in a folder of theirs.
+
+    Each listens on a socket of its own, between which the system spreads connections: of one socket that all share, whoever is quick
+    takes all connections of clients that keep them.
+    """
     from service.cli.workers import supervise
     from service.runtime.choices import Choices
 
-    with tempfile.TemporaryDirectory(prefix="streetfix-") as folder, _shared_port(settings) as grpc_port:
+    with (
+        tempfile.TemporaryDirectory(prefix="streetfix-") as folder,
+        _held_port(settings.host, settings.port) as port,
+        _held_port(settings.host, settings.grpc_port) as grpc_port,
+    ):
         counts = Path(folder) / "metrics"
         counts.mkdir()
         os.environ[METRICS_FOLDER] = str(counts)  # Prometheus' client looks here when it is imported, which workers do
-        shared = settings.model_copy(update={"grpc_port": grpc_port})
+        shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port})
         choices = Path(folder) / "choices.json"
 
         def work(number: int, ready: Callable[[], None]) -> None:
-            _answer(shared, listener, choices=Choices(choices), ready=ready, says_where=number == 0)
+            with _listen(shared.host, shared.port, shared=True) as listener:
+                _answer(shared, listener, choices=Choices(choices), ready=ready, says_where=number == 0)
 
         def fell(pid: int) -> None:
             for path in counts.glob(f"gauge_live*_{pid}.db"):  # what it had in hand it has no more
@@ -145,19 +154,24 @@ def _answer_by_workers(settings: "Settings", listener: socket.socket) -> None:
 
 
 @contextmanager
-def _shared_port(settings: "Settings") -> Iterator[int | None]:
-    """The port of gRPC, held for the workers, each of which listens on it; chosen by the system where it is 0."""
-    if settings.grpc_port is None:
+def _held_port(host: str, port: int | None) -> Iterator[int | None]:
+    """A port for the workers, each of which listens on it; chosen by the system where it is 0.
+
+    Raises:
+        AddressError: it is taken.
+    """
+    if port is None:
         yield None
         return
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    with socket.socket(family) as holder:
+    with _listen(host, port) as alone:  # a service that shares its ports would else be joined by another one in silence
+        chosen = int(alone.getsockname()[1])
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as holder:
         holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         try:
-            holder.bind((settings.host, settings.grpc_port))
+            holder.bind((host, chosen))
         except OSError as error:
-            raise _cannot_listen(settings.host, settings.grpc_port, error) from error
-        yield holder.getsockname()[1]
+            raise _cannot_listen(host, chosen, error) from error
+        yield chosen
 
 
 def _answer(
@@ -236,10 +250,10 @@ def _watching(engine: "Engine") -> Iterator[None]:
         watcher.stop()
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int, *, shared: bool = False) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG, reuse_port=shared)
     except OSError as error:
         raise _cannot_listen(host, port, error) from error
 

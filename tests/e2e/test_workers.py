@@ -144,3 +144,13 @@ def test_a_map_that_cannot_be_opened_ends_the_service_with_its_message(folder: P
     assert done.returncode == 1
     assert "manifest.json" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_port_that_is_taken_is_refused_though_workers_share_theirs(service: Service, folder: Path) -> None:
+    port = service.url.rsplit(":", 1)[1]
+    done = subprocess.run(
+        [*COMMAND, str(folder), "--workers", "2", "--port", port], env={"PATH": ""}, capture_output=True, text=True, timeout=60,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert f"cannot listen on 127.0.0.1:{port}" in done.stderr
