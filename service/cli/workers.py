@@ -51,11 +51,13 @@ def supervise(count: int, work: Work, *, fell: Callable[[int], None] = lambda _:
             running[_forked(number, work, told)] = number
         while running:
             pid, status = os.wait()
-            number, bad = running.pop(pid), os.waitstatus_to_exitcode(status) != 0
+            number, ended = running.pop(pid), os.waitstatus_to_exitcode(status)
             answered.update(_bytes(ready))
             fell(pid)
             if leaving:
-                code = code or int(bad)
+                code = code or int(
+                    ended not in (0, -signal.SIGTERM)
+                )  # a signal before it had a handler ends it as well
             elif number not in answered:
                 code = 1
                 pass_on(signal.SIGTERM, None)

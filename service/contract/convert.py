@@ -258,7 +258,7 @@ def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
 
 def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
     direction = np.array([vector.x, vector.y, vector.z])
-    length = float(np.linalg.norm(direction))
+    length = math.hypot(*direction)
     if not 1e-6 < length < 1e9:
         raise RequestError(
             f"{field}: a vector of length {length:g} has no direction; send the accelerometer's", field=field
@@ -285,7 +285,7 @@ def transform_of(transform: schema.RigidTransform, name: str) -> NDArray[np.floa
     """
     q, p = transform.orientation, transform.position
     quaternion = np.array([q.x, q.y, q.z, q.w])
-    length = float(np.linalg.norm(quaternion))
+    length = math.hypot(*quaternion)  # no square of 1e200 on the way
     if not 1e-6 < length < 1e9:
         field = f"{name}.orientation"
         raise RequestError(f"{field}: a quaternion of length {length:g} is no rotation; send a unit one", field=field)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.contract import convert
+from service.contract import convert, schema
 from service.contract.convert import answer_from, parsed, query_from
 from service.contract.schema import LocalizeRequest
 from service.errors import RequestError
@@ -184,3 +184,15 @@ def test_two_streets_that_look_alike_are_two_hypotheses_of_the_same_share_until_
 
 def test_an_answer_is_json(localized):
     assert json.loads(answer_from(localized).model_dump_json(by_alias=True))["hypotheses"][0]["share"] <= 1
+
+
+@pytest.mark.parametrize("size", [1e200, 1e308, 0.0, 1e-300])
+def test_numbers_whose_squares_are_none_are_refused_like_any_other(size):
+    """Found by Schemathesis: an overflow on the way to the message."""
+    vector = schema.Vector(x=size, y=size, z=size)
+    with pytest.raises(RequestError, match="gravity"):
+        convert._down(vector)
+    quaternion = schema.Quaternion(x=size, y=0.0, z=0.0, w=size)
+    origin = schema.Position(x=0.0, y=0.0, z=0.0)
+    with pytest.raises(RequestError, match=r"orientation: a quaternion of length"):
+        convert.transform_of(schema.RigidTransform(position=origin, orientation=quaternion), "T_vehicle_camera")
