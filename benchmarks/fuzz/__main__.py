@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 from benchmarks.report import ROOT, Report
@@ -69,7 +69,11 @@ def _bundle(folder: Path) -> Path:
     """The tests' own small map."""
     from service.maps.writer import write_bundle
 
-    factory = SourceFileLoader("tests_conftest", str(ROOT / "tests" / "conftest.py")).load_module()
+    spec = spec_from_file_location("tests_conftest", ROOT / "tests" / "conftest.py")
+    if spec is None or spec.loader is None:
+        raise RuntimeError("tests/conftest.py is missing: it makes the map that is fuzzed")
+    factory = module_from_spec(spec)
+    spec.loader.exec_module(factory)
     write_bundle(folder / "tiny", factory.make_content())
     return folder / "tiny"
 
