@@ -92,9 +92,6 @@ WHY_MISSED: dict[str, str] = {
         "with a seed that no choice was made on, and thresholds that accept more, the margin of five frames makes the answer sure "
         "although blocks repeat; calibration knows no repeating street; next: let it"
     ),
-    "registration.cpu_ms_per_query.stereo": (
-        "27.7 and 30.0 in the report before, by the same code; the machine was busier with others when this was read"
-    ),
     "cpu_over_bare.full.rest": (
         "reading and splitting the body, JSON and the event loop take 2.5 ms of 42; gRPC takes 2.1"
     ),
@@ -108,9 +105,5 @@ WHY_MISSED: dict[str, str] = {
     "overload.refusal_p99_ms": (
         "refused before the body is read, yet the event loop shares Python's lock with the worker and the generator one core with "
         "itself: which of them it waits for was not measured"
-    ),
-    "registration.cpu_ms_per_query.precise": (
-        "25.4 before the covariance's patches came; read at 25.7 (40.2 less 14.5 ms) by the serving report's idle minutes and "
-        "at 49 half an hour later on the same machine: times here are ratios"
     ),
 }
