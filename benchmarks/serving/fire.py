@@ -19,6 +19,7 @@ from benchmarks.serving.loads import closed, load, opened
 from benchmarks.serving.machines import Server
 from benchmarks.serving.ratios import MANY, Site
 from model_training.loadtest.drive import Load
+from model_training.loadtest.payloads import Payload
 from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import read_manifest
 
@@ -78,25 +79,13 @@ def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
     with tempfile.TemporaryDirectory(dir=site.bundle.parent) as name:
         folder = Path(name)
         newest, _ = _version_of(site.bundle, folder, 0)
-        with Server(folder, core=core) as server:
-            failed, answers, stop = [], [], threading.Event()
-            clients = [
-                threading.Thread(
-                    target=_ask_until, args=(server.url, sent[k].body, sent[k].content_type, stop, answers, failed)
-                )
-                for k in range(4)
-            ]
-            for client in clients:
-                client.start()
+        with Server(folder, core=core) as server, asking(server.url, sent[:4]) as (answers, failed):
             for number in range(1, SWAPS + 1):
                 oldest = newest
                 newest, version = _version_of(site.bundle, folder, number)
                 server.process.send_signal(signal.SIGHUP)
                 _until_served(server.url, version)
                 shutil.rmtree(oldest)
-            stop.set()
-            for client in clients:
-                client.join()
     versions = set(answers)
     report.row("swap.versions_that_answered", len(versions), "count")
     report.row("swap.failed_requests", len(failed), "count", bar=0, better="lower", n=len(answers) + len(failed),
@@ -124,42 +113,44 @@ def _until_served(url: str, version: str) -> None:
         time.sleep(0.02)
 
 
-def _ask_until(
-    url: str, body: bytes, content_type: str, stop: threading.Event, answers: list[str], failed: list[str]
-) -> None:
-    with httpx.Client(base_url=url, timeout=60) as client:
-        while not stop.is_set():
-            try:
-                found = client.post("/v1/localize", content=body, headers={"Content-Type": content_type})
-            except httpx.HTTPError as error:
-                failed.append(repr(error))
-                continue
-            if found.status_code == 200:
-                answers.append(found.json()["map"]["version"])
-            else:
-                failed.append(f"{found.status_code} {found.text[:200]}")
+@contextmanager
+def asking(url: str, sent: list[Payload]) -> Iterator[tuple[list[str], list[str]]]:
+    """A client for each request, which sends it again and again inside; versions that answered, and what failed."""
+    answers, failed, stop = list[str](), list[str](), threading.Event()
+
+    def ask(payload: Payload) -> None:
+        with httpx.Client(base_url=url, timeout=60, headers={"Content-Type": payload.content_type}) as client:
+            while not stop.is_set():
+                try:
+                    found = client.post("/v1/localize", content=payload.body)
+                except httpx.HTTPError as error:
+                    failed.append(repr(error))
+                    continue
+                if found.status_code == 200:
+                    answers.append(found.json()["map"]["version"])
+                else:
+                    failed.append(f"{found.status_code} {found.text[:200]}")
+
+    clients = [threading.Thread(target=ask, args=(each,)) for each in sent]
+    for client in clients:
+        client.start()
+    try:
+        yield answers, failed
+    finally:
+        stop.set()
+        for client in clients:
+            client.join()
 
 
 def sigterm_rows(report: Report, site: Site, *, core: int | None) -> None:
     """Clients that stop asking when readiness goes, as a balancer's do; every request before that is answered."""
-    sent, answers, failed, stop = site.payloads(refine=True), list[str](), list[str](), threading.Event()
     with Server(site.bundle, core=core, drain_s=3) as server:
-        clients = [
-            threading.Thread(
-                target=_ask_until, args=(server.url, sent[k].body, sent[k].content_type, stop, answers, failed)
-            )
-            for k in range(4)
-        ]
-        for client in clients:
-            client.start()
-        time.sleep(3)
-        server.process.send_signal(signal.SIGTERM)
-        with httpx.Client(base_url=server.url, timeout=10) as watcher:
-            while watcher.get("/readyz").status_code == 200:
-                time.sleep(0.05)
-        stop.set()
-        for client in clients:
-            client.join()
+        with asking(server.url, site.payloads(refine=True)[:4]) as (answers, failed):
+            time.sleep(3)
+            server.process.send_signal(signal.SIGTERM)
+            with httpx.Client(base_url=server.url, timeout=10) as watcher:
+                while watcher.get("/readyz").status_code == 200:
+                    time.sleep(0.05)
         code = server.process.wait(60)
     report.row("sigterm.failed_requests", len(failed), "count", bar=0, better="lower", n=len(answers) + len(failed),
                why=f"first: {failed[0]}" if failed else None)  # fmt: skip

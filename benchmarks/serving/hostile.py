@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 
 from benchmarks.report import Report
-from benchmarks.serving.fire import _ask_until
+from benchmarks.serving.fire import asking
 from benchmarks.serving.machines import Server
 from benchmarks.serving.ratios import Site
 
@@ -29,40 +29,31 @@ def hostile_rows(report: Report, site: Site, *, core: int | None) -> None:
     good = {"rgb": _part(sent[0].body, b"rgb"), "depth": _part(sent[0].body, b"depth"), "request": _REQUEST}
     kinds = hostile_kinds(good)
     with Server(site.bundle, core=core, request_timeout_s=10) as server:
-        answers, failed, stop, peak = list[str](), list[str](), threading.Event(), [0.0]
-        others = [
-            threading.Thread(
-                target=_ask_until, args=(server.url, sent[k].body, sent[k].content_type, stop, answers, failed)
-            )
-            for k in range(2)
-        ]
-        for other in others:
-            other.start()
-        time.sleep(5)
-        idle = server.used.resident_mib
+        with asking(server.url, sent[:2]) as (answers, failed):
+            time.sleep(5)
+            idle, peak, over = server.used.resident_mib, [0.0], threading.Event()
 
-        def watch() -> None:
-            while not stop.wait(0.05):
-                peak[0] = max(peak[0], server.used.resident_mib)
+            def watch() -> None:
+                while not over.wait(0.05):
+                    peak[0] = max(peak[0], server.used.resident_mib)
 
-        watcher = threading.Thread(target=watch)
-        watcher.start()
-        told: dict[str, set[str]] = {name: set() for name in kinds}
-        until = time.monotonic() + SECONDS
+            watcher = threading.Thread(target=watch)
+            watcher.start()
+            told: dict[str, set[str]] = {name: set() for name in kinds}
+            until = time.monotonic() + SECONDS
 
-        def attack(number: int) -> None:
-            names = list(kinds)
-            while time.monotonic() < until:
-                name = names[number % len(names)]
-                told[name].add(kinds[name](server.url))
-                number += AT_ONCE // 2 + 1
+            def attack(number: int) -> None:
+                names = list(kinds)
+                while time.monotonic() < until:
+                    name = names[number % len(names)]
+                    told[name].add(kinds[name](server.url))
+                    number += AT_ONCE // 2 + 1
 
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            list(pool.map(attack, range(AT_ONCE)))
+            with ThreadPoolExecutor(AT_ONCE) as pool:
+                list(pool.map(attack, range(AT_ONCE)))
+            over.set()
+            watcher.join()
         lives = httpx.get(f"{server.url}/livez", timeout=10).status_code == 200
-        stop.set()
-        for thread in (*others, watcher):
-            thread.join()
     report.notes["hostile"] = {name: sorted(each) for name, each in sorted(told.items())}
     report.row("hostile.kinds", len(kinds), "count")
     report.row("hostile.peak_mib", peak[0] - idle, "MiB", bar=200, better="lower", n=len(kinds))

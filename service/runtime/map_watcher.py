@@ -1,6 +1,7 @@
 """Sees new bundles in the mounted folders, opens and warms them, and only then lets them serve."""
 
 import logging
+import os
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -135,10 +136,11 @@ class MapWatcher:
 def stamp_of(path: Path) -> Stamp:
     """Of a bundle's folder as it is now."""
     files = []
-    for file in sorted(path.rglob("*")):
+    # os.walk passes over folders that vanish under it, as those of a bundle that is being removed do.
+    for file in (Path(folder) / name for folder, _, names in os.walk(path) for name in names):
         try:
             status = file.stat()
         except OSError:  # being replaced
             continue
         files.append((file.relative_to(path).as_posix(), status.st_size, status.st_mtime_ns))
-    return tuple(files)
+    return tuple(sorted(files))

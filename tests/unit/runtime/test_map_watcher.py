@@ -11,7 +11,7 @@ from service.localization.localizer import Localizer
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.map_registry import MapRegistry
-from service.runtime.map_watcher import MapWatcher
+from service.runtime.map_watcher import MapWatcher, stamp_of
 
 Content = Callable[..., BundleContent]
 
@@ -170,3 +170,19 @@ def _until(true: Callable[[], bool]) -> None:
     while not true():
         assert time.monotonic() < until
         os.sched_yield()
+
+
+def test_a_folder_that_vanishes_while_it_is_looked_at_does_no_harm(
+    bundle_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found by fifty swaps under load: a bundle was being removed."""
+    whole = stamp_of(bundle_copy)
+    real, gone = os.scandir, bundle_copy / "cloud"
+
+    def scandir(path: str) -> object:
+        if Path(path) == gone:
+            raise FileNotFoundError(path)
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert stamp_of(bundle_copy) == tuple(each for each in whole if not each[0].startswith("cloud/"))
