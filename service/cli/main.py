@@ -29,6 +29,19 @@ _KNOWN = {
 }
 
 
+#: Packages that only some of a command's work needs, and the extra that brings each.
+_EXTRA_OF_PACKAGE = {
+    "rosbags": "ros",
+    "laspy": "las",
+    "osmium": "geo",
+    "pyproj": "geo",
+    "gtsam": "odometry",
+    "kiss_icp": "odometry",
+    "carla": "carla",
+    "cyclonedds": "ros2",
+}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage."""
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -104,5 +117,6 @@ def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any]:
 
 
 def _extra_missing(point: EntryPoint, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
+    extra = _EXTRA_OF_PACKAGE.get((error.name or "").partition(".")[0], extra)
     remedy = f'pip install "streetfix[{extra}]"' if extra else "install the packages it needs"
     return ExtraMissingError(f"the command {point.name!r} needs the package {error.name!r}: {remedy}", field=point.name)
