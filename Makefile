@@ -94,14 +94,13 @@ reports: .venv/.torch ## all reports as one page with plots
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS)
 	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --start-from runs/stock
-	$(BIN)/streetfix average runs/stock runs/second --run runs/mean
-	$(BIN)/streetfix export runs/mean --out model_training/stock/encoder.onnx
+	$(BIN)/streetfix export runs/second --out model_training/stock/encoder.onnx
 
 calibration: .venv/.torch ## ask calibration cities and fit confidence anew, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)
 
 paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there
-	$(BIN)/streetfix train --recipe paper --start-from runs/mean --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper
+	$(BIN)/streetfix train --recipe paper --start-from runs/second --rate 5e-4 --steps $(PAPER_STEPS) --run runs/paper
 	$(BIN)/streetfix export runs/paper --out runs/paper/encoder.onnx
 
 install-demo: .venv/.mapping ## what the demo needs, and no more

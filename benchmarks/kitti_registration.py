@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.report import Report
 from benchmarks.runs import Runs
 from model_training.datasets.dataset import Dataset
-from model_training.datasets.kitti_object import import_kitti_object
+from model_training.importing.kitti_object import import_kitti_object
 from model_training.mapping.build import BuildSettings
 from service.geometry.rigid import rotation_z, transform_from
 from service.imaging.level import level_camera

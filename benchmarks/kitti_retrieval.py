@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from model_training.baselines.raw_range import similarities
 from model_training.datasets.dataset import Dataset
-from model_training.datasets.kitti_object import import_kitti_object
+from model_training.importing.kitti_object import import_kitti_object
 from model_training.mapping.build import BuildSettings, fan, levelled_scans
 from service.geometry.camera import PinholeCamera
 from service.imaging.query_view import query_view

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model_training.cli.progress import Report
 from model_training.datasets.dataset import CameraSensor, Dataset, QueryFrame
-from model_training.datasets.kitti_object import import_kitti_object
+from model_training.importing.kitti_object import import_kitti_object
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.simulate import simulate

@@ -7,30 +7,114 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.datasets.kitti_object import import_kitti_object
+from model_training.importing.extrinsics import Extrinsics, read_extrinsics
+from model_training.importing.kinds import KINDS, DepthFrom, OpenSettings, open_recording
+from model_training.importing.kitti_object import import_kitti_object
+from model_training.importing.pose_file import read_pose_file
+from model_training.importing.recording import Recording
+from model_training.importing.ros_topics import ROLES
+from model_training.importing.take import TakeSettings, TakeSummary, take
+from model_training.importing.trajectory import Sync, Trajectory
 from service.errors import DatasetError
 
-KINDS = ("kitti-object",)
-DEPTHS = ("stored", "sgbm")
+#: Frames without poses, each a place of its own, are imported another way than drives.
+SINGLE_FRAMES = "kitti-object"
+DEPTHS = ("recorded", "stored", "sgbm", "lidar")
+_HELP = f"format: {', '.join(sorted([*KINDS, SINGLE_FRAMES]))}"
 
 
 def command(
-    kind: Annotated[str, typer.Argument(help="layout of the recording: kitti-object")],
-    source: Annotated[Path, typer.Argument(help="folder of the recording")],
+    kind: Annotated[str, typer.Argument(help=_HELP)],
+    source: Annotated[Path, typer.Argument(help="file or folder of the recording")],
     out: Annotated[Path, typer.Option(help="folder to write the dataset to")],
     depth: Annotated[
-        str, typer.Option(help="stored: the depth that lies beside; sgbm: from the stereo pair by OpenCV")
-    ] = "sgbm",
+        str,
+        typer.Option(
+            help="what a picture's depth is: recorded or stored beside it, sgbm of the stereo pair, lidar for the scan "
+            "nearest in time [default: recorded; kitti-object: sgbm]"
+        ),
+    ] = "",
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="TUM file (timestamp x y z qx qy qz qw) instead of the recording's own poses"),
+    ] = None,
+    queries: Annotated[str, typer.Option(help="query set that pictures go to")] = "recorded",
+    pictures: Annotated[bool, typer.Option(help="take pictures at all")] = True,
+    hold_out: Annotated[
+        int,
+        typer.Option(
+            help="leave each such scan out of the survey, and take only pictures near those as queries", min=0
+        ),
+    ] = 0,
+    sync: Annotated[str, typer.Option(help="how a frame's pose is found: interpolate, or nearest")] = "interpolate",
+    tolerance: Annotated[float, typer.Option(help="seconds that a pose or scan may be from a frame", min=0)] = 0.1,
+    topic: Annotated[
+        list[str] | None, typer.Option(help=f"of a bag, ROLE=NAME; roles: {', '.join(ROLES)} [default: guessed]")
+    ] = None,
+    extrinsics: Annotated[
+        Path | None, typer.Option(help="JSON with T_vehicle_lidar and T_vehicle_camera, where the recording lacks them")
+    ] = None,
+    rectified: Annotated[
+        bool | None, typer.Option(help="a bag's pictures are rectified already [default: if the topic's name says so]")
+    ] = None,
+    deskew: Annotated[
+        bool, typer.Option(help="take the vehicle's motion out of scans that tell their points' times")
+    ] = True,
 ) -> None:
     """Turn somebody else's recording into a dataset folder.
 
+    Frames that cannot be used are counted by reason and left out.
+
     \b
     Example:
+      streetfix import kitti-raw 2011_09_26_drive_0005_sync --depth sgbm --out data/drive
+      streetfix import rosbag drive.mcap --topic scan=/ouster/points --out data/drive
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
     """
-    if kind not in KINDS:
-        raise DatasetError(f"kind: {kind!r} is not known; there is: {', '.join(KINDS)}", field="kind")
-    if depth not in DEPTHS:
+    if depth and depth not in DEPTHS:
+        raise DatasetError(f"depth: {depth!r} is none of: {', '.join(DEPTHS)}", field="depth")
+    if kind == SINGLE_FRAMES:
+        _single_frames(source, out, depth or "sgbm")
+        return
+    if sync not in ("interpolate", "nearest"):
+        raise DatasetError(f"sync: {sync!r} is neither 'interpolate' nor 'nearest'", field="sync")
+    settings = TakeSettings(
+        queries=queries if pictures else "", depth="lidar" if depth == "lidar" else "recorded", sync=cast(Sync, sync),
+        tolerance_s=tolerance, deskew=deskew, hold_out=hold_out,
+    )  # fmt: skip
+    told = OpenSettings(
+        depth=cast(DepthFrom, depth or "recorded"), topics=_topics(topic or []), rectified=rectified,
+        extrinsics=Extrinsics() if extrinsics is None else read_extrinsics(extrinsics),
+    )  # fmt: skip
+    recording = open_recording(kind, source, told)
+    console = Console()
+    for line in recording.notes.lines:
+        console.print(line, soft_wrap=True)
+    trajectory = _trajectory(recording, source, poses)
+    with bars() as report:
+        summary = take(recording, trajectory, out, settings, report=report)
+    _tell(console, out, summary)
+
+
+def _topics(told: list[str]) -> dict[str, str]:
+    topics = {}
+    for text in told:
+        role, equals, name = text.partition("=")
+        if not equals or not name:
+            raise DatasetError(f"topic: {text!r} is not ROLE=NAME, such as scan=/points", field="topic")
+        topics[role] = name
+    return topics
+
+
+def _trajectory(recording: Recording, source: Path, poses: Path | None) -> Trajectory:
+    trajectory = read_pose_file(poses) if poses is not None else recording.trajectory()
+    if trajectory is None:
+        raise DatasetError(f"{source}: the recording has no poses; name a TUM file with --poses", field="poses")
+    return trajectory
+
+
+def _single_frames(source: Path, out: Path, depth: str) -> None:
+    if depth not in ("stored", "sgbm"):
         raise DatasetError(f"depth: {depth!r} is neither 'stored' nor 'sgbm'", field="depth")
     with bars() as report:
         summary = import_kitti_object(
@@ -43,3 +127,12 @@ def command(
     console.print(f"{out}: {summary.places} places, query sets: frames {summary.frames}, elsewhere {summary.elsewhere}")
     if summary.skipped:
         console.print(f"left out, since they have no depth: {', '.join(summary.skipped)}")
+
+
+def _tell(console: Console, out: Path, summary: TakeSummary) -> None:
+    held = f" ({summary.held_out} held out)" if summary.held_out else ""
+    console.print(f"{out}: {summary.scans} scans{held}, {summary.pictures} picture pairs", soft_wrap=True)
+    if summary.points_without_numbers:
+        console.print(f"left out: {summary.points_without_numbers} points that are no numbers")
+    for line in summary.dropped:
+        console.print(f"left out: {line}", soft_wrap=True)

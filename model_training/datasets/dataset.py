@@ -155,7 +155,11 @@ class Dataset:
 
     def survey_poses(self) -> Transforms:
         """T_map_lidar of every scan, (n, 4, 4)."""
-        return read_tum(self.folder / "survey" / "poses.txt")[1]
+        return self.survey_trajectory()[1]
+
+    def survey_trajectory(self) -> tuple[NDArray[np.float64], Transforms]:
+        """Time (n), seconds, and T_map_lidar (n, 4, 4) of every scan."""
+        return read_tum(self.folder / "survey" / "poses.txt")
 
     def scan(self, number: int) -> NDArray[np.float32]:
         """Scan ``number``: (n, 4) x, y, z (m, LiDAR frame) and intensity, 0 where a sensor has none or a nonsensical one."""

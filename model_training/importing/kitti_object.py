@@ -25,10 +25,10 @@ from model_training.datasets.dataset import (
     write_description,
     write_tum,
 )
-from model_training.datasets.kitti_calibration import KittiCalibration, read_calibration
-from model_training.datasets.kitti_files import copy_scan, damaged, read_rgb, read_stored_depth
-from model_training.datasets.stereo import StereoMatching, depth_from_stereo
 from model_training.datasets.whole_folder import whole_or_not_at_all
+from model_training.importing.kitti_calibration import KittiCalibration, read_calibration
+from model_training.importing.kitti_files import copy_scan, damaged, read_rgb, read_stored_depth
+from model_training.importing.stereo import StereoMatching, depth_from_stereo
 from service.errors import DatasetError
 from service.geometry.rigid import Transform, inverse, transform_from
 
@@ -216,6 +216,7 @@ def _match(left: NDArray[np.uint8], right_path: Path, calibration: KittiCalibrat
     right = read_rgb(right_path)
     if right.shape != left.shape:
         raise damaged(right_path, f"it is {right.shape[:2]}, and its left picture is {left.shape[:2]}")
+    assert calibration.focal_baseline_px_m is not None  # noqa: S101  # the object layout always names both cameras
     depth_m = depth_from_stereo(left, right, focal_baseline_px_m=calibration.focal_baseline_px_m)
     values = np.rint(depth_m / DEPTH_SCALE_M)
     return np.where(values <= np.iinfo(np.uint16).max, values, 0).astype(np.uint16)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
-from model_training.datasets.kitti_object import import_kitti_object
+from model_training.importing.kitti_object import import_kitti_object
 from service.errors import DatasetError
 from service.geometry.rigid import inverse, transform_points
 

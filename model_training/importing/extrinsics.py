@@ -1,0 +1,48 @@
+"""Mountings that a recording does not tell, in a JSON file."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from service.errors import DatasetError
+from service.geometry.rigid import Transform
+
+_KEYS = ("T_vehicle_lidar", "T_vehicle_camera")
+
+
+@dataclass(frozen=True, slots=True)
+class Extrinsics:
+    """Where sensors stand on the vehicle; None where the recording tells."""
+
+    T_vehicle_lidar: Transform | None = None
+    T_vehicle_camera: Transform | None = None
+
+
+def read_extrinsics(path: Path) -> Extrinsics:
+    """Read ``{"T_vehicle_lidar": 4x4, "T_vehicle_camera": 4x4}``; the camera's frame is its optical one.
+
+    Raises:
+        DatasetError: the file is missing, not JSON, or a matrix in it is no rigid transform.
+    """
+    try:
+        loaded = json.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DatasetError(f"{path}: no JSON that can be read: {error}", field="extrinsics") from error
+    if not isinstance(loaded, dict) or not loaded.keys() <= set(_KEYS):
+        raise DatasetError(f"{path}: an object with {' and '.join(_KEYS)} is wanted", field="extrinsics")
+    return Extrinsics(**{key: _rigid(path, key, value) for key, value in loaded.items()})
+
+
+def _rigid(path: Path, key: str, value: object) -> Transform:
+    try:
+        T = np.array(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise DatasetError(f"{path}: {key} is no matrix of numbers", field=key) from error
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
+        raise DatasetError(f"{path}: {key} is not 4 rows of 4 numbers, the last 0 0 0 1", field=key)
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0:
+        raise DatasetError(f"{path}: {key} turns by no rotation (its columns are not square to each other)", field=key)
+    return T

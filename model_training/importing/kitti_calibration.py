@@ -1,0 +1,115 @@
+"""KITTI's calibration, in the layouts that its benchmarks came in: the left colour camera, the right one, and the LiDAR."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import DatasetError
+from service.geometry.rigid import Transform, transform_from
+
+Matrix = NDArray[np.float64]
+_OBJECT = {"P2": (3, 4), "P3": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+
+
+@dataclass(frozen=True, slots=True)
+class KittiCalibration:
+    """The left colour camera (2), its distance to the right one (3), and where the LiDAR stands.
+
+    Attributes:
+        fx: pixels, as are fy, cx and cy.
+        focal_baseline_px_m: fx times the baseline of cameras 2 and 3: z is this over the disparity; None where the right one is not told.
+        T_camera_lidar: takes LiDAR coordinates to the optical frame of camera 2, the offset in P2 included.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    focal_baseline_px_m: float | None
+    T_camera_lidar: Transform
+
+
+def read_calibration(path: Path) -> KittiCalibration:
+    """Read a frame's calibration of the object layout: ``calib/NNNNNN.txt`` with P2, P3, R0_rect and Tr_velo_to_cam.
+
+    Raises:
+        DatasetError: the file is missing, or a matrix in it is missing, broken or impossible.
+    """
+    matrices = read_matrices(path, _OBJECT)
+    return calibration_from(
+        path, P2=matrices["P2"], P3=matrices["P3"], R0=matrices["R0_rect"], Tr=matrices["Tr_velo_to_cam"]
+    )
+
+
+def calibration_from(path: Path, *, P2: Matrix, P3: Matrix | None, R0: Matrix, Tr: Matrix) -> KittiCalibration:
+    """Put the matrices together.
+
+    P2 is K [I | t], so t = K^-1 times its last column takes the rectified frame of camera 0 to that of camera 2.
+
+    Args:
+        path: where they were read, for messages.
+        P2: (3, 4) projection of the left colour camera, from the rectified frame of camera 0.
+        P3: (3, 4) of the right one.
+        R0: (3, 3) rectification of camera 0.
+        Tr: (3, 4) from the LiDAR to camera 0 before rectification.
+
+    Raises:
+        DatasetError: they are no rigid mounting, or no stereo pair.
+    """
+    K = P2[:, :3]
+    rotation = R0 @ Tr[:, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    baseline = None if P3 is None else float(P2[0, 3] - P3[0, 3])
+    if not is_rotation or K[0, 0] <= 0 or K[1, 1] <= 0 or (baseline is not None and baseline <= 0):
+        raise DatasetError(
+            f"{path}: R0_rect and Tr_velo_to_cam are no rotation, or P2 and P3 no pair with the right camera on "
+            "the right; take the file from the recording again",
+            field=path.name,
+        )
+    translation = R0 @ Tr[:, 3] + np.linalg.solve(K, P2[:, 3])
+    return KittiCalibration(
+        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), focal_baseline_px_m=baseline,
+        T_camera_lidar=transform_from(rotation, translation),
+    )  # fmt: skip
+
+
+def read_matrices(
+    path: Path, shapes: Mapping[str, tuple[int, ...]], *, optional: frozenset[str] = frozenset()
+) -> dict[str, Matrix]:
+    """Read ``KEY: numbers`` lines.
+
+    Args:
+        path: of the file.
+        shapes: the keys wanted, each with its shape.
+        optional: those that may be missing; they are then missing in the result too.
+
+    Raises:
+        DatasetError: the file is missing, or a matrix in it is missing or broken.
+    """
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(
+            f"{path} cannot be read ({error}); every frame that is used as a query needs its calibration",
+            field=path.name,
+        ) from error
+    rows = dict(line.split(":", 1) for line in lines if ":" in line)
+    matrices = {}
+    for key, shape in shapes.items():
+        if key in optional and key not in rows:
+            continue
+        try:
+            values = np.array(rows[key].split(), np.float64)
+            matrices[key] = values.reshape(shape)
+        except (KeyError, ValueError) as error:
+            size = "x".join(str(n) for n in shape)
+            raise DatasetError(
+                f"{path}: {key} is missing or is not {size} numbers; take the file from the recording again",
+                field=path.name,
+            ) from error
+        if not np.isfinite(values).all():
+            raise DatasetError(f"{path}: {key} is not finite; take the file from the recording again", field=path.name)
+    return matrices

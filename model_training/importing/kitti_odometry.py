@@ -1,0 +1,71 @@
+"""KITTI's odometry layout: ``sequences/NN/{velodyne,image_2,image_3,calib.txt,times.txt}`` and ``poses/NN.txt``."""
+
+from pathlib import Path
+
+import numpy as np
+
+from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
+from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
+from model_training.importing.trajectory import Trajectory
+from service.errors import DatasetError
+from service.geometry.rigid import inverse, transform_from
+
+
+def open_kitti_odometry(source: Path, *, depth: KittiDepth) -> KittiSequence:
+    """Open a sequence.
+
+    Args:
+        source: its folder, ``.../sequences/NN``.
+        depth: what a picture's depth comes from.
+
+    Raises:
+        DatasetError: a scan, calibration or time is missing or broken.
+    """
+    scans = numbered(source / "velodyne", (".bin",))
+    if not scans:
+        raise DatasetError(
+            f"{source}: a folder sequences/NN with velodyne/*.bin in it is wanted; here is no scan", field="source"
+        )
+    left, right = (numbered(source / camera, (".png", ".jpg")) for camera in ("image_2", "image_3"))
+    stored = numbered(source / "depth_2", (".png",))
+    calibration, T_lidar_cam0 = _calibration(source / "calib.txt")
+    numbers = sorted(scans.keys() | left.keys())
+    stamps = _times(source / "times.txt", numbers[-1])
+    frames = tuple(KittiFrame(f"{n:06d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers)  # fmt: skip
+    poses = _poses(source.parent.parent / "poses" / f"{source.name}.txt", stamps, T_lidar_cam0)
+    return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses)
+
+
+def _calibration(path: Path) -> tuple[KittiCalibration, np.ndarray]:
+    found = read_matrices(path, {"P2": (3, 4), "P3": (3, 4), "Tr": (3, 4)}, optional=frozenset({"P3"}))
+    calibration = calibration_from(path, P2=found["P2"], P3=found.get("P3"), R0=np.eye(3), Tr=found["Tr"])
+    return calibration, inverse(transform_from(found["Tr"][:, :3], found["Tr"][:, 3]))
+
+
+def _times(path: Path, last: int) -> list[float]:
+    """Seconds of every frame; at the usual rate where the file is missing."""
+    if not path.is_file():
+        return [n / RATE_HZ for n in range(last + 1)]
+    try:
+        times = [float(line) for line in path.read_text(encoding="ascii").split()]
+    except ValueError as error:
+        raise DatasetError(f"{path}: not a number a line: {error}", field=path.name) from error
+    if len(times) <= last:
+        raise DatasetError(f"{path} has {len(times)} lines, and there is a frame {last:06d}", field=path.name)
+    return times
+
+
+def _poses(path: Path, stamps: list[float], T_lidar_cam0: np.ndarray) -> Trajectory | None:
+    """T_map_lidar: the map is the LiDAR's frame at the first moment, so that it is level and z is up, unlike camera 0's."""
+    if not path.is_file():
+        return None
+    poses, times = [], []
+    for number, line in enumerate(path.read_text(encoding="ascii", errors="replace").splitlines()):
+        try:
+            values = np.array(line.split(), np.float64).reshape(3, 4)
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {number + 1}: not the 12 numbers of a pose", field=path.name) from error
+        if number < len(stamps):
+            poses.append(T_lidar_cam0 @ transform_from(values[:, :3], values[:, 3]) @ inverse(T_lidar_cam0))
+            times.append(stamps[number])
+    return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4), str(path))

@@ -1,0 +1,108 @@
+"""KITTI's raw layout: ``DATE/DATE_drive_NNNN_sync/{velodyne_points,image_02,image_03,oxts}`` and the day's calibration.
+
+A drive's files are numbered alike; what was left out of an extract may be missing. Depth that lies beside is that of KITTI's
+depth benchmark, ``proj_depth/groundtruth/image_02``.
+"""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
+from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
+from model_training.importing.oxts import read_oxts
+from model_training.importing.trajectory import Trajectory
+from service.errors import DatasetError
+from service.geometry.rigid import Transform, transform_from
+
+_PICTURES = (".png", ".jpg")
+
+
+def open_kitti_raw(source: Path, *, depth: KittiDepth) -> KittiSequence:
+    """Open a drive.
+
+    Args:
+        source: the drive's folder, or the day's with a single drive in it.
+        depth: what a picture's depth comes from.
+
+    Raises:
+        DatasetError: there is no drive, no scan, or no calibration.
+    """
+    drive = _drive(source)
+    calibration = _calibration(drive.parent)
+    scans = numbered(drive / "velodyne_points" / "data", (".bin",))
+    left, right = (numbered(drive / camera / "data", _PICTURES) for camera in ("image_02", "image_03"))
+    stored = numbered(drive / "proj_depth" / "groundtruth" / "image_02", (".png",))
+    if not scans:
+        raise DatasetError(f"{drive}/velodyne_points/data has no scan; add the scans", field="velodyne_points")
+    numbers = sorted(scans.keys() | left.keys())
+    stamps = _stamps(drive / "velodyne_points" / "timestamps.txt", numbers) or {n: n / RATE_HZ for n in numbers}
+    frames = tuple(
+        KittiFrame(f"{n:010d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers
+    )
+    poses, georeference = _poses(drive)
+    return KittiSequence("kitti-raw", drive, frames, calibration, depth, poses, georeference)
+
+
+def _drive(source: Path) -> Path:
+    if (source / "velodyne_points").is_dir():
+        return source
+    drives = sorted(path.parent for path in source.glob("*/velodyne_points")) if source.is_dir() else []
+    if len(drives) != 1:
+        found = ", ".join(path.name for path in drives) or "none"
+        raise DatasetError(
+            f"{source}: the folder of one drive is wanted, with velodyne_points in it; here: {found}", field="source"
+        )
+    return drives[0]
+
+
+def _calibration(day: Path) -> KittiCalibration:
+    velodyne, cameras = day / "calib_velo_to_cam.txt", day / "calib_cam_to_cam.txt"
+    Tr = _rigid(velodyne)
+    found = read_matrices(
+        cameras, {"R_rect_00": (3, 3), "P_rect_02": (3, 4), "P_rect_03": (3, 4)}, optional=frozenset({"P_rect_03"})
+    )
+    return calibration_from(cameras, P2=found["P_rect_02"], P3=found.get("P_rect_03"), R0=found["R_rect_00"], Tr=Tr[:3])
+
+
+def _rigid(path: Path) -> Transform:
+    """A file with R and T."""
+    found = read_matrices(path, {"R": (3, 3), "T": (3,)})
+    return transform_from(found["R"], found["T"])
+
+
+def _poses(drive: Path) -> tuple[Trajectory | None, dict[str, Any] | None]:
+    """T_map_lidar from the inertial system, where it was recorded."""
+    files = numbered(drive / "oxts" / "data", (".txt",))
+    if not files:
+        return None, None
+    stamps = _stamps(drive / "oxts" / "timestamps.txt", sorted(files)) or {n: n / RATE_HZ for n in files}
+    T_lidar_imu = _rigid(drive.parent / "calib_imu_to_velo.txt")
+    T_map_imu, georeference = read_oxts([files[n] for n in sorted(files)])
+    at: NDArray[np.float64] = np.array([stamps[n] for n in sorted(files)])
+    return Trajectory(at, T_map_imu, str(drive / "oxts")).moved_by(T_lidar_imu), georeference
+
+
+def _stamps(path: Path, numbers: list[int]) -> dict[int, float] | None:
+    """Seconds by a frame's number, or None where no times were recorded."""
+    if not path.is_file():
+        return None
+    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    if numbers and numbers[-1] >= len(lines):
+        raise DatasetError(
+            f"{path} has {len(lines)} lines, and there is a frame {numbers[-1]:010d}; take the file from the recording again",
+            field=path.name,
+        )
+    stamps = {}
+    for number in numbers:
+        text = lines[number].strip()
+        try:
+            whole, _, nanoseconds = text.partition(".")
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+            stamps[number] = moment.timestamp() + float(f"0.{nanoseconds or 0}")
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {number + 1}: no time: {text[:40]!r}", field=path.name) from error
+    return stamps

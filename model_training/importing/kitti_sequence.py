@@ -1,0 +1,138 @@
+"""What KITTI's raw and odometry layouts have in common: numbered frames of a rig that is calibrated once."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float32
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import LidarSensor
+from model_training.importing.kitti_calibration import KittiCalibration
+from model_training.importing.kitti_files import read_rgb, read_stored_depth
+from model_training.importing.recording import Event, Notes, RecordedPicture, RecordedScan, Unusable
+from model_training.importing.scan_file import read_scan
+from model_training.importing.stereo import StereoMatching, depth_from_stereo
+from model_training.importing.trajectory import Trajectory
+from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import inverse
+
+#: KITTI's own step of stored depth; up to 256 m in 16 bits.
+STORED_SCALE_M = 1 / 256
+#: Frames a second, where the recording names no times.
+RATE_HZ = 10.0
+HDL64 = LidarSensor(
+    name="hdl-64", channels=64, top_deg=2.0, bottom_deg=-24.8, max_range_m=120.0, T_vehicle_sensor=np.eye(4).tolist()
+)
+KittiDepth = Literal["none", "stored", "sgbm"]
+
+
+@dataclass(frozen=True, slots=True)
+class KittiFrame:
+    """The files of one moment; each may be missing."""
+
+    name: str
+    stamp_s: float
+    scan: Path | None
+    left: Path | None
+    right: Path | None
+    stored: Path | None
+
+
+@dataclass(frozen=True, slots=True)
+class KittiSequence:
+    """A drive; ``vehicle`` is the LiDAR's frame.
+
+    Attributes:
+        kind: ``kitti-raw`` or ``kitti-odometry``.
+        path: where it lies.
+        frames: in time order.
+        calibration: of all frames.
+        depth: what a picture's depth comes from; ``none`` leaves it to who takes the recording.
+        poses: T_map_lidar, or None.
+        georeference: of the poses.
+    """
+
+    kind: str
+    path: Path
+    frames: tuple[KittiFrame, ...]
+    calibration: KittiCalibration
+    depth: KittiDepth
+    poses: Trajectory | None
+    georeference: dict[str, Any] | None = None
+    lidar: LidarSensor = HDL64
+
+    @property
+    def notes(self) -> Notes:
+        """What there is of each."""
+        scans, left, right = (
+            sum(getattr(frame, kind) is not None for frame in self.frames) for kind in ("scan", "left", "right")
+        )
+        source: dict[str, Any] = {"path": self.path.name, "depth": self.depth}
+        if self.depth == "sgbm":
+            source["matching"] = StereoMatching().description()
+        return Notes((f"{len(self.frames)} moments: {scans} scans, {left} left and {right} right pictures",), source)
+
+    def count(self) -> int:
+        """Scans and left pictures."""
+        return sum((frame.scan is not None) + (frame.left is not None) for frame in self.frames)
+
+    def trajectory(self) -> Trajectory | None:
+        """As the recording has it."""
+        return self.poses
+
+    def events(self, *, pictures: bool = True) -> Iterator[Event]:
+        """Frame by frame."""
+        for frame in self.frames:
+            if frame.scan is not None:
+                points = read_scan(frame.scan)
+                name = f"velodyne {frame.name}"
+                yield Unusable("scan", name, points) if isinstance(points, str) else RecordedScan(name, frame.stamp_s, points)  # fmt: skip
+            if pictures and frame.left is not None:
+                yield self._picture(frame, frame.left)
+
+    def _picture(self, frame: KittiFrame, left: Path) -> RecordedPicture | Unusable:
+        name, calibration = f"image {frame.name}", self.calibration
+        try:
+            rgb = read_rgb(left)
+            camera = PinholeCamera(rgb.shape[1], rgb.shape[0], calibration.fx, calibration.fy, calibration.cx, calibration.cy)  # fmt: skip
+            picture = RecordedPicture(
+                name, frame.stamp_s, rgb, camera, inverse(calibration.T_camera_lidar), depth_scale_m=STORED_SCALE_M, file=left
+            )  # fmt: skip
+            if self.depth == "stored":
+                if frame.stored is None:
+                    return Unusable("picture", name, "no stored depth beside it (--depth sgbm or lidar does without)")
+                return replace(picture, depth=read_stored_depth(frame.stored, rgb.shape[:2]))
+            if self.depth == "sgbm":
+                if frame.right is None:
+                    return Unusable("picture", name, "no right picture beside it")
+                return self._matched(picture, read_rgb(frame.right))
+            return picture
+        except DatasetError as error:
+            return Unusable("picture", name, error.message.removeprefix(f"{left}: "))
+
+    def _matched(self, picture: RecordedPicture, right: NDArray[np.uint8]) -> RecordedPicture | Unusable:
+        if right.shape != picture.rgb.shape:
+            return Unusable("picture", picture.name, "its right picture has another size")
+        if self.calibration.focal_baseline_px_m is None:
+            raise DatasetError(
+                f"{self.path}: the calibration does not name the right camera (P3), so stereo has no baseline; "
+                "add it, or take --depth lidar",
+                field="P3",
+            )
+        depth_m: Float32[NDArray[np.float32], "H W"] = depth_from_stereo(
+            picture.rgb, right, focal_baseline_px_m=self.calibration.focal_baseline_px_m
+        )
+        return replace(picture, depth=depth_m)
+
+
+def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Files of a folder by their number; others are not the recording's."""
+    if not folder.is_dir():
+        return {}
+    return {
+        int(path.stem): path for path in sorted(folder.iterdir()) if path.stem.isdigit() and path.suffix in suffixes
+    }

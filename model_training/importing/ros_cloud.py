@@ -1,0 +1,75 @@
+"""``sensor_msgs/PointCloud2`` of any field layout."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy.typing import NDArray
+
+#: sensor_msgs/PointField: the numbers of its datatypes.
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+#: What drivers call the strength of a return, and the time of a point, the most usual first.
+_INTENSITY = ("intensity", "intensities", "reflectivity", "i")
+_TIME = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset")
+#: Later than this a time is one since 1970, not since the scan's stamp.
+_ABSOLUTE_S = 1e6
+
+
+def points_of_cloud(
+    message: Any, *, stamp_s: float, max_points: int
+) -> tuple[Float32[NDArray[np.float32], "N 4"], Float64[NDArray[np.float64], " N"] | None] | str:
+    """Points x y z intensity and their times against the stamp, or why the message is no scan.
+
+    Whole numbers of time are nanoseconds (Ouster, Livox), floating ones seconds (Velodyne, Hesai); a time that is one since 1970
+    is taken against the stamp.
+    """
+    count = int(message.width) * int(message.height)
+    if count == 0:
+        return "no points"
+    if count > max_points:
+        return f"more than {max_points} points"
+    fields = {field.name: field for field in message.fields}
+    missing = [name for name in "xyz" if name not in fields]
+    if missing:
+        return f"its fields have no {', '.join(missing)} (they are: {', '.join(fields) or 'none'})"
+    unknown = [field.name for field in message.fields if field.datatype not in _TYPES]
+    if unknown:
+        return f"unknown datatype of field {unknown[0]}"
+    rows = _rows(message)
+    if isinstance(rows, str):
+        return rows
+    intensity = next((name for name in _INTENSITY if name in fields), None)
+    points = np.zeros((count, 4), np.float32)
+    for column, name in enumerate(("x", "y", "z", intensity)):
+        if name is not None:
+            points[:, column] = rows[name].reshape(-1)
+    time = next((name for name in _TIME if name in fields), None)
+    return points, None if time is None else _offsets(rows[time].reshape(-1), stamp_s)
+
+
+def _rows(message: Any) -> NDArray[Any] | str:
+    """The message's bytes as records, (height, width), without padding copied."""
+    order = ">" if message.is_bigendian else "<"
+    step, row_step = int(message.point_step), int(message.row_step)
+    ends = [field.offset + int(_TYPES[field.datatype][1]) * max(1, field.count) for field in message.fields]
+    if step < max(ends) or row_step < step * message.width:
+        return f"its point_step of {step} bytes does not hold its fields, or its row_step not its points"
+    if len(message.data) < row_step * message.height:
+        return f"its data are {len(message.data)} of {row_step * message.height} bytes: truncated"
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in message.fields],
+            "formats": [order + _TYPES[field.datatype] for field in message.fields],
+            "offsets": [field.offset for field in message.fields],
+            "itemsize": step,
+        }
+    )
+    shape = (int(message.height), int(message.width))
+    return np.ndarray(shape, dtype, np.ascontiguousarray(message.data).data, strides=(row_step, step))
+
+
+def _offsets(times: NDArray[Any], stamp_s: float) -> Float64[NDArray[np.float64], " N"]:
+    seconds = times.astype(np.float64) * (1e-9 if times.dtype.kind in "iu" else 1.0)
+    if np.abs(seconds).max(initial=0.0) > 1e15:  # nanoseconds since 1970, written as a floating number
+        seconds = seconds * 1e-9
+    return seconds - stamp_s if np.abs(seconds).max(initial=0.0) > _ABSOLUTE_S else seconds

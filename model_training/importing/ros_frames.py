@@ -1,0 +1,100 @@
+"""The tree of frames that ``/tf`` and ``/tf_static`` tell."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from model_training.importing.trajectory import Trajectory
+from service.geometry.rigid import Transform, inverse, rotation_from_quaternion_xyzw, transform_from
+
+
+def transform_of(message: Any) -> Transform:
+    """A geometry_msgs Transform (translation, rotation) or Pose (position, orientation) as a matrix.
+
+    Raises:
+        ValueError: a number is none, or the quaternion is zero.
+    """
+    at = message.translation if hasattr(message, "translation") else message.position
+    turned = message.rotation if hasattr(message, "rotation") else message.orientation
+    quaternion = np.array([turned.x, turned.y, turned.z, turned.w], np.float64)
+    translation = np.array([at.x, at.y, at.z], np.float64)
+    if not np.isfinite(translation).all() or not np.isfinite(quaternion).all() or np.linalg.norm(quaternion) < 1e-6:
+        raise ValueError("a pose of numbers and a unit quaternion are wanted")
+    return transform_from(rotation_from_quaternion_xyzw(quaternion), translation)
+
+
+def stamp_of(header: Any) -> float:
+    """Seconds of a std_msgs Header, of ROS 1 or 2."""
+    stamp = header.stamp
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
+@dataclass(slots=True)
+class FrameTree:
+    """Edges from parent to child; an edge that was told more than once over time moves."""
+
+    _stamps: dict[str, list[float]] = field(default_factory=dict)
+    _poses: dict[str, list[Transform]] = field(default_factory=dict)
+    _parent: dict[str, str] = field(default_factory=dict)
+    _static: set[str] = field(default_factory=set)
+
+    def add(self, message: Any, *, static: bool) -> None:
+        """Take one TransformStamped; of a moving edge times must rise, and what does not is left out."""
+        child, parent = _name(message.child_frame_id), _name(message.header.frame_id)
+        stamp_s = 0.0 if static else stamp_of(message.header)
+        if static:
+            self._static.add(child)
+            self._stamps[child], self._poses[child] = [], []
+        stamps = self._stamps.setdefault(child, [])
+        if stamps and stamp_s <= stamps[-1]:
+            return
+        self._parent[child] = parent
+        stamps.append(stamp_s)
+        self._poses.setdefault(child, []).append(transform_of(message.transform))
+
+    def chain(self, frame: str) -> list[str]:
+        """The frame and all above it, to the root."""
+        chain = [_name(frame)]
+        while chain[-1] in self._parent and self._parent[chain[-1]] not in chain:
+            chain.append(self._parent[chain[-1]])
+        return chain
+
+    def fixed(self, target: str, source: str) -> Transform | None:
+        """T_target_source by edges that do not move, or None where they do not join the two."""
+        above_target, above_source = self.chain(target), self.chain(source)
+        shared = next((name for name in above_source if name in above_target), None)
+        if shared is None:
+            return None
+        edges = above_source[: above_source.index(shared)] + above_target[: above_target.index(shared)]
+        if not all(name in self._static or len(self._stamps[name]) == 1 for name in edges):
+            return None
+        return inverse(self._down(shared, above_target)) @ self._down(shared, above_source)
+
+    def moving(self, source: str, *, name: str) -> tuple[str, Trajectory] | None:
+        """The root above a frame and T_root_source over time, at the times of its most frequent edge; None where nothing moves."""
+        chain = self.chain(source)
+        edges = [edge for edge in chain[:-1] if edge not in self._static and len(self._stamps[edge]) > 1]
+        if not edges:
+            return None
+        stamps = np.array(self._stamps[max(edges, key=lambda edge: len(self._stamps[edge]))])
+        begin, end = max(self._stamps[edge][0] for edge in edges), min(self._stamps[edge][-1] for edge in edges)
+        stamps = stamps[(stamps >= begin) & (stamps <= end)]
+        T = np.tile(np.eye(4), (len(stamps), 1, 1))
+        for edge in chain[:-1]:
+            poses = np.stack(self._poses[edge])
+            T = (
+                Trajectory(np.array(self._stamps[edge]), poses, edge).between(stamps) if edge in edges else poses[0]
+            ) @ T
+        return chain[-1], Trajectory(stamps, T, name)
+
+    def _down(self, top: str, chain: list[str]) -> Transform:
+        T = np.eye(4)
+        for edge in chain[: chain.index(top)]:
+            T = self._poses[edge][0] @ T
+        return T
+
+
+def _name(frame: str) -> str:
+    """ROS 1 wrote some names with a slash before them."""
+    return frame.lstrip("/")

@@ -1,0 +1,100 @@
+"""``sensor_msgs/Image``, ``CompressedImage`` and ``CameraInfo``."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+
+from model_training.importing.recording import Depth, Lens
+from service.errors import StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.imaging.decode import ImageLimits, decode_rgb
+from service.imaging.ros_depth import read_ros_depth
+
+#: Channels there are, and those to take, by encoding; grey ones are repeated.
+_COLOUR = {
+    "rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0)), "mono8": (1, (0, 0, 0)),
+    "8UC1": (1, (0, 0, 0)), "8UC3": (3, (2, 1, 0)),
+}  # fmt: skip
+_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_PINHOLE_MODELS = ("", "plumb_bob", "rational_polynomial")
+_FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt4")
+_LIMITS = ImageLimits()
+
+
+def colour_of(message: Any) -> UInt8[NDArray[np.uint8], "H W 3"] | str:
+    """The sRGB picture of an Image or CompressedImage, or why it is none."""
+    if hasattr(message, "format"):
+        try:
+            return decode_rgb(bytes(message.data), limits=_LIMITS)
+        except StreetfixError as error:
+            return f"cannot be decoded: {error.message}"
+    if message.encoding not in _COLOUR:
+        return f"unknown encoding {message.encoding[:40]!r} (known: {', '.join(_COLOUR)})"
+    channels, taken = _COLOUR[message.encoding]
+    pixels = _pixels(message, "u1", channels)
+    return pixels if isinstance(pixels, str) else np.ascontiguousarray(pixels[:, :, list(taken)])
+
+
+def depth_of(message: Any) -> Depth | str:
+    """Depth of an Image (16UC1: millimetres, 32FC1: metres; REP-118) or of a compressedDepth message, or why there is none."""
+    if hasattr(message, "format"):
+        if "compressedDepth" not in message.format:
+            return f"unknown format {message.format[:40]!r} (known: compressedDepth)"
+        try:
+            values = read_ros_depth(bytes(message.data), _LIMITS, field="depth")
+        except StreetfixError as error:
+            return f"cannot be decoded: {error.message}"
+        return _as_depth(values)
+    if message.encoding not in _DEPTH:
+        return f"unknown encoding {message.encoding[:40]!r} (known: {', '.join(_DEPTH)})"
+    pixels = _pixels(message, _DEPTH[message.encoding], 1)
+    if isinstance(pixels, str):
+        return pixels
+    return _as_depth(np.ascontiguousarray(pixels[:, :, 0]))
+
+
+def _as_depth(values: NDArray[Any]) -> Depth:
+    return np.asarray(values, np.uint16) if values.dtype == np.uint16 else np.asarray(values, np.float32)
+
+
+def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens] | str:
+    """Intrinsics of a CameraInfo, with the distortion to be taken out, or why it tells none.
+
+    Args:
+        message: sensor_msgs/CameraInfo, of ROS 1 or 2.
+        is_rectified: the pictures are already; then P holds for them instead of K and D.
+    """
+    K = np.asarray(message.K if hasattr(message, "K") else message.k, np.float64).reshape(3, 3)
+    P = np.asarray(message.P if hasattr(message, "P") else message.p, np.float64).reshape(3, 4)
+    D = np.asarray(message.D if hasattr(message, "D") else message.d, np.float64)
+    matrix = P[:, :3] if is_rectified and P[0, 0] > 0 else K
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.isfinite(matrix).all()):
+        return "its focal lengths are not positive: the camera is not calibrated"
+    model = message.distortion_model
+    if model not in (*_PINHOLE_MODELS, *_FISHEYE_MODELS) and D.any() and not is_rectified:
+        return f"unknown distortion_model {model[:40]!r} (known: {', '.join((*_PINHOLE_MODELS[1:], *_FISHEYE_MODELS))})"
+    distortion = () if is_rectified or not D.any() else tuple(float(x) for x in D)
+    lens: Lens = "fisheye" if model in _FISHEYE_MODELS else "pinhole"
+    camera = PinholeCamera(
+        int(message.width), int(message.height), float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]),
+        distortion,
+    )  # fmt: skip
+    return camera, lens
+
+
+def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any] | str:
+    """(H, W, channels) of an Image's bytes, in the machine's order, rows' padding left out."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    size = np.dtype(dtype).itemsize
+    if height < 1 or width < 1 or height * width > _LIMITS.max_pixels:
+        return f"its size of {width}x{height} pixels is none, or over the limit"
+    if step < width * channels * size or len(message.data) < step * height:
+        return f"its data are {len(message.data)} bytes, too few for {width}x{height} {message.encoding}: truncated"
+    order = ">" if message.is_bigendian else "<"
+    rows: NDArray[Any] = np.ndarray(
+        (height, width, channels), np.dtype(order + dtype), np.ascontiguousarray(message.data).data,
+        strides=(step, channels * size, size),
+    )  # fmt: skip
+    return rows.astype(np.dtype(dtype), copy=False)

@@ -1,0 +1,123 @@
+"""Which topic of a bag is what: as told, or guessed from types and names."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from service.errors import DatasetError
+
+ROLES = ("scan", "color", "depth", "info", "poses")
+POSE_TYPES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "tf2_msgs/msg/TFMessage",
+)
+_IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_TYPES: dict[str, tuple[str, ...]] = {
+    "scan": ("sensor_msgs/msg/PointCloud2",), "color": _IMAGE_TYPES, "depth": _IMAGE_TYPES, "info": ("sensor_msgs/msg/CameraInfo",),
+    "poses": POSE_TYPES,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """The topic of each role; None where the bag has none."""
+
+    scan: Topic
+    color: Topic | None
+    depth: Topic | None
+    info: Topic | None
+    poses: Topic | None
+    guessed: tuple[str, ...]
+
+    def lines(self) -> tuple[str, ...]:
+        """A line a role, saying what was guessed."""
+        lines = []
+        for role in ROLES:
+            topic: Topic | None = getattr(self, role)
+            guess = " (guessed)" if role in self.guessed and topic is not None else ""
+            what = (
+                "none" if topic is None else f"{topic.name}, {topic.count} x {topic.msgtype.rsplit('/', 1)[-1]}{guess}"
+            )
+            lines.append(f"{role}: {what}")
+        return tuple(lines)
+
+
+def topics_of(available: list[Topic], told: Mapping[str, str], *, source: str) -> Topics:
+    """Choose the topics of a bag.
+
+    Args:
+        available: all there are.
+        told: topics by role; what is not told is guessed.
+        source: of the bag, for messages.
+
+    Raises:
+        DatasetError: a role or topic is unknown or of another type, or there is no point cloud.
+    """
+    by_name = {topic.name: topic for topic in available}
+    for role, name in told.items():
+        if role not in ROLES:
+            raise DatasetError(f"topic: {role!r} is no role; there are: {', '.join(ROLES)}", field="topic")
+        if name not in by_name:
+            raise DatasetError(
+                f"{source} has no topic {name!r}; it has: {', '.join(sorted(by_name)) or 'none'}", field="topic"
+            )
+        if by_name[name].msgtype not in _TYPES[role]:
+            raise DatasetError(
+                f"topic {name!r} is {by_name[name].msgtype}; for {role} one is wanted of: {', '.join(_TYPES[role])}",
+                field="topic",
+            )
+    chosen = {role: by_name[name] for role, name in told.items()}
+    for role in ROLES:
+        if role not in chosen and (topic := _guess(role, available, chosen)) is not None:
+            chosen[role] = topic
+    if "scan" not in chosen:
+        have = ", ".join(f"{topic.name} ({topic.msgtype})" for topic in available) or "nothing"
+        raise DatasetError(
+            f"{source} has no sensor_msgs/PointCloud2, so there is no survey in it; it has: {have}", field="scan"
+        )
+    return Topics(
+        scan=chosen["scan"], color=chosen.get("color"), depth=chosen.get("depth"), info=chosen.get("info"),
+        poses=chosen.get("poses"), guessed=tuple(role for role in ROLES if role not in told),
+    )  # fmt: skip
+
+
+def _guess(role: str, available: list[Topic], chosen: Mapping[str, Topic]) -> Topic | None:
+    fitting = [
+        topic for topic in available if topic.msgtype in _TYPES[role] and topic.count and topic not in chosen.values()
+    ]
+    if role == "poses":
+        known = [topic for topic in fitting if topic.msgtype != POSE_TYPES[-1] or topic.name.rstrip("/").endswith("tf")]
+        return min(known, key=lambda topic: (POSE_TYPES.index(topic.msgtype), -topic.count), default=None)
+    if role in ("color", "depth"):
+        fitting = [topic for topic in fitting if ("depth" in topic.name.lower()) == (role == "depth")]
+        fitting = [
+            topic for topic in fitting if not any(word in topic.name.lower() for word in ("infra", "mask", "label"))
+        ]
+    color = chosen.get("color")
+    near = "" if color is None or role not in ("depth", "info") else color.name
+
+    def rank(topic: Topic) -> tuple[int, int, int]:
+        aligned = role == "depth" and any(word in topic.name for word in ("aligned", "registered"))
+        return (-int(aligned), -_shared(topic.name, near), -topic.count)
+
+    return min(fitting, key=rank, default=None)
+
+
+def _shared(one: str, other: str) -> int:
+    """How many first parts two names have in common: a camera's topics lie in one namespace."""
+    count = 0
+    for a, b in zip(one.split("/"), other.split("/"), strict=False):
+        if a != b:
+            break
+        count += 1
+    return count

@@ -1,0 +1,252 @@
+"""Take a recording into a dataset folder: match times, remove motion and distortion, sort into survey and queries.
+
+One pass over the recording, a frame at a time; what cannot be used is counted by reason and the rest is kept.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import DatasetDescription, Sensors, write_description
+from model_training.datasets.whole_folder import whole_or_not_at_all
+from model_training.importing.deskew import deskewed
+from model_training.importing.dropped import Dropped
+from model_training.importing.lidar_depth import depth_from_scan
+from model_training.importing.recording import RecordedPicture, RecordedScan, Recording, Unusable
+from model_training.importing.rectify import rectified
+from model_training.importing.trajectory import Sync, Trajectory
+from model_training.importing.write_queries import QueryWriter
+from model_training.importing.write_survey import SurveyWriter
+from service.errors import DatasetError
+from service.geometry.rigid import Transform, inverse
+
+Report = Callable[[str, int, int], None]
+
+#: Scans that are kept while pictures wait for the one nearest to them.
+_RECENT_SCANS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class TakeSettings:
+    """How a recording becomes a dataset.
+
+    Attributes:
+        queries: name of the query set that pictures go to; empty leaves pictures out.
+        depth: ``recorded`` as it comes, ``lidar`` from the scan nearest in time.
+        sync: how a pose is found for a frame's moment.
+        tolerance_s: how far a pose, or the scan of a depth, may be from a frame.
+        deskew: take the vehicle's motion out of scans that tell their points' times.
+        hold_out: each how many scans one is left out of the survey; 0 leaves none out. Pictures are then queries only if the
+            scan nearest to them was left out, so that no query's own moment is in the map.
+        max_points: of a scan; more is refused before it is kept.
+    """
+
+    queries: str = "recorded"
+    depth: Literal["recorded", "lidar"] = "recorded"
+    sync: Sync = "interpolate"
+    tolerance_s: float = 0.1
+    deskew: bool = True
+    hold_out: int = 0
+    max_points: int = 5_000_000
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense.
+
+        Raises:
+            DatasetError: naming the option.
+        """
+        if self.hold_out == 1 or self.hold_out < 0:
+            raise DatasetError("hold_out: 1 would leave no survey; give 0, or 2 and more", field="hold_out")
+        if not 0 <= self.tolerance_s < np.inf:
+            raise DatasetError(f"tolerance_s: {self.tolerance_s:g} is no time; give seconds", field="tolerance_s")
+
+
+@dataclass(frozen=True, slots=True)
+class TakeSummary:
+    """What came in, and what did not: ``dropped`` counts frames by kind and reason, with the first name of each."""
+
+    scans: int
+    held_out: int
+    pictures: int
+    points_without_numbers: int
+    dropped: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def take(
+    recording: Recording, trajectory: Trajectory, out: Path, settings: TakeSettings, *, report: Report = lambda *_: None
+) -> TakeSummary:
+    """Write a recording as a dataset.
+
+    Args:
+        recording: opened.
+        trajectory: T_map_vehicle, the recording's own or one that was found by odometry.
+        out: the dataset; it appears when it is whole.
+        settings: what goes where.
+        report: told after every frame.
+
+    Raises:
+        DatasetError: nothing usable is left, or ``out`` is taken.
+    """
+    with whole_or_not_at_all(out) as part:
+        taking = _Taking(recording, trajectory, part, settings)
+        of = recording.count()
+        for done, event in enumerate(recording.events(pictures=bool(settings.queries)), 1):
+            if isinstance(event, Unusable):
+                taking.dropped.add(event.kind, event.name, event.why)
+            elif isinstance(event, RecordedScan):
+                taking.scan(event)
+            else:
+                taking.picture(event)
+            report("frames", done, max(of, done))
+        return taking.finish(out.name)
+
+
+class _Taking:
+    """A dataset while it comes in."""
+
+    def __init__(self, recording: Recording, trajectory: Trajectory, out: Path, settings: TakeSettings) -> None:
+        self.dropped = Dropped()
+        self._recording, self._trajectory, self._out, self._settings = recording, trajectory, out, settings
+        T = recording.lidar.T_vehicle_sensor
+        self._T_vehicle_lidar: Transform = np.eye(4) if T is None else np.array(T, np.float64)
+        self._survey, self._queries = SurveyWriter(out), QueryWriter(out, settings.queries)
+        self._recent: deque[tuple[float, bool, NDArray[np.float32]]] = deque(maxlen=_RECENT_SCANS)
+        self._waiting: deque[RecordedPicture] = deque()
+        self._seen = self._held = self._without_numbers = 0
+        self._last_scan_s = -np.inf
+
+    def scan(self, scan: RecordedScan) -> None:
+        finite = finite_points(scan.points)
+        self._without_numbers += int((~finite).sum())
+        if why := self._useless(scan, finite):
+            self.dropped.add("scan", scan.name, why)
+            return
+        T_map_vehicle = self._trajectory.at(
+            scan.stamp_s, sync=self._settings.sync, tolerance_s=self._settings.tolerance_s
+        )
+        if isinstance(T_map_vehicle, str):
+            self.dropped.add("scan", scan.name, T_map_vehicle)
+            return
+        clean = scan if finite.all() else _only(scan, finite)
+        points = deskewed(clean, self._trajectory, self._T_vehicle_lidar) if self._settings.deskew else clean.points
+        self._last_scan_s = scan.stamp_s
+        is_held = bool(self._settings.hold_out) and self._seen % self._settings.hold_out == self._settings.hold_out - 1
+        self._seen += 1
+        self._recent.append((scan.stamp_s, is_held, points))
+        if is_held:
+            self._held += 1
+        else:
+            self._survey.add(scan.stamp_s, T_map_vehicle @ self._T_vehicle_lidar, points)
+        self._answer_waiting(until_s=scan.stamp_s)
+
+    def picture(self, picture: RecordedPicture) -> None:
+        if self._needs_scans():
+            self._waiting.append(picture)
+        else:
+            self._query(picture, None)
+
+    def finish(self, name: str) -> TakeSummary:
+        self._answer_waiting(until_s=np.inf)
+        recording, settings = self._recording, self._settings
+        if not self._survey.count:
+            why = "; ".join(self.dropped.lines()) or "there is none"
+            where = recording.notes.source.get("path", recording.kind)
+            raise DatasetError(
+                f"{where}: no scan can be used ({why}); mend the first reason, or name other poses", field="scans"
+            )
+        self._survey.finish()
+        cameras = self._queries.finish()
+        source: dict[str, Any] = {
+            "kind": recording.kind,
+            **recording.notes.source,
+            "poses": self._trajectory.name,
+            "sync": settings.sync,
+            "deskewed": settings.deskew,
+            "hold_out": settings.hold_out,
+            "dropped": self.dropped.lines(),
+        }
+        description = DatasetDescription(
+            name=name, source=source, sensors=Sensors(lidars=[recording.lidar], cameras=cameras), georeference=recording.georeference
+        )  # fmt: skip
+        write_description(self._out, description)
+        return TakeSummary(
+            self._survey.count, self._held, self._queries.count, self._without_numbers, tuple(self.dropped.lines()), recording.notes.lines
+        )  # fmt: skip
+
+    def _useless(self, scan: RecordedScan, finite: NDArray[np.bool_]) -> str | None:
+        if not finite.any():
+            return "no finite points"
+        if len(scan.points) > self._settings.max_points:
+            return f"more than {self._settings.max_points} points"
+        if scan.stamp_s <= self._last_scan_s:
+            return "its time is not after the scan's before it"
+        return None
+
+    def _needs_scans(self) -> bool:
+        return self._settings.depth == "lidar" or self._settings.hold_out > 0
+
+    def _answer_waiting(self, *, until_s: float) -> None:
+        """Pictures wait until a scan after them came, so that the nearest of all is known."""
+        while self._waiting and self._waiting[0].stamp_s <= until_s:
+            picture = self._waiting.popleft()
+            if not self._recent:
+                self.dropped.add("picture", picture.name, "no scan near it in time")
+                continue
+            stamp_s, is_held, points = min(self._recent, key=lambda scan: abs(scan[0] - picture.stamp_s))
+            if self._settings.hold_out and not is_held:
+                continue
+            if self._settings.depth == "lidar" and abs(stamp_s - picture.stamp_s) > self._settings.tolerance_s:
+                self.dropped.add("picture", picture.name, f"no scan within {self._settings.tolerance_s:g} s")
+                continue
+            self._query(picture, (stamp_s, points))
+
+    def _query(self, picture: RecordedPicture, scan: tuple[float, NDArray[np.float32]] | None) -> None:
+        T_map_vehicle = self._trajectory.at(
+            picture.stamp_s, sync=self._settings.sync, tolerance_s=self._settings.tolerance_s
+        )
+        if isinstance(T_map_vehicle, str):
+            self.dropped.add("picture", picture.name, T_map_vehicle)
+            return
+        pinhole = rectified(picture)
+        if self._settings.depth == "lidar" and scan is not None:
+            pinhole = replace(pinhole, depth=self._lidar_depth(pinhole, *scan))
+        if pinhole.depth is None:
+            self.dropped.add("picture", picture.name, "no depth")
+            return
+        if why := self._queries.add(pinhole, T_map_vehicle @ picture.T_vehicle_camera):
+            self.dropped.add("picture", picture.name, why)
+
+    def _lidar_depth(
+        self, picture: RecordedPicture, stamp_s: float, points: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """The scan's points where they are in the camera's frame at the picture's moment."""
+        T_then, T_now = self._trajectory.between(np.array([stamp_s, picture.stamp_s]))
+        T_camera_lidar = inverse(T_now @ picture.T_vehicle_camera) @ T_then @ self._T_vehicle_lidar
+        return depth_from_scan(points[:, :3].astype(np.float64), T_camera_lidar, picture.camera)
+
+
+def _only(scan: RecordedScan, chosen: NDArray[np.bool_]) -> RecordedScan:
+    offsets = None if scan.offsets_s is None else scan.offsets_s[chosen]
+    return replace(scan, points=scan.points[chosen], offsets_s=offsets)
+
+
+def finite_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which points have numbers for coordinates; a cloud that is not dense marks what never came back by NaN."""
+    return np.asarray(np.isfinite(points[:, :3]).all(axis=1), np.bool_)
+
+
+def scans_of(recording: Recording) -> Iterator[RecordedScan]:
+    """The usable scans of a recording alone, NaN points dropped: what odometry reads."""
+    last_s = -np.inf
+    for event in recording.events(pictures=False):
+        if isinstance(event, RecordedScan) and event.stamp_s > last_s:
+            finite = finite_points(event.points)
+            if finite.any():
+                last_s = event.stamp_s
+                yield event if finite.all() else _only(event, finite)

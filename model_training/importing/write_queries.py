@@ -1,0 +1,101 @@
+"""A query set of a dataset, written pair after pair."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import (
+    PICTURES,
+    CameraSensor,
+    DepthSpec,
+    query_folder,
+    write_tum,
+)
+from model_training.importing.recording import Depth, RecordedPicture
+from service.geometry.rigid import Transform
+
+#: Step of depth that was recorded as metres: up to 65 m in 16 bits, finer than any sensor that is meant here.
+METRES_SCALE_M = 0.001
+
+
+class QueryWriter:
+    """Numbers pairs as they come; poses and cameras are written at the end.
+
+    Args:
+        out: folder of the dataset.
+        name: of the query set.
+    """
+
+    def __init__(self, out: Path, name: str) -> None:
+        self._folder = query_folder(out, name)
+        self._stamps: list[float] = []
+        self._poses: list[Transform] = []
+        self._cameras: list[CameraSensor] = []
+        self._camera_names: list[str] = []
+
+    @property
+    def count(self) -> int:
+        """Pairs so far."""
+        return len(self._stamps)
+
+    def add(self, picture: RecordedPicture, T_map_camera: Transform) -> str | None:
+        """Write a rectified pair with its depth, or say why it cannot be one."""
+        size = (picture.camera.height, picture.camera.width)
+        if picture.depth is None or picture.rgb.shape[:2] != size or picture.depth.shape != size:
+            depth = None if picture.depth is None else picture.depth.shape
+            return f"sizes differ: colour {picture.rgb.shape[:2]}, depth {depth}, camera {size}"
+        values, scale_m = whole_steps(picture.depth, picture.depth_scale_m)
+        if not values.any():
+            return "its depth is empty"
+        number = f"{self.count:06d}"
+        self._write_rgb(picture, number)
+        _write_png(self._folder / "depth" / f"{number}.png", values)
+        self._stamps.append(picture.stamp_s)
+        self._poses.append(T_map_camera)
+        self._camera_names.append(self._camera_name(picture, scale_m))
+        return None
+
+    def finish(self) -> list[CameraSensor]:
+        """Write poses and cameras; the cameras are for ``dataset.json``."""
+        if self.count:
+            write_tum(self._folder / "poses.txt", np.array(self._stamps), np.stack(self._poses))
+            if len(self._cameras) > 1:
+                (self._folder / "cameras.txt").write_text("\n".join(self._camera_names) + "\n")
+        return self._cameras
+
+    def _write_rgb(self, picture: RecordedPicture, number: str) -> None:
+        if picture.file is not None and picture.file.suffix.lower() in PICTURES:
+            target = self._folder / "rgb" / f"{number}{picture.file.suffix.lower()}"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(picture.file, target)
+        else:
+            _write_png(self._folder / "rgb" / f"{number}.png", np.ascontiguousarray(picture.rgb[:, :, ::-1]))
+
+    def _camera_name(self, picture: RecordedPicture, scale_m: float) -> str:
+        pinhole = picture.camera
+        camera = CameraSensor(
+            name=f"camera-{len(self._cameras)}", width=pinhole.width, height=pinhole.height, fx=pinhole.fx, fy=pinhole.fy,
+            cx=pinhole.cx, cy=pinhole.cy, depth=DepthSpec(scale_m=scale_m), T_vehicle_sensor=picture.T_vehicle_camera.tolist(),
+        )  # fmt: skip
+        for known in self._cameras:
+            if known.model_dump(exclude={"name"}) == camera.model_dump(exclude={"name"}):
+                return known.name
+        self._cameras.append(camera)
+        return camera.name
+
+
+def whole_steps(depth: Depth, scale_m: float) -> tuple[NDArray[np.uint16], float]:
+    """Depth in 16 bits and the metres of a step; what is no depth, or too far for 16 bits, becomes 0."""
+    if depth.dtype == np.uint16:
+        return np.asarray(depth, np.uint16), scale_m
+    metres = np.nan_to_num(np.asarray(depth, np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    steps = np.rint(metres / METRES_SCALE_M)
+    return np.where((steps > 0) & (steps <= np.iinfo(np.uint16).max), steps, 0).astype(np.uint16), METRES_SCALE_M
+
+
+def _write_png(path: Path, values: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 2])[1].tobytes())
