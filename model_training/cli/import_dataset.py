@@ -6,8 +6,8 @@ from typing import Annotated, Literal, cast
 import typer
 from rich.console import Console
 
-from model_training.cli.progress import bars
-from model_training.importing.extrinsics import Extrinsics, read_extrinsics
+from model_training.cli.progress import Report, bars
+from model_training.importing.extrinsics import Extrinsics, read_camera, read_extrinsics
 from model_training.importing.kinds import KINDS, DepthFrom, OpenSettings, open_recording
 from model_training.importing.kitti_object import import_kitti_object
 from model_training.importing.pose_file import read_pose_file
@@ -54,6 +54,16 @@ def command(
     extrinsics: Annotated[
         Path | None, typer.Option(help="JSON with T_vehicle_lidar and T_vehicle_camera, where the recording lacks them")
     ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="JSON with width, height, fx, fy, cx, cy, where the recording lacks them")
+    ] = None,
+    odometry: Annotated[
+        bool, typer.Option(help="find the poses by LiDAR odometry, the recording's own are not looked at")
+    ] = False,
+    loops: Annotated[bool, typer.Option(help="with --odometry: close loops where a place is met again")] = True,
+    lidar_height: Annotated[
+        float, typer.Option(help="with --odometry: of the LiDAR above the ground, roughly, metres", min=0.1)
+    ] = 1.8,
     rectified: Annotated[
         bool | None, typer.Option(help="a bag's pictures are rectified already [default: if the topic's name says so]")
     ] = None,
@@ -69,6 +79,7 @@ def command(
     Example:
       streetfix import kitti-raw 2011_09_26_drive_0005_sync --depth sgbm --out data/drive
       streetfix import rosbag drive.mcap --topic scan=/ouster/points --out data/drive
+      streetfix import clouds scans/ --odometry --out data/site
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
     """
     if depth and depth not in DEPTHS:
@@ -84,15 +95,23 @@ def command(
     )  # fmt: skip
     told = OpenSettings(
         depth=cast(DepthFrom, depth or "recorded"), topics=_topics(topic or []), rectified=rectified,
+        camera=None if camera is None else read_camera(camera),
         extrinsics=Extrinsics() if extrinsics is None else read_extrinsics(extrinsics),
     )  # fmt: skip
     recording = open_recording(kind, source, told)
     console = Console()
     for line in recording.notes.lines:
         console.print(line, soft_wrap=True)
-    trajectory = _trajectory(recording, source, poses)
+    if odometry and poses is not None:
+        raise DatasetError("poses: --odometry finds them; give one of the two", field="poses")
+    if not odometry:
+        trajectory = _trajectory(recording, source, poses)
     with bars() as report:
+        if odometry:
+            trajectory, told_of_loops = _by_odometry(recording, loops, lidar_height, report)
         summary = take(recording, trajectory, out, settings, report=report)
+    if odometry:
+        console.print(told_of_loops, soft_wrap=True)
     _tell(console, out, summary)
 
 
@@ -109,8 +128,28 @@ def _topics(told: list[str]) -> dict[str, str]:
 def _trajectory(recording: Recording, source: Path, poses: Path | None) -> Trajectory:
     trajectory = read_pose_file(poses) if poses is not None else recording.trajectory()
     if trajectory is None:
-        raise DatasetError(f"{source}: the recording has no poses; name a TUM file with --poses", field="poses")
+        raise DatasetError(
+            f"{source}: the recording has no poses; name a TUM file with --poses, or find them with --odometry",
+            field="poses",
+        )
     return trajectory
+
+
+def _by_odometry(
+    recording: Recording, close_loops: bool, lidar_height: float, report: Report
+) -> tuple[Trajectory, str]:
+    """The trajectory and a line for people."""
+    from model_training.odometry.find import find_trajectory
+
+    found = find_trajectory(recording, close_loops=close_loops, expected_height_m=lidar_height, report=report)
+    before, after = found.disagreement_m
+    line = "poses by odometry, "
+    line += (
+        f"{found.loops} loops closed: off by {before:.2f} m there before, {after:.2f} m after"
+        if found.loops
+        else "no loop found"
+    )
+    return found.trajectory, line
 
 
 def _single_frames(source: Path, out: Path, depth: str) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 
 _KEYS = ("T_vehicle_lidar", "T_vehicle_camera")
@@ -33,6 +34,34 @@ def read_extrinsics(path: Path) -> Extrinsics:
     if not isinstance(loaded, dict) or not loaded.keys() <= set(_KEYS):
         raise DatasetError(f"{path}: an object with {' and '.join(_KEYS)} is wanted", field="extrinsics")
     return Extrinsics(**{key: _rigid(path, key, value) for key, value in loaded.items()})
+
+
+def read_camera(path: Path) -> PinholeCamera:
+    """Read intrinsics: ``{"width", "height", "fx", "fy", "cx", "cy", "distortion": []}``, or a request's ``camera``.
+
+    Raises:
+        DatasetError: the file is missing, or a number in it is missing or makes no sense.
+    """
+    try:
+        loaded = json.loads(path.read_text())
+        told = loaded.get("camera", loaded)
+        numbers = {key: float(told[key]) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        distortion = tuple(float(x) for x in told.get("distortion", ()))
+    except (
+        OSError,
+        UnicodeDecodeError,
+        json.JSONDecodeError,
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+    ) as error:
+        raise DatasetError(f"{path}: no camera: {type(error).__name__}: {error}", field="camera") from error
+    if not all(np.isfinite(x) and x > 0 for key, x in numbers.items() if key not in ("cx", "cy")):
+        raise DatasetError(f"{path}: width, height, fx and fy are to be more than 0", field="camera")
+    return PinholeCamera(
+        int(numbers["width"]), int(numbers["height"]), numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"], distortion
+    )  # fmt: skip
 
 
 def _rigid(path: Path, key: str, value: object) -> Transform:

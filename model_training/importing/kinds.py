@@ -8,6 +8,7 @@ from typing import Literal
 from model_training.importing.extrinsics import Extrinsics
 from model_training.importing.recording import Recording
 from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
 
 DepthFrom = Literal["recorded", "stored", "sgbm", "lidar"]
 
@@ -20,12 +21,14 @@ class OpenSettings:
         depth: what a picture's depth comes from.
         topics: of a bag, by role.
         extrinsics: mountings that the recording does not tell.
+        camera: intrinsics that the recording does not tell.
         rectified: whether a bag's pictures are rectified already; None believes the topic's name.
     """
 
     depth: DepthFrom = "recorded"
     topics: Mapping[str, str] = field(default_factory=dict)
     extrinsics: Extrinsics = field(default_factory=Extrinsics)
+    camera: PinholeCamera | None = None
     rectified: bool | None = None
 
 
@@ -59,6 +62,32 @@ def _kitti_odometry(source: Path, settings: OpenSettings) -> Recording:
     return open_kitti_odometry(source, depth=_kitti_depth(settings.depth))
 
 
+def _clouds(source: Path, settings: OpenSettings) -> Recording:
+    from model_training.importing.clouds import open_clouds
+
+    del settings  # nothing of them concerns scans in files
+    return open_clouds(source)
+
+
+def _carla(source: Path, settings: OpenSettings) -> Recording:
+    from model_training.importing.carla_folder import open_carla
+
+    del settings
+    return open_carla(source)
+
+
+def _tum_rgbd(source: Path, settings: OpenSettings) -> Recording:
+    from model_training.importing.rgbd_folder import open_tum_rgbd
+
+    return open_tum_rgbd(source, settings.camera)
+
+
+def _open3d(source: Path, settings: OpenSettings) -> Recording:
+    from model_training.importing.rgbd_folder import open_open3d
+
+    return open_open3d(source, settings.camera)
+
+
 def _rosbag(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.ros_bag import BagSettings, RosBag
 
@@ -78,4 +107,8 @@ KINDS: dict[str, Callable[[Path, OpenSettings], Recording]] = {
     "kitti-raw": _kitti_raw,
     "kitti-odometry": _kitti_odometry,
     "rosbag": _rosbag,
+    "carla": _carla,
+    "clouds": _clouds,
+    "open3d": _open3d,
+    "tum-rgbd": _tum_rgbd,
 }

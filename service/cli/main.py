@@ -18,6 +18,7 @@ GROUP = "streetfix.commands"
 _KNOWN = {
     "simulate": ("Make a city by seed and drive through it: survey and queries.", "mapping"),
     "import": ("Bring recorded data into the dataset folder.", "mapping"),
+    "record": ("Record a drive from a running simulator.", "mapping"),
     "convert": ("Write a dataset as a ROS bag or in KITTI's layout.", "mapping"),
     "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
     "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
@@ -33,7 +34,9 @@ _KNOWN = {
 #: Packages that only some of a command's work needs, and the extra that brings each.
 _EXTRA_OF_PACKAGE = {
     "rosbags": "ros",
-    "laspy": "las",
+    "laspy": "clouds",
+    "plyfile": "clouds",
+    "pypcd4": "clouds",
     "osmium": "geo",
     "pyproj": "geo",
     "gtsam": "odometry",

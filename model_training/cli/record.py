@@ -1,0 +1,38 @@
+"""``streetfix record``."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from model_training.cli.progress import bars
+from service.errors import DatasetError
+
+
+def command(
+    kind: Annotated[str, typer.Argument(help="what is recorded from: carla")],
+    out: Annotated[Path, typer.Option(help="new folder of the recording")],
+    host: Annotated[str, typer.Option(help="of the CARLA server")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="of the CARLA server", min=1, max=65535)] = 2000,
+    town: Annotated[str, typer.Option(help="map to load, such as Town01 [default: the one that is loaded]")] = "",
+    weather: Annotated[str, typer.Option(help="a preset of CARLA's, such as ClearNoon or HardRainSunset")] = "",
+    frames: Annotated[int, typer.Option(help="frames to record", min=1)] = 600,
+    step: Annotated[float, typer.Option(help="simulated seconds between frames", min=0.01, max=1.0)] = 0.1,
+    seed: Annotated[int, typer.Option(help="of the vehicle's place and the traffic", min=0)] = 0,
+) -> None:
+    """Record a drive by autopilot from a running CARLA; Ctrl-C ends it, and what was recorded stays.
+
+    \b
+    Example:
+      streetfix record carla --host 192.168.0.7 --town Town01 --out recordings/town01
+      streetfix import carla recordings/town01 --out data/town01
+    """
+    if kind != "carla":
+        raise DatasetError(f"kind: {kind!r} is not known; there is: carla", field="kind")
+    from model_training.importing.carla_record import RecordSettings, record
+
+    settings = RecordSettings(town=town, weather=weather, frames=frames, step_s=step, seed=seed)
+    with bars() as report:
+        done = record(host, port, out, settings, report=lambda done, of: report("frames", done, of))
+    Console().print(f"{out}: {done} frames; next: streetfix import carla {out} --out DATASET", soft_wrap=True)

@@ -1,0 +1,197 @@
+"""CARLA recordings on disk: what ``save_to_disk`` writes (PLY, PNG, 24-bit depth PNG), with poses and mountings beside it.
+
+``recording.json`` tells where sensors are mounted and the camera's field of view, ``poses.csv`` where the vehicle was in each
+frame, both in CARLA's own convention; ``streetfix record carla`` writes them.
+"""
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from model_training.datasets.dataset import LidarSensor
+from model_training.importing.carla_frame import T_from_carla, depth_from_carla, optical, points_from_carla
+from model_training.importing.cloud_file import read_cloud
+from model_training.importing.kitti_files import read_rgb
+from model_training.importing.recording import Event, Notes, RecordedPicture, RecordedScan, Unusable
+from model_training.importing.trajectory import Trajectory
+from service.errors import DatasetError, StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import Transform
+from service.imaging.decode import ImageLimits
+from service.imaging.picture_headers import header_of, require_pixels
+
+_LIMITS = ImageLimits()
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Mounting(_Model):
+    """A ``carla.Transform`` against the vehicle: metres and degrees, left-handed."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+
+    def T_vehicle_sensor(self) -> Transform:
+        """In our convention."""
+        return T_from_carla(self.x, self.y, self.z, self.roll, self.pitch, self.yaw)
+
+
+class CarlaCamera(_Model):
+    """RGB and depth camera, mounted as one."""
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fov_deg: float = Field(gt=0, lt=180)
+    mounting: Mounting = Mounting()
+
+    def pinhole(self) -> PinholeCamera:
+        """CARLA's field of view is horizontal and reaches from edge to edge."""
+        focal = self.width / (2.0 * np.tan(np.deg2rad(self.fov_deg) / 2))
+        return PinholeCamera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+
+
+class CarlaLidar(_Model):
+    """The ray-cast LiDAR."""
+
+    channels: int = 32
+    upper_fov_deg: float = 10.0
+    lower_fov_deg: float = -30.0
+    range_m: float = 100.0
+    mounting: Mounting = Mounting()
+
+
+class CarlaRecording(_Model):
+    """``recording.json``."""
+
+    town: str = ""
+    lidar: CarlaLidar
+    camera: CarlaCamera | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CarlaFolder:
+    """A recording; ``vehicle`` is the actor's origin, on the ground."""
+
+    path: Path
+    told: CarlaRecording
+    frames: tuple[str, ...]
+    poses: Trajectory
+    kind: str = "carla"
+    georeference: dict[str, Any] | None = None
+
+    @property
+    def lidar(self) -> LidarSensor:
+        """The LiDAR in our convention."""
+        lidar = self.told.lidar
+        return LidarSensor(
+            name="carla", channels=lidar.channels, top_deg=lidar.upper_fov_deg, bottom_deg=lidar.lower_fov_deg,
+            max_range_m=lidar.range_m, T_vehicle_sensor=lidar.mounting.T_vehicle_sensor().tolist(),
+        )  # fmt: skip
+
+    @property
+    def notes(self) -> Notes:
+        """How many there are."""
+        town = f" of {self.told.town}" if self.told.town else ""
+        return Notes((f"{len(self.frames)} frames{town}",), {"path": self.path.name, "town": self.told.town})
+
+    def count(self) -> int:
+        """A scan a frame, and a picture where there is a camera."""
+        return len(self.frames) * (2 if self.told.camera else 1)
+
+    def trajectory(self) -> Trajectory | None:
+        """T_map_vehicle: CARLA's world, mirrored to be right-handed, as its OpenDRIVE is."""
+        return self.poses
+
+    def events(self, *, pictures: bool = True) -> Iterator[Event]:
+        """Frame by frame."""
+        for name, stamp_s in zip(self.frames, self.poses.stamps_s, strict=True):
+            scan = self.path / "lidar" / f"{name}.ply"
+            if scan.is_file():
+                points = read_cloud(scan)
+                if isinstance(points, str):
+                    yield Unusable("scan", scan.name, points)
+                else:
+                    yield RecordedScan(scan.name, float(stamp_s), points_from_carla(points))
+            if pictures and self.told.camera is not None and (self.path / "rgb" / f"{name}.png").is_file():
+                yield self._picture(name, float(stamp_s), self.told.camera)
+
+    def _picture(self, name: str, stamp_s: float, camera: CarlaCamera) -> RecordedPicture | Unusable:
+        rgb_path, depth_path = (self.path / kind / f"{name}.png" for kind in ("rgb", "depth"))
+        try:
+            rgb = read_rgb(rgb_path)
+            data = depth_path.read_bytes()
+            header = header_of(data, "PNG", field="depth")
+            require_pixels(header.height, header.width, _LIMITS, field="depth")
+        except (StreetfixError, OSError) as error:
+            return Unusable("picture", rgb_path.name, f"cannot be read: {type(error).__name__}")
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        if bgr is None:
+            return Unusable("picture", rgb_path.name, "its depth cannot be decoded")
+        T = optical(camera.mounting.T_vehicle_sensor())
+        depth = depth_from_carla(np.asarray(bgr, np.uint8))
+        return RecordedPicture(rgb_path.name, stamp_s, rgb, camera.pinhole(), T, depth=depth, file=rgb_path)
+
+
+def open_carla(source: Path) -> CarlaFolder:
+    """Open a recording.
+
+    Raises:
+        DatasetError: ``recording.json`` or ``poses.csv`` is missing or broken.
+    """
+    told = source / "recording.json"
+    try:
+        recording = CarlaRecording.model_validate_json(told.read_bytes())
+    except OSError as error:
+        raise DatasetError(
+            f"{told} cannot be read ({error}); it tells where sensors are mounted: see docs/recordings.md",
+            field=told.name,
+        ) from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise DatasetError(f"{told}: {where}: {first['msg']}", field=where) from error
+    names, stamps, poses = _poses(source / "poses.csv")
+    return CarlaFolder(source, recording, names, Trajectory(stamps, poses, str(source / "poses.csv")))
+
+
+def write_recording(out: Path, recording: CarlaRecording) -> None:
+    """Write ``recording.json``."""
+    (out / "recording.json").write_text(json.dumps(recording.model_dump(mode="json"), indent=1) + "\n")
+
+
+POSE_COLUMNS = ("frame", "timestamp", "x", "y", "z", "roll", "pitch", "yaw")
+
+
+def _poses(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    if not path.is_file():
+        raise DatasetError(
+            f"{path} is missing: {', '.join(POSE_COLUMNS)} of the vehicle, a line a frame", field=path.name
+        )
+    names, stamps, poses = [], [], []
+    with path.open(newline="") as file:
+        for number, row in enumerate(csv.DictReader(file), 2):
+            try:
+                values = [float(row[column]) for column in POSE_COLUMNS[1:]]
+            except (KeyError, TypeError, ValueError) as error:
+                raise DatasetError(f"{path}, line {number}: not {', '.join(POSE_COLUMNS)}", field=path.name) from error
+            if not (row["frame"] or "").isdigit() or not np.isfinite(values).all():
+                raise DatasetError(
+                    f"{path}, line {number}: the frame is no number, or a value is not finite", field=path.name
+                )
+            names.append(row["frame"])
+            stamps.append(values[0])
+            poses.append(T_from_carla(*values[1:]))
+    return tuple(names), np.array(stamps), np.array(poses).reshape(-1, 4, 4)

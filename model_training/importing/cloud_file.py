@@ -1,0 +1,77 @@
+"""One scan in a file of its own: PCD, PLY, LAS, LAZ, or KITTI's rows of float32."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+from numpy.typing import NDArray
+
+from model_training.importing.scan_file import read_scan
+
+Points = Float32[NDArray[np.float32], "N 4"]
+_INTENSITY = ("intensity", "Intensity", "I", "i", "reflectivity", "scalar_Intensity", "scalar_intensity")
+#: Bytes of a file that are read at all.
+MAX_BYTES = 1 << 30
+
+
+def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
+    """Points x y z (as the file has them, metres) and intensity, or why the file is no scan.
+
+    Args:
+        path: its suffix says the format.
+        max_points: more is refused.
+    """
+    if path.suffix.lower() == ".bin":
+        return read_scan(path, max_points=max_points)
+    if path.stat().st_size > MAX_BYTES:
+        return f"more than {MAX_BYTES >> 20} MiB"
+    try:
+        columns = _READERS[path.suffix.lower()](path)
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:  # three packages, each with errors of its own, and whatever damage makes NumPy raise
+        return f"it cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
+    if isinstance(columns, str):
+        return columns
+    if len(columns) > max_points:
+        return f"more than {max_points} points"
+    return columns if len(columns) else "no points"
+
+
+def _pcd(path: Path) -> Points | str:
+    from pypcd4.pypcd4 import PointCloud
+
+    cloud = PointCloud.from_path(path)
+    return _columns(cloud.fields, lambda name: cloud.numpy((name,))[:, 0])
+
+
+def _ply(path: Path) -> Points | str:
+    from plyfile import PlyData
+
+    vertices = PlyData.read(str(path))["vertex"].data
+    return _columns(vertices.dtype.names, lambda name: vertices[name])
+
+
+def _las(path: Path) -> Points | str:
+    import laspy
+
+    with laspy.open(path) as file:
+        cloud = file.read()
+    xyz = np.asarray(cloud.xyz)
+    return np.asarray(np.c_[xyz, np.asarray(cloud.intensity)], np.float32)
+
+
+def _columns(names: Sequence[str], column: Callable[[str], Any]) -> Points | str:
+    missing = [name for name in "xyz" if name not in names]
+    if missing:
+        return f"its fields have no {', '.join(missing)} (they are: {', '.join(names)})"
+    intensity = next((name for name in _INTENSITY if name in names), None)
+    chosen = [np.asarray(column(name), np.float32) for name in "xyz"]
+    chosen.append(np.zeros_like(chosen[0]) if intensity is None else np.asarray(column(intensity), np.float32))
+    return np.stack(chosen, axis=1)
+
+
+_READERS: dict[str, Callable[[Path], Points | str]] = {".pcd": _pcd, ".ply": _ply, ".las": _las, ".laz": _las}
+SUFFIXES = (".bin", *_READERS)

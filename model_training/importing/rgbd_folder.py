@@ -1,0 +1,209 @@
+"""RGB-D recordings in folders: TUM's layout and Open3D's. They have no LiDAR; their scans are made of their depth."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model_training.datasets.dataset import LidarSensor, read_tum
+from model_training.importing.depth_scan import scan_from_depth
+from model_training.importing.kitti_files import read_rgb
+from model_training.importing.recording import Event, Notes, RecordedPicture, Unusable
+from model_training.importing.rectify import rectified
+from model_training.importing.trajectory import Trajectory
+from service.errors import DatasetError, StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, Transform, transform_from
+from service.imaging.depth_formats import read_depth_values
+from service.imaging.picture_headers import ImageLimits
+
+#: Depth of TUM's files: 5000 steps a metre; Open3D's own tools write millimetres.
+TUM_SCALE_M, OPEN3D_SCALE_M = 1 / 5000, 0.001
+#: Colour and depth of TUM's sequences are stamped apart.
+PAIR_TOLERANCE_S = 0.02
+#: Frames a second of a folder without times.
+RATE_HZ = 30.0
+_AHEAD: Transform = transform_from(R_BODY_OPTICAL, np.zeros(3))
+_LIMITS = ImageLimits()
+
+
+@dataclass(frozen=True, slots=True)
+class RgbdFrame:
+    """Files of one moment."""
+
+    stamp_s: float
+    rgb: Path
+    depth: Path
+
+
+@dataclass(frozen=True, slots=True)
+class RgbdFolder:
+    """A recording of one RGB-D camera; ``vehicle`` is the camera's body: x ahead, z up."""
+
+    kind: str
+    path: Path
+    frames: tuple[RgbdFrame, ...]
+    camera: PinholeCamera
+    scale_m: float
+    poses: Trajectory | None
+    lidar: LidarSensor = field(
+        default_factory=lambda: LidarSensor(name="depth camera", T_vehicle_sensor=np.eye(4).tolist())
+    )
+    georeference: dict[str, Any] | None = None
+
+    @property
+    def notes(self) -> Notes:
+        """How many there are."""
+        line = f"{len(self.frames)} RGB-D frames; scans are made of their depth, so the map sees only where the camera looked"
+        return Notes((line,), {"path": self.path.name})
+
+    def count(self) -> int:
+        """A scan and a picture a frame."""
+        return 2 * len(self.frames)
+
+    def trajectory(self) -> Trajectory | None:
+        """As the recording has it."""
+        return self.poses
+
+    def events(self, *, pictures: bool = True) -> Iterator[Event]:
+        """Frame by frame: its scan, then its picture pair."""
+        for frame in self.frames:
+            picture = self._picture(frame)
+            if isinstance(picture, Unusable):
+                yield picture
+                continue
+            scan = scan_from_depth(rectified(picture))
+            yield Unusable("scan", picture.name, "no depth in it") if scan is None else scan
+            if pictures:
+                yield picture
+
+    def _picture(self, frame: RgbdFrame) -> RecordedPicture | Unusable:
+        try:
+            rgb = read_rgb(frame.rgb)
+            values = read_depth_values(frame.depth.read_bytes(), encoding=None, limits=_LIMITS)
+        except (StreetfixError, OSError) as error:
+            return Unusable("picture", frame.rgb.name, f"cannot be read: {error}".replace(f"{frame.rgb}: ", ""))
+        depth = np.asarray(values, np.uint16) if values.dtype == np.uint16 else np.asarray(values, np.float32)
+        size = (self.camera.height, self.camera.width)
+        if rgb.shape[:2] != size or depth.shape != size:
+            return Unusable(
+                "picture", frame.rgb.name, f"sizes differ: colour {rgb.shape[:2]}, depth {depth.shape}, camera {size}"
+            )
+        return RecordedPicture(
+            frame.rgb.name, frame.stamp_s, rgb, self.camera, _AHEAD, depth=depth, depth_scale_m=self.scale_m, file=frame.rgb
+        )  # fmt: skip
+
+
+def open_tum_rgbd(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
+    """Open TUM's layout: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt`` (T_world_camera) and the pictures that they name.
+
+    Args:
+        source: the folder.
+        camera: intrinsics, which the layout does not tell.
+
+    Raises:
+        DatasetError: a list is missing or broken, no colour has a depth, or there is no camera.
+    """
+    colour, depth = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
+    stamps = np.array([stamp for stamp, _ in depth])
+    frames = []
+    for stamp_s, path in colour:
+        nearest = int(np.argmin(np.abs(stamps - stamp_s)))
+        if abs(stamps[nearest] - stamp_s) <= PAIR_TOLERANCE_S:
+            frames.append(RgbdFrame(stamp_s, path, depth[nearest][1]))
+    if not frames:
+        raise DatasetError(f"{source}: no colour picture has a depth within {PAIR_TOLERANCE_S:g} s", field="depth.txt")
+    if camera is None:
+        raise DatasetError(
+            f"{source}: TUM's layout does not tell the camera; give --camera FILE with width, height, fx, fy, cx, cy",
+            field="camera",
+        )
+    truth = source / "groundtruth.txt"
+    poses = None
+    if truth.is_file():
+        times, T = read_tum(truth)
+        poses = Trajectory(times, T, str(truth)).moved_by(_AHEAD)
+    return RgbdFolder("tum-rgbd", source, tuple(frames), camera, TUM_SCALE_M, poses)
+
+
+def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
+    """Open a folder as Open3D's reconstruction reads it: ``color``, ``depth``, ``camera_intrinsic.json``, ``trajectory.log``.
+
+    Args:
+        source: the folder.
+        camera: intrinsics; by default those of the JSON.
+
+    Raises:
+        DatasetError: pictures, camera or a pose are missing or broken.
+    """
+    folder = next((source / name for name in ("color", "rgb", "image") if (source / name).is_dir()), source / "color")
+    colour, depth = (
+        sorted(p for p in where.iterdir() if p.suffix in (".jpg", ".png")) if where.is_dir() else []
+        for where in (folder, source / "depth")
+    )
+    if not colour or len(colour) != len(depth):
+        raise DatasetError(
+            f"{source}: as many pictures in color as in depth are wanted; there are {len(colour)} and {len(depth)}",
+            field="source",
+        )
+    intrinsics = next(
+        (p for name in ("camera_intrinsic.json", "intrinsic.json") if (p := source / name).is_file()), None
+    )
+    if camera is None and intrinsics is not None:
+        camera = _open3d_camera(intrinsics)
+    if camera is None:
+        raise DatasetError(
+            f"{source}: there is no camera_intrinsic.json; add it, or give --camera FILE", field="camera"
+        )
+    frames = tuple(RgbdFrame(k / RATE_HZ, a, b) for k, (a, b) in enumerate(zip(colour, depth, strict=True)))
+    log = next((p for p in (source / "trajectory.log", source / "scene" / "trajectory.log") if p.is_file()), None)
+    poses = None if log is None else _open3d_poses(log).moved_by(_AHEAD)
+    return RgbdFolder("open3d", source, frames, camera, OPEN3D_SCALE_M, poses)
+
+
+def _listed(path: Path) -> list[tuple[float, Path]]:
+    """Times and files of TUM's lists."""
+    if not path.is_file():
+        raise DatasetError(f"{path} is missing; TUM's layout has it beside the pictures", field=path.name)
+    found = []
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        parts = line.split()
+        try:
+            stamp_s, name = float(parts[0]), parts[1]
+        except (ValueError, IndexError) as error:
+            raise DatasetError(f"{path}, line {number}: not `timestamp file`", field=path.name) from error
+        named = (path.parent / name).resolve()
+        if not named.is_relative_to(path.parent.resolve()):
+            raise DatasetError(f"{path}, line {number}: the file lies outside of the recording", field=path.name)
+        found.append((stamp_s, named))
+    if not found:
+        raise DatasetError(f"{path} lists no picture", field=path.name)
+    return found
+
+
+def _open3d_camera(path: Path) -> PinholeCamera:
+    try:
+        loaded = json.loads(path.read_text())
+        K = np.array(loaded["intrinsic_matrix"], np.float64).reshape(3, 3).T  # column after column
+        return PinholeCamera(int(loaded["width"]), int(loaded["height"]), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{path}: no camera of Open3D: {error}", field=path.name) from error
+
+
+def _open3d_poses(path: Path) -> Trajectory:
+    """T_world_camera: a line of three whole numbers, then four rows, a frame."""
+    lines = [line for line in path.read_text(errors="replace").splitlines() if line.strip()]
+    stamps, poses = [], []
+    for start in range(0, len(lines), 5):
+        try:
+            T = np.array([line.split() for line in lines[start + 1 : start + 5]], np.float64).reshape(4, 4)
+            stamps.append(int(lines[start].split()[0]) / RATE_HZ)
+        except (ValueError, IndexError) as error:
+            raise DatasetError(f"{path}, line {start + 1}: not a frame of five lines", field=path.name) from error
+        poses.append(T)
+    return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4), str(path))

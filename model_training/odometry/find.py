@@ -1,0 +1,75 @@
+"""Poses of a recording that has none: odometry, then loops closed."""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from model_training.importing.recording import Recording
+from model_training.importing.take import scans_of
+from model_training.importing.trajectory import Trajectory
+from model_training.odometry.keyframes import drive_of
+from model_training.odometry.loops import find_loops
+from model_training.odometry.pose_graph import closed, disagreement_m
+from model_training.odometry.scan_to_map import posed
+from model_training.stock import ENCODER
+from service.errors import DatasetError
+from service.localization.encoder import Encoder
+
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What odometry found.
+
+    Attributes:
+        trajectory: T_map_vehicle; the map is the LiDAR's frame at the first scan.
+        before: the same without loops closed.
+        loops: how many were proved.
+        disagreement_m: of odometry with the loops, in the mean: before and after they were closed.
+    """
+
+    trajectory: Trajectory
+    before: Trajectory
+    loops: int
+    disagreement_m: tuple[float, float]
+
+
+def find_trajectory(
+    recording: Recording, *, close_loops: bool = True, expected_height_m: float = 1.8, report: Report = lambda *_: None
+) -> Found:
+    """Follow the scans of a recording, and close loops where a place is met again.
+
+    Args:
+        recording: its own poses are not looked at.
+        close_loops: False leaves odometry as it is.
+        expected_height_m: of the LiDAR above the ground, roughly.
+        report: told stage, done and all.
+
+    Raises:
+        DatasetError: there is no usable scan.
+    """
+    mounted = recording.lidar.T_vehicle_sensor
+    T_vehicle_lidar = np.eye(4) if mounted is None else np.array(mounted, np.float64)
+    encoder = Encoder.open(ENCODER, threads=2) if close_loops else None
+    total = recording.count()
+    with tempfile.TemporaryDirectory(prefix="streetfix-odometry-") as folder:
+        drive = drive_of(
+            posed(scans_of(recording)), encoder, Path(folder), expected_height_m=expected_height_m,
+            report=lambda done: report("odometry", done, max(done, total)),
+        )  # fmt: skip
+        if not len(drive.stamps_s):
+            raise DatasetError("no scan can be used, so odometry has nothing to follow", field="scans")
+        name = "odometry (KISS-ICP)"
+        before = Trajectory(drive.stamps_s, drive.T_first_lidar, name).moved_by(T_vehicle_lidar)
+        loops = find_loops(drive, report=lambda done, of: report("loops", done, of)) if close_loops else []
+        if not loops:
+            return Found(before, before, 0, (0.0, 0.0))
+        T = closed(drive, loops)
+        rows = np.searchsorted(drive.stamps_s, [keyframe.stamp_s for keyframe in drive.keyframes])
+        away = (disagreement_m(drive.T_first_lidar[rows], loops), disagreement_m(T[rows], loops))
+        after = Trajectory(drive.stamps_s, T, f"{name}, {len(loops)} loops closed").moved_by(T_vehicle_lidar)
+        return Found(after, before, len(loops), away)
