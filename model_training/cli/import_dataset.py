@@ -46,6 +46,7 @@ def command(
             help="leave each such scan out of the survey, and take only pictures near those as queries", min=0
         ),
     ] = 0,
+    hold_out_first: Annotated[int, typer.Option(help="with --hold-out: the first scan left out, from 0", min=0)] = 0,
     sync: Annotated[str, typer.Option(help="how a frame's pose is found: interpolate, or nearest")] = "interpolate",
     tolerance: Annotated[float, typer.Option(help="seconds that a pose or scan may be from a frame", min=0)] = 0.1,
     topic: Annotated[
@@ -91,7 +92,7 @@ def command(
         raise DatasetError(f"sync: {sync!r} is neither 'interpolate' nor 'nearest'", field="sync")
     settings = TakeSettings(
         queries=queries if pictures else "", depth="lidar" if depth == "lidar" else "recorded", sync=cast(Sync, sync),
-        tolerance_s=tolerance, deskew=deskew, hold_out=hold_out,
+        tolerance_s=tolerance, deskew=deskew, hold_out=hold_out, hold_out_first=hold_out_first,
     )  # fmt: skip
     told = OpenSettings(
         depth=cast(DepthFrom, depth or "recorded"), topics=_topics(topic or []), rectified=rectified,

@@ -43,6 +43,7 @@ class TakeSettings:
         deskew: take the vehicle's motion out of scans that tell their points' times.
         hold_out: each how many scans one is left out of the survey; 0 leaves none out. Pictures are then queries only if the
             scan nearest to them was left out, so that no query's own moment is in the map.
+        hold_out_first: the first scan that is left out, counted from 0.
         max_points: of a scan; more is refused before it is kept.
     """
 
@@ -52,6 +53,7 @@ class TakeSettings:
     tolerance_s: float = 0.1
     deskew: bool = True
     hold_out: int = 0
+    hold_out_first: int = 0
     max_points: int = 5_000_000
 
     def __post_init__(self) -> None:
@@ -62,6 +64,10 @@ class TakeSettings:
         """
         if self.hold_out == 1 or self.hold_out < 0:
             raise DatasetError("hold_out: 1 would leave no survey; give 0, or 2 and more", field="hold_out")
+        if self.hold_out and not 0 <= self.hold_out_first < self.hold_out:
+            raise DatasetError(
+                f"hold_out_first: {self.hold_out_first} is none of 0 to {self.hold_out - 1}", field="hold_out_first"
+            )
         if not 0 <= self.tolerance_s < np.inf:
             raise DatasetError(f"tolerance_s: {self.tolerance_s:g} is no time; give seconds", field="tolerance_s")
 
@@ -136,7 +142,9 @@ class _Taking:
         clean = scan if finite.all() else _only(scan, finite)
         points = deskewed(clean, self._trajectory, self._T_vehicle_lidar) if self._settings.deskew else clean.points
         self._last_scan_s = scan.stamp_s
-        is_held = bool(self._settings.hold_out) and self._seen % self._settings.hold_out == self._settings.hold_out - 1
+        is_held = (
+            bool(self._settings.hold_out) and self._seen % self._settings.hold_out == self._settings.hold_out_first
+        )
         self._seen += 1
         self._recent.append((scan.stamp_s, is_held, points))
         if is_held:

@@ -1,0 +1,93 @@
+"""KITTI's recordings: imported, mapped with the stock encoder, and asked over HTTP."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.real.served import answers, away_m
+from benchmarks.report import Report
+from model_training.datasets.dataset import Dataset, read_tum
+from model_training.importing.kinds import OpenSettings, open_recording
+from model_training.importing.kitti_object import import_kitti_object
+from model_training.importing.pose_file import read_pose_file
+from model_training.importing.take import TakeSettings, take
+from model_training.importing.trajectory import Trajectory
+from model_training.mapping.build import BuildSettings, build_map
+from model_training.odometry.find import find_trajectory
+from model_training.stock import ENCODER
+
+DRIVE = Path("2011_09_26") / "2011_09_26_drive_sync"
+LIDAR_HEIGHT_M = 1.73  # as KITTI's own figure of its car has it
+SETTINGS = OpenSettings(depth="lidar")
+NO_DATA = "no recordings at {name}"
+
+
+def drive_rows(report: Report, data: Path, work: Path) -> None:
+    """``kitti_drive``: every other scan is the map, the frames between are asked; then the other way round."""
+    source = data / "kitti_drive" / DRIVE
+    if not source.exists():
+        for row, unit in (("within_1_m", "share"), ("median_m", "m"), ("odometry_vs_reference_m", "m")):
+            report.row(f"kitti_drive.{row}", None, unit, bar=0.0, why=NO_DATA.format(name=data.name))
+        return
+    reference = source / "reference_poses.txt"
+    stamps, T_reference = read_tum(reference)
+    odometry = find_trajectory(open_recording("kitti-raw", source, SETTINGS), close_loops=False)
+    drift = away_m(_at(odometry.trajectory, stamps), T_reference)
+    report.row("kitti_drive.odometry_vs_reference_m", float(drift.mean()), "m", bar=0.05, better="lower", n=len(drift))
+    away = {"given": read_pose_file(reference), "odometry": odometry.trajectory}
+    errors = {
+        name: _both_halves(source, poses, work / f"kitti_drive_{name}", reference) for name, poses in away.items()
+    }
+    for name, found in errors.items():
+        report.share(f"kitti_drive.{name}_poses.within_1_m", found <= 1.0)
+        report.row(f"kitti_drive.{name}_poses.median_m", float(np.median(found)), "m", n=len(found))
+    both = np.concatenate(list(errors.values()))
+    report.share("kitti_drive.within_1_m", both <= 1.0, bar=1.0)
+    report.row("kitti_drive.median_m", float(np.median(both)), "m", bar=0.12, better="lower", n=len(both))
+
+
+def stereo_rows(report: Report, data: Path, work: Path) -> None:
+    """``kitti_stereo``: the places of all frames in one map, the stereo frames asked with SGBM's depth."""
+    source = data / "kitti_stereo"
+    if not source.exists():
+        report.row("kitti_stereo.served.within_1_m", None, "share", bar=1.0, why=NO_DATA.format(name=data.name))
+        return
+    folder, bundle = work / "kitti_stereo", work / "kitti_stereo_map"
+    _fresh(folder, bundle)
+    import_kitti_object(source, folder, depth="sgbm")
+    dataset = Dataset(folder)
+    build_map(dataset, ENCODER, bundle, BuildSettings(name="kitti-stereo", expected_lidar_height_m=LIDAR_HEIGHT_M))
+    truth = np.array([frame.T_map_camera for frame in dataset.queries("frames")])
+    away = away_m(answers(bundle, dataset, "frames"), truth)
+    report.share("kitti_stereo.served.within_1_m", away <= 1.0, bar=1.0)
+    report.row("kitti_stereo.served.median_m", float(np.median(away)), "m", n=len(away))
+
+
+def _both_halves(source: Path, poses: Trajectory, work: Path, reference: Path) -> NDArray[np.float64]:
+    """Distances (m) of all frames' answers from the reference, each frame asked of the map that lacks it."""
+    away = []
+    for first in (0, 1):
+        folder, bundle = work.with_name(f"{work.name}_{first}"), work.with_name(f"{work.name}_{first}_map")
+        _fresh(folder, bundle)
+        recording = open_recording("kitti-raw", source, SETTINGS)
+        take(recording, poses, folder, TakeSettings(depth="lidar", hold_out=2, hold_out_first=first))
+        dataset = Dataset(folder)
+        settings = BuildSettings(name="kitti-drive", spacing_m=0.0, expected_lidar_height_m=LIDAR_HEIGHT_M)
+        build_map(dataset, ENCODER, bundle, settings)
+        frames = list(dataset.queries("recorded"))
+        camera = np.array(frames[0].camera.T_vehicle_sensor)
+        stamps = np.array([frame.stamp_s for frame in frames], np.float64)
+        away.append(away_m(answers(bundle, dataset, "recorded"), _at(read_pose_file(reference), stamps) @ camera))
+    return np.concatenate(away)
+
+
+def _at(trajectory: Trajectory, stamps_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    return trajectory.between(stamps_s)
+
+
+def _fresh(*folders: Path) -> None:
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)

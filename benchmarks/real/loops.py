@@ -1,0 +1,30 @@
+"""A simulated survey without poses: how far off it is by odometry alone, and with its loops closed."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.real.loop_drive import LoopDrive
+from benchmarks.report import Report
+from model_training.odometry.find import find_trajectory
+
+SEED, LENGTH_M = 9101, 1500.0
+
+
+def loop_rows(report: Report) -> None:
+    """Root of the mean squared distance from the truth, trajectories aligned as a whole (what ``evo_ape --align`` gives)."""
+    drive = LoopDrive(SEED, length_m=LENGTH_M)
+    found = find_trajectory(drive, report=lambda stage, done, of: print(f"\r{stage} {done}/{of}", end="", flush=True))
+    print()
+    truth = drive.T_map_lidar[:, :3, 3]
+    before, after = (aligned_error_m(t.T_map_vehicle[:, :3, 3], truth) for t in (found.before, found.trajectory))
+    report.row("loop_closure.drift_before_m", before, "m", n=len(truth))
+    report.row("loop_closure.drift_after_m", after, "m", bar=0.30, better="lower", n=len(truth))
+    report.row("loop_closure.loops", found.loops, "loops")
+
+
+def aligned_error_m(estimated: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+    """RMSE after the rigid alignment that makes it smallest (Umeyama 1991, without scale)."""
+    a, b = estimated - estimated.mean(axis=0), truth - truth.mean(axis=0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return float(np.sqrt(((a @ R.T - b) ** 2).sum(axis=1).mean()))

@@ -1,0 +1,128 @@
+"""A simulated dataset written in other people's formats and imported again: what the way there and back costs."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.report import ROOT, Report
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.predict import predict
+from model_training.exporting.kitti_raw import DAY, DRIVE, POSES, write_kitti_raw
+from model_training.exporting.ros_bag import write_bag
+from model_training.importing.kinds import OpenSettings, open_recording
+from model_training.importing.pose_file import read_pose_file
+from model_training.importing.take import TakeSettings, take
+from model_training.mapping.build import BuildSettings, build_map
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.simulate import simulate
+from model_training.stock import ENCODER
+from service.localization.localizer import Localizer
+from service.maps.reader import MapBundle
+
+QUERIES = "drive1_precise"
+#: Scans of the bags whose import is timed, and whose memory is compared.
+SHORT, LONG = 500, 5000
+
+
+def round_trip_rows(report: Report, work: Path) -> None:
+    """Answers after the way there and back against those before."""
+    original = simulated(work)
+    expected = _answers(original, QUERIES, work / "round_trip_map")
+    for kind in ("mcap", "bag", "kitti"):
+        again = _there_and_back(original, kind, work)
+        found = _answers(again, "recorded", work / f"round_trip_{kind}_map")
+        away = np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1)
+        report.row(f"roundtrip.{kind}.pose_difference_m", float(away.max()), "m", bar=0.01, better="lower", n=len(away))
+
+
+def import_rows(report: Report, work: Path) -> None:
+    """Scans a second out of a bag, and what ten times as many take in memory."""
+    original = simulated(work)
+    peaks, rates = {}, {}
+    for scans in (SHORT, LONG):
+        bag, out = work / f"many_{scans}.bag", work / f"many_{scans}"
+        for path in (bag, out):
+            shutil.rmtree(path, ignore_errors=True)
+        _repeated(original, scans, bag)
+        rates[scans], peaks[scans] = _import_apart(bag, out)
+        for path in (bag, out):
+            shutil.rmtree(path)
+    report.row("import.scans_per_s", rates[LONG], "1/s", bar=50, n=LONG)
+    growth = peaks[LONG] - peaks[SHORT]
+    report.row("import.memory_growth_mib", growth, "MiB", bar=50, better="lower", n=LONG)
+    report.row("import.peak_mib", peaks[LONG], "MiB", n=LONG)
+
+
+def simulated(work: Path) -> Dataset:
+    """A street of the paper's city and one query drive, kept in ``work``."""
+    asked = QueryPlan(name="drive1", traversal=1, count=40, depths=("precise",))
+    plan = SimulationPlan(name="round-trip", city="paper", seed=9090, streets=("1",), queries=(asked,))
+    folder = work / plan.name
+    simulate(plan, folder)
+    return Dataset(folder)
+
+
+def _there_and_back(original: Dataset, kind: str, work: Path) -> Dataset:
+    there, back = work / f"round_trip_{kind}.bag", work / f"round_trip_{kind}"
+    for path in (there, back):
+        if path.is_file():
+            path.unlink()
+        shutil.rmtree(path, ignore_errors=True)
+    if kind == "kitti":
+        write_kitti_raw(original, QUERIES, there, report=lambda *_: None)
+        recording = open_recording("kitti-raw", there / DAY / DRIVE, OpenSettings(depth="stored"))
+        poses = read_pose_file(there / DAY / DRIVE / POSES)
+    else:
+        write_bag(original, QUERIES, there, kind="mcap" if kind == "mcap" else "bag", report=lambda *_: None)
+        recording = open_recording("rosbag", there, OpenSettings())
+        told = recording.trajectory()
+        if told is None:
+            raise RuntimeError(f"the bag of {kind} came back without its poses")
+        poses = told
+    take(recording, poses, back, TakeSettings())
+    return Dataset(back)
+
+
+def _answers(dataset: Dataset, queries: str, bundle: Path) -> np.ndarray:
+    shutil.rmtree(bundle, ignore_errors=True)
+    build_map(dataset, ENCODER, bundle, BuildSettings(name="round-trip"))
+    return predict(Localizer.open(MapBundle.open(bundle)), dataset, queries).T_answer
+
+
+class _Repeated(Dataset):
+    """A dataset whose survey is driven again and again, for a long bag."""
+
+    def __init__(self, folder: Path, scans: int) -> None:
+        super().__init__(folder)
+        self._scans = scans
+
+    def survey_trajectory(self) -> tuple[np.ndarray, np.ndarray]:
+        _, poses = super().survey_trajectory()
+        rows = np.arange(self._scans) % len(poses)
+        return np.arange(self._scans) * 0.1, poses[rows]
+
+    def scan(self, number: int) -> np.ndarray:
+        return super().scan(number % len(super().survey_trajectory()[0]))
+
+
+def _repeated(original: Dataset, scans: int, out: Path) -> None:
+    write_bag(_Repeated(original.folder, scans), None, out, kind="mcap", report=lambda *_: None)
+
+
+def _import_apart(bag: Path, out: Path) -> tuple[float, float]:
+    """Scans a second and the peak of memory (MiB) of the real command, in a process of its own."""
+    code = (
+        "import resource, sys, json, time\n"
+        "from service.cli.main import main\n"
+        "began = time.perf_counter()\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        "print(json.dumps([time.perf_counter() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]))"
+    )
+    command = [sys.executable, "-c", code, "import", "rosbag", str(bag), "--out", str(out), "--no-pictures"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    seconds, peak_kib = json.loads(done.stdout.splitlines()[-1])
+    return len(Dataset(out).survey_poses()) / seconds, peak_kib / 1024
