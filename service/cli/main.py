@@ -18,6 +18,7 @@ GROUP = "streetfix.commands"
 _KNOWN = {
     "simulate": ("Make a city by seed and drive through it: survey and queries.", "mapping"),
     "import": ("Bring recorded data into the dataset folder.", "mapping"),
+    "streets": ("Name streets: from GeoJSON, OpenDRIVE or OpenStreetMap into a dataset.", "mapping"),
     "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
     "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
     "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
