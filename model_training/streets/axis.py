@@ -10,6 +10,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree, shortest_path
 from shapely.geometry.base import BaseGeometry
 
+#: Carriageways of one street are rarely further apart than this.
+_PARALLEL_M = 25.0
+_PARALLEL_SHARE = 0.8
+
 
 def axis_of(surface: BaseGeometry, lines: Sequence[shapely.LineString]) -> shapely.LineString:
     """The line along which a street's length is counted, metres.
@@ -24,12 +28,23 @@ def axis_of(surface: BaseGeometry, lines: Sequence[shapely.LineString]) -> shape
     """
     if not lines:
         return _of_rectangle(surface)
-    merged = shapely.line_merge(shapely.union_all(list(lines)))
+    merged = shapely.line_merge(shapely.union_all(_one_carriageway(lines)))
     pieces = [part for part in shapely.get_parts(merged) if part.length > 0]
     axis = pieces[0] if len(pieces) == 1 else _longest_way(pieces)
     first = lines[0]
     start, end = (axis.project(shapely.Point(first.coords[at])) for at in (0, -1))
     return axis.reverse() if start > end else axis
+
+
+def _one_carriageway(lines: Sequence[shapely.LineString]) -> list[shapely.LineString]:
+    """The lines, longest first, less those that run beside longer ones: along both, the way would lead there and back."""
+    kept: list[shapely.LineString] = []
+    beside: BaseGeometry = shapely.Polygon()
+    for line in sorted(lines, key=lambda each: -each.length):
+        if not kept or line.intersection(beside).length < _PARALLEL_SHARE * line.length:
+            kept.append(line)
+            beside = beside.union(line.buffer(_PARALLEL_M, cap_style="flat"))
+    return kept
 
 
 def _of_rectangle(surface: BaseGeometry) -> shapely.LineString:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,9 +120,9 @@ def _coordinates(shape: BaseGeometry) -> list[list[list[list[float]]]]:
 
 def _own_ids(streets: list[NamedStreet]) -> list[str]:
     ids = [street.id for street in streets if street.id is not None]
-    twice = next((identity for identity in ids if ids.count(identity) > 1), None)
-    if twice is not None:
-        raise DatasetError(f"two streets have the id {twice!r}; give each its own, or none", field="id")
+    most = Counter(ids).most_common(1)
+    if most and most[0][1] > 1:
+        raise DatasetError(f"two streets have the id {most[0][0]!r}; give each its own, or none", field="id")
     return ids
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, NoReturn, cast
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry.base import BaseGeometry
+from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 
 from model_training.streets.corridor import corridor
 from model_training.streets.map_frame import FARTHEST_M, MapFrame
@@ -166,8 +166,9 @@ def _parts(feature: dict[str, Any], to_map: ToMap, where: str) -> list[BaseGeome
 
 def _leaves(shape: BaseGeometry) -> list[BaseGeometry]:
     """A geometry's simple parts, also those of collections in collections."""
-    parts = shapely.get_parts(shape)
-    return [shape] if len(parts) == 1 and parts[0].equals(shape) else [leaf for part in parts for leaf in _leaves(part)]
+    if not isinstance(shape, BaseMultipartGeometry):
+        return [shape]
+    return [leaf for part in shape.geoms for leaf in _leaves(part)]
 
 
 def _width(feature: dict[str, Any], width_m: float | None, where: str) -> float:

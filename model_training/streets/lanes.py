@@ -20,7 +20,7 @@ DRIVEN = frozenset({
 #: "none" is the ground outside of a road.
 NOWHERE = frozenset({"none"})
 #: Strips that follow one another meet to rounding only; on this grid they meet exactly.
-_GRID_M = 0.001
+GRID_M = 0.001
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class RoadShape:
             for section, end in zip(self.sections, ends, strict=True)
             for strip in self._strips(section, end, lanes)
         ]
-        return shapely.union_all(strips, grid_size=_GRID_M)
+        return shapely.union_all(strips, grid_size=GRID_M)
 
     def _strips(self, section: LaneSection, end: float, lanes: Lanes) -> list[BaseGeometry]:
         if end <= section.s:

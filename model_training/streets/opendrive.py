@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 
+from model_training.streets.lanes import GRID_M
 from model_training.streets.map_frame import MapFrame, Points
 from model_training.streets.named_street import Lanes, NamedStreet, StreetSource, in_natural_order
 from model_training.streets.opendrive_junctions import junction_streets
@@ -101,7 +102,7 @@ def read_opendrive(path: Path, *, lanes: Lanes = "all", frame: MapFrame | None =
     streets = [
         NamedStreet(
             street=name, name=name, lines=tuple(road.centre for road in of_name[name]),
-            surface=shapely.union_all([*(road.surface for road in of_name[name]), *through.get(name, ())]),
+            surface=shapely.union_all([*(road.surface for road in of_name[name]), *through.get(name, ())], grid_size=GRID_M),
         )
         for name in sorted(of_name, key=in_natural_order)
     ]  # fmt: skip

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from model_training.streets.lanes import GRID_M
 from model_training.streets.named_street import NamedStreet, in_natural_order
 from model_training.streets.opendrive_road import Road
 
@@ -41,12 +42,9 @@ def junction_streets(
         own = junctions.get(identity, "")
         met = sorted({names[road] for road in meeting[identity] if road in names}, key=in_natural_order)
         # What its lanes lead around, between kerbs or on an island, belongs to a junction as well.
+        parts = shapely.get_parts(shapely.union_all(surfaces[identity], grid_size=GRID_M))
         ground = shapely.union_all(
-            [
-                shapely.Polygon(part.exterior)
-                for part in shapely.get_parts(shapely.union_all(surfaces[identity]))
-                if isinstance(part, shapely.Polygon)
-            ]
+            [shapely.Polygon(part.exterior) for part in parts if isinstance(part, shapely.Polygon)]
         )
         if own and not _NUMBERED.fullmatch(own):
             name = own
