@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 
 from model_training.streets.corridor import corridor
 from model_training.streets.map_frame import FARTHEST_M, MapFrame
-from model_training.streets.named_street import NamedStreet, Section, StreetSource
+from model_training.streets.named_street import LARGEST_M, NamedStreet, Section, StreetSource
 from service.errors import DatasetError
 
 DEFAULT_WIDTH_M = 8.0
@@ -156,7 +156,7 @@ def _parts(feature: dict[str, Any], to_map: ToMap, where: str) -> list[BaseGeome
         raise DatasetError(
             f"{where}.geometry: its coordinates make no {kind}: {error}; correct them", field="geometry"
         ) from error
-    if not np.isfinite(shapely.get_coordinates(placed)).all():
+    if not (np.abs(shapely.get_coordinates(placed)) <= LARGEST_M).all():
         return f"lie more than {FARTHEST_M / 1000:.0f} km from the map's origin, or nowhere (are they WGS-84?)"
     repaired = shapely.make_valid(placed) if "Polygon" in kind else placed
     wanted: type[BaseGeometry] = shapely.Polygon if "Polygon" in kind else shapely.LineString

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from model_training.streets.named_street import Lanes
+from model_training.streets.named_street import LARGEST_M, Lanes
 from model_training.streets.plan_view import STEP_M, Along, Geometry, Points, reference_line
 
 #: OpenDRIVE's types of lanes that vehicles drive on.
@@ -71,7 +71,11 @@ class RoadShape:
         return reference_line(self.geometries, self._lengths(0.0, self.length_m))[0]
 
     def surface(self, lanes: Lanes) -> BaseGeometry:
-        """The ground its lanes cover, metres; empty where it has no lane of that kind."""
+        """The ground its lanes cover, metres; empty where it has no lane of that kind.
+
+        Raises:
+            ValueError: a cubic leads further than any map reaches.
+        """
         ends = [section.s for section in self.sections[1:]] + [self.length_m]
         strips = [
             strip
@@ -94,6 +98,8 @@ class RoadShape:
         for lane in sorted((each for each in section.lanes if each.number < 0), key=lambda each: -each.number):
             borders.append(borders[-1] - np.maximum(lane.width.at(s - section.s), 0.0))
             wanted.append(_is_wanted(lane.kind, lanes))
+        if not (np.abs(points) <= LARGEST_M).all() or not (np.abs(borders) <= LARGEST_M).all():
+            raise ValueError(f"a coordinate is beyond {LARGEST_M:g} m")
         outer = [number for number, (a, b) in enumerate(pairwise([False, *wanted, False])) if a != b]
         return [
             strip_between(points + left * borders[a][:, None], points + left * borders[b][:, None])

@@ -10,6 +10,8 @@ from shapely.geometry.base import BaseGeometry
 Section = Literal["beginning", "end"]
 #: Which lanes make a street's surface: those for vehicles, or the shoulders and pavements as well.
 Lanes = Literal["driving", "all"]
+#: No map's coordinates are larger, whatever its projection; GEOS does not come to an end on some that are.
+LARGEST_M = 1e8
 
 
 @dataclass(frozen=True, slots=True)

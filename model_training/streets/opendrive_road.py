@@ -91,7 +91,7 @@ def read_road(element: Element, lanes: Lanes, path: Path) -> Road:
     ]
     try:
         surface, centre = shape.surface(lanes), shapely.LineString(shape.centre())
-    except shapely.errors.GEOSException as error:
+    except (ValueError, shapely.errors.GEOSException) as error:
         raise DatasetError(f"{where}: its planView or lanes make no surface: {error}", field="planView") from error
     return Road(
         identity, (element.get("name") or "").strip(), None if junction in ("-1", "") else junction, tuple(linked),
@@ -129,7 +129,8 @@ def road_shape(road: Element, where: str) -> RoadShape:
 
 
 def _geometry(element: Element, where: str) -> Geometry:
-    s, x, y, heading, length = (number_of(element, name, where) for name in ("s", "x", "y", "hdg", "length"))
+    s = _station(element, where)
+    x, y, heading, length = (number_of(element, name, where) for name in ("x", "y", "hdg", "length"))
     if length < 0 or length > _LONGEST_ROAD_M:
         raise DatasetError(f"{where}: a <geometry> is {length:g} m long", field="length")
     return Geometry(s, x, y, heading, length, _shape(element, length, where))
@@ -160,10 +161,18 @@ def _shape(element: Element, length_m: float, where: str) -> Bend | Cubic:
 
 
 def _section(element: Element, where: str) -> LaneSection:
-    start = number_of(element, "s", where)
+    start = _station(element, where)
     where = f"{where}: laneSection at s = {start:g}"
     lanes = [_lane(lane, where) for side in ("left", "right") for lane in element.findall(f"{side}/lane")]
     return LaneSection(start, tuple(lanes))
+
+
+def _station(element: Element, where: str) -> float:
+    """Where along the road an element begins; all between is sampled, so that a mistake would fill the memory."""
+    s = number_of(element, "s", where)
+    if not 0 <= s <= _LONGEST_ROAD_M:
+        raise DatasetError(f"{where}: <{element.tag}>: s is {s:g}, not between 0 and {_LONGEST_ROAD_M:g}", field="s")
+    return s
 
 
 def _lane(element: Element, where: str) -> Lane:

@@ -71,7 +71,7 @@ def read_openstreetmap(
                 left_out[read] += 1
             else:
                 of_name[_name(tags)].append(read)
-    except (RuntimeError, ValueError) as error:  # osmium's parsers raise the former, its decoding of text the latter
+    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:  # the parser's, of text, of coordinates
         raise DatasetError(
             f"{path}: not whole OpenStreetMap data: {error}; fetch the extract again", field=path.name
         ) from error

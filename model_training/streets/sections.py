@@ -11,9 +11,13 @@ from shapely.geometry.base import BaseGeometry
 
 from model_training.streets.axis import axis_of
 from model_training.streets.named_street import NamedStreet, Section
+from service.errors import DatasetError
 
 Cut = Literal["ends", "numbered"]
 _STEP_M = 1.0
+_MOST = 1000
+#: Beyond as many points a stretch is sampled more coarsely, at its ends as finely as ever.
+_MOST_POINTS = 5000
 
 
 def in_sections(streets: Iterable[NamedStreet], *, length_m: float, cut: Cut = "ends") -> tuple[NamedStreet, ...]:
@@ -24,6 +28,9 @@ def in_sections(streets: Iterable[NamedStreet], *, length_m: float, cut: Cut = "
         length_m: of a section, above 0.
         cut: "ends": its first metres are the beginning and its last the end; what lies between keeps the street's name,
             and a street of less than two lengths is halved. "numbered": as few equal sections as are no longer than that.
+
+    Raises:
+        DatasetError: a street would be cut into more than a thousand.
     """
     return tuple(section for street in streets for section in _cut(street, length_m, cut))
 
@@ -34,6 +41,12 @@ def _cut(street: NamedStreet, length_m: float, cut: Cut) -> list[NamedStreet]:
     axis = axis_of(street.surface, street.lines)
     if axis.length <= length_m:
         return [street]
+    if axis.length > _MOST * length_m:
+        raise DatasetError(
+            f"{street.name} is {axis.length:.0f} m long: more than {_MOST} sections of {length_m:g} m; are the coordinates metres "
+            "of the map (--frame), and the length?",
+            field="section_length",
+        )
     named: list[tuple[str, Section | None]]
     if cut == "numbered":
         count = int(np.ceil(axis.length / length_m))
@@ -62,7 +75,8 @@ def _divided(surface: BaseGeometry, axis: shapely.LineString, bounds: NDArray[np
     half = min(_STEP_M, float((far - near).min())) / 2
     # The last point before a bound and the first after it are as far from it, so the line between their cells is the cut.
     lengths = [
-        np.linspace(a + half, b - half, max(2, int(np.ceil((b - a) / _STEP_M)))) for a, b in zip(near, far, strict=True)
+        np.linspace(a + half, b - half, int(np.clip(np.ceil((b - a) / _STEP_M), 2, _MOST_POINTS)))
+        for a, b in zip(near, far, strict=True)
     ]
     stretch = np.repeat(np.arange(len(near)), [len(each) for each in lengths])
     points = shapely.line_interpolate_point(axis, np.concatenate(lengths))

@@ -95,6 +95,7 @@ def test_what_is_left_out_is_counted_with_the_reason(geojson, ulm):
         ([("LineString", [[0, 0]], NAMED)], "its coordinates make no LineString"),
         ([("LineString", None, NAMED)], "cover no ground"),
         ([("LineString", [[5, 5], [5, 5]], NAMED)], "cover no ground"),
+        ([("Polygon", [[[0, 0], [9, 0], [9, 1e308], [0, 0]]], NAMED)], "lie more than"),
     ],
 )
 def test_a_defective_collection_is_refused_by_file_and_feature(geojson, features, said):

@@ -86,6 +86,7 @@ def test_a_file_without_named_ways_is_refused_with_the_reason(osm, line, read):
         "no xml",
         "<osm version='0.6'><node id='1' lon=",
         "<gpx/>",
+        "<osm version='0.6'><node id='1' version='1' lon='east' lat='48'/></osm>",
         '<!DOCTYPE a [<!ENTITY x "ha">]><osm version="0.6">&x;</osm>',
     ],
 )

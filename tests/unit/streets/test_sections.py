@@ -8,6 +8,7 @@ from model_training.streets.axis import axis_of
 from model_training.streets.corridor import corridor
 from model_training.streets.named_street import NamedStreet
 from model_training.streets.sections import in_sections
+from service.errors import DatasetError
 
 
 def street_of(*lines, name="High Street", width=8.0, **more):
@@ -48,6 +49,11 @@ def test_numbered_sections_are_equal_and_no_longer_than_asked():
 )
 def test_a_short_street_and_a_junction_stay_whole(street):
     assert in_sections([street], length_m=30) == (street,)
+
+
+def test_more_sections_than_make_sense_are_refused():
+    with pytest.raises(DatasetError, match="High Street is 100000 m long"):
+        in_sections([street_of([(0, 0), (1e5, 0)])], length_m=30, cut="numbered")
 
 
 def test_the_beginning_is_where_the_source_begins():
