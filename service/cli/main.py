@@ -20,6 +20,7 @@ _KNOWN = {
     "import": ("Bring recorded data into the dataset folder.", "mapping"),
     "record": ("Record a drive from a running simulator.", "mapping"),
     "convert": ("Write a dataset as a ROS bag or in KITTI's layout.", "mapping"),
+    "streets": ("Name streets: from GeoJSON, OpenDRIVE or OpenStreetMap into a dataset.", "mapping"),
     "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
     "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
     "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),

@@ -2,11 +2,15 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
+from service.maps.content import BundleContent
+from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
 
@@ -50,6 +54,23 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     assert list(best) == ["pose", "share", "inliers", "similarity"]
     assert best["pose"] == answer["pose"] | {"covariance": None}
     assert best["inliers"] > 0.8
+
+
+def test_a_map_without_streets_answers_with_null(
+    content_of: Callable[..., BundleContent],
+    client_of: Callable[[Engine], httpx.Client],
+    parts_of: Parts,
+    tmp_path: Path,
+) -> None:
+    write_bundle(tmp_path / "m", content_of(streets=None, place_street=np.full(12, -1, np.int32)))
+    engine = Engine.open(Settings(maps=(tmp_path / "m",), threads=1))
+    try:
+        answer = post(client_of(engine), parts_of()).json()
+    finally:
+        engine.close()
+    assert answer["street"] is None
+    assert {neighbour["street"] for neighbour in answer["neighbours"]} == {None}
+    assert answer["pose"]["position"]["x"] == pytest.approx(20, abs=0.3)
 
 
 def test_without_registration_there_is_no_covariance(client: httpx.Client, parts_of: Parts) -> None:

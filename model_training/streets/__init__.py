@@ -1,0 +1,1 @@
+"""Streets of a map from other people's files: GeoJSON, OpenDRIVE, OpenStreetMap."""

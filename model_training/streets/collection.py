@@ -1,0 +1,140 @@
+"""``streets.geojson`` as the service reads it: no point in two streets, every id its own."""
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from model_training.streets.named_street import NamedStreet
+from service.errors import DatasetError
+from service.maps.streets import Streets
+
+GRID_M = 0.001
+#: Points that say less about an edge are left out. Every street is widened by as much, else rounding to the grid would leave
+#: gaps between streets that follow one another.
+_EDGE_M = 0.002
+_SLIVER_M2 = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class StreetCollection:
+    """A FeatureCollection in map metres; what was left out, a sentence each; how much ground two streets laid claim to, m2."""
+
+    document: dict[str, Any]
+    dropped: tuple[str, ...]
+    overlap_m2: float
+
+
+def collection_of(streets: Iterable[NamedStreet]) -> StreetCollection:
+    """Make a FeatureCollection; where streets overlap, the earlier one keeps the ground.
+
+    Args:
+        streets: in the order in which ground is given away.
+
+    Raises:
+        DatasetError: two streets bring the same id, or none covers any ground.
+    """
+    given = list(streets)
+    surfaces = [_widened(street.surface) for street in given]
+    tree, taken = shapely.STRtree(surfaces), set(_own_ids(given))
+    features: list[dict[str, Any]] = []
+    dropped, overlap = [], 0.0
+    for number, (street, surface) in enumerate(zip(given, surfaces, strict=True)):
+        earlier = [surfaces[other] for other in sorted(tree.query(surface, predicate="intersects")) if other < number]
+        own = shapely.difference(surface, shapely.union_all(earlier), grid_size=GRID_M) if earlier else surface
+        if earlier and surface.area - own.area >= _SLIVER_M2:  # less is the widening
+            overlap += surface.area - own.area
+        coordinates = _coordinates(own)
+        if not coordinates:
+            why = "lies wholly within other streets" if surface.area >= _SLIVER_M2 else "covers less than 1 m2"
+            dropped.append(f"{street.name} {why}")
+            continue
+        identity = street.id or _free(_id_from(street), taken)
+        taken.add(identity)
+        features.append({
+            "type": "Feature",
+            "properties": {
+                "id": identity, "street": street.street, "section": street.section, "name": street.name,
+                "class_index": len(features),
+            },
+            "geometry": {"type": "Polygon", "coordinates": coordinates[0]} if len(coordinates) == 1
+            else {"type": "MultiPolygon", "coordinates": coordinates},
+        })  # fmt: skip
+    if not features:
+        raise DatasetError(
+            f"no street covers any ground ({'; '.join(dropped[:5])}); are the coordinates degrees? --frame wgs84 says so",
+            field="features",
+        )
+    return StreetCollection({"type": "FeatureCollection", "features": features}, tuple(dropped), overlap)
+
+
+def write_streets(path: Path, document: dict[str, Any], *, replace: bool = False) -> Streets:
+    """Write ``streets.geojson``, renamed when whole.
+
+    Args:
+        path: of the file.
+        document: a FeatureCollection.
+        replace: whether a file that is there may go.
+
+    Returns:
+        The streets as the service reads them.
+
+    Raises:
+        DatasetError: the file is there and may not go, or cannot be written.
+        BundleError: the service would not read it.
+    """
+    if path.exists() and not replace:
+        raise DatasetError(f"{path} is there; give --replace to write over it", field=path.name)
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False)
+    streets = Streets.from_geojson(json.loads(text))
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text + "\n")
+        part.replace(path)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be written: {error.strerror or error}", field=path.name) from error
+    return streets
+
+
+def _widened(surface: BaseGeometry) -> BaseGeometry:
+    """A surface's parts that cover ground, on the grid and without points that its edge does not need."""
+    parts = [part for part in shapely.get_parts(surface) if isinstance(part, shapely.Polygon)]
+    plain = shapely.simplify(shapely.union_all(parts), _EDGE_M)
+    return shapely.set_precision(plain.buffer(_EDGE_M, join_style="mitre"), GRID_M)
+
+
+def _coordinates(shape: BaseGeometry) -> list[list[list[list[float]]]]:
+    """GeoJSON coordinates of all parts but slivers; the points lie on the grid, rounding only cuts their digits."""
+    parts = [part for part in shapely.get_parts(shape) if isinstance(part, shapely.Polygon) and part.area >= _SLIVER_M2]
+    return [
+        [[[round(x, 3), round(y, 3)] for x, y in ring.coords] for ring in (part.exterior, *part.interiors)]
+        for part in parts
+    ]
+
+
+def _own_ids(streets: list[NamedStreet]) -> list[str]:
+    ids = [street.id for street in streets if street.id is not None]
+    most = Counter(ids).most_common(1)
+    if most and most[0][1] > 1:
+        raise DatasetError(f"two streets have the id {most[0][0]!r}; give each its own, or none", field="id")
+    return ids
+
+
+def _id_from(street: NamedStreet) -> str:
+    text = f"{street.street} {street.section}" if street.section else street.name
+    return re.sub(r"\W+", "-", text.casefold()).strip("-") or "street"
+
+
+def _free(wanted: str, taken: set[str]) -> str:
+    if wanted not in taken:
+        return wanted
+    number = 2
+    while f"{wanted}-{number}" in taken:
+        number += 1
+    return f"{wanted}-{number}"

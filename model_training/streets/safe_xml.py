@@ -1,0 +1,59 @@
+"""XML of unknown origin: no document types, no entities, nothing fetched, a limit of size."""
+
+from pathlib import Path
+from typing import NoReturn
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+from service.errors import DatasetError
+
+#: CARLA's largest town has 70 MB.
+LARGEST_BYTES = 256 * 2**20
+
+
+def read_xml(path: Path, *, root: str, largest_bytes: int = LARGEST_BYTES) -> Element:
+    """Read a file's tree.
+
+    Args:
+        path: of the file.
+        root: name of its outermost element.
+        largest_bytes: what is larger is not read.
+
+    Raises:
+        DatasetError: the file is missing, too large, no XML, cut off, or has a document type.
+    """
+    builder = TreeBuilder()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+
+    def refuse(*_: object) -> NoReturn:
+        raise DatasetError(
+            f"{path}: line {parser.CurrentLineNumber}: a document type (DTD) is not read, since its entities may grow "
+            "without bound; remove the <!DOCTYPE> line",
+            field=path.name,
+        )
+
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        size = path.stat().st_size
+        if size > largest_bytes:
+            raise DatasetError(
+                f"{path}: {size} bytes are more than {largest_bytes}; cut the map down to the survey's surroundings",
+                field=path.name,
+            )
+        parser.Parse(path.read_bytes(), True)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}", field=path.name) from error
+    except expat.ExpatError as error:
+        raise DatasetError(
+            f"{path}: not whole XML: {error}; the file is cut off or of another kind", field=path.name
+        ) from error
+    tree: Element = builder.close()
+    if tree.tag != root:
+        raise DatasetError(
+            f"{path}: its outermost element is <{tree.tag}>, not <{root}>; it is of another kind", field=path.name
+        )
+    return tree
