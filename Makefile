@@ -28,7 +28,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check format generate release-proto lock evaluate bench-training bench-serving fuzz sbom audit reports encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test check format generate release-proto lock evaluate evaluate-real bench-training bench-serving fuzz sbom audit reports encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -70,6 +70,9 @@ lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
 
 evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json
 	$(BIN)/python -m benchmarks.accuracy $(ARGS)
+
+evaluate-real: .venv/.torch ## measure on real recordings and round trips -> reports/real_data.json
+	$(BIN)/python -m benchmarks.real $(ARGS)
 
 bench-training: .venv/.torch ## measure training and simulation -> reports/training.json
 	$(BIN)/python -m benchmarks.training $(ARGS)

@@ -41,7 +41,7 @@ def main() -> None:
         "stereo": lambda report, a: stereo_rows(report, a.data, a.work),
         "round-trips": lambda report, a: round_trip_rows(report, a.work),
         "import": lambda report, a: import_rows(report, a.work),
-        "loops": lambda report, a: loop_rows(report),
+        "loops": lambda report, _: loop_rows(report),
         "resume": lambda report, a: resume_rows(report, a.work),
         "ros2": lambda report, a: ros2_rows(report, a.work),
     }
