@@ -4,7 +4,9 @@ Definitions: common_interfaces and rcl_interfaces (builtin_interfaces, std_msgs,
 ROS 2 Humble and later, which have not changed since. A ROS topic ``/a`` is the DDS topic ``rt/a``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
@@ -36,7 +38,7 @@ class Image(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):
     encoding: str = ""
     is_bigendian: uint8 = 0
     step: uint32 = 0
-    data: bytes = b""
+    data: Annotated[Sequence[int] | bytes, sequence(uint8)] = b""
 
 
 @dataclass
@@ -58,10 +60,10 @@ class CameraInfo(IdlStruct, typename="sensor_msgs.msg.dds_.CameraInfo_"):
     height: uint32 = 0
     width: uint32 = 0
     distortion_model: str = ""
-    d: sequence[float64] = field(default_factory=list)
-    k: array[float64, 9] = field(default_factory=lambda: [0.0] * 9)
-    r: array[float64, 9] = field(default_factory=lambda: [0.0] * 9)
-    p: array[float64, 12] = field(default_factory=lambda: [0.0] * 12)
+    d: Annotated[Sequence[float], sequence(float64)] = field(default_factory=list)
+    k: Annotated[Sequence[float], array(float64, 9)] = field(default_factory=lambda: [0.0] * 9)
+    r: Annotated[Sequence[float], array(float64, 9)] = field(default_factory=lambda: [0.0] * 9)
+    p: Annotated[Sequence[float], array(float64, 12)] = field(default_factory=lambda: [0.0] * 12)
     binning_x: uint32 = 0
     binning_y: uint32 = 0
     roi: RegionOfInterest = field(default_factory=RegionOfInterest)
@@ -99,7 +101,7 @@ class PoseWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.PoseWithCov
     """A pose, and its 6 x 6 covariance row by row: x, y, z, rotations about the fixed axes x, y, z."""
 
     pose: Pose = field(default_factory=Pose)
-    covariance: array[float64, 36] = field(default_factory=lambda: [0.0] * 36)
+    covariance: Annotated[Sequence[float], array(float64, 36)] = field(default_factory=lambda: [0.0] * 36)
 
 
 @dataclass
@@ -126,7 +128,7 @@ class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticS
     name: str = ""
     message: str = ""
     hardware_id: str = ""
-    values: sequence[KeyValue] = field(default_factory=list)
+    values: Annotated[Sequence[KeyValue], sequence(KeyValue)] = field(default_factory=list)
 
 
 @dataclass
@@ -134,4 +136,4 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticAr
     """How components do."""
 
     header: Header = field(default_factory=Header)
-    status: sequence[DiagnosticStatus] = field(default_factory=list)
+    status: Annotated[Sequence[DiagnosticStatus], sequence(DiagnosticStatus)] = field(default_factory=list)

@@ -238,7 +238,7 @@ def _parts(asked: Asked[Any], **pictures: bytes) -> dict[str, tuple[str, bytes, 
 
 
 def _numbered(asked: Asked[Any]) -> dict[str, tuple[str, bytes, str]]:
-    pictures = {}
+    pictures: dict[str, bytes] = {}
     for number, (rgb, depth) in enumerate(asked.pictures):
         pictures |= {f"rgb{number}": rgb, f"depth{number}": depth}
     return _parts(asked, **pictures)
