@@ -73,6 +73,11 @@ class Pairs:
         found = self._matches()
         return self._take(max(found)) if found else None
 
+    @property
+    def waiting(self) -> int:
+        """Pictures without a partner yet."""
+        return len(self._colors) + len(self._depths)
+
     def missing(self) -> tuple[str, ...]:
         """Which streams nothing waits of: ``color``, ``depth``, ``info``."""
         streams: dict[str, OrderedDict[int, Any]] = {"color": self._colors, "depth": self._depths, "info": self._infos}

@@ -10,7 +10,7 @@ from typing import Any, Self, TypeVar, Unpack
 import httpx
 
 from service.client import asking, rest
-from service.client.asking import About, AboutSequence, Camera, Depth, Encoding, Frame, Rgb
+from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.encode import JPEG_QUALITY
 from service.client.retry import Attempts, RetryPolicy
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -33,7 +33,7 @@ class AsyncClient:
     ) -> None:  # fmt: skip
         how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s)
         self._url, self._timeout_s = url, timeout_s
-        self._encoding = Encoding(quality, compress_depth=not rest.is_loopback(url))
+        self._quality = quality
         self._policy = retry or RetryPolicy()
         self._sleep, self._clock, self._draw = sleep, clock, draw
         self._http = httpx.AsyncClient(**how, transport=transport)
@@ -54,19 +54,19 @@ class AsyncClient:
 
     async def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
         """As ``Client.localize``."""
-        asked = await asyncio.to_thread(asking.one, rgb, depth, camera, about, self._encoding)
+        asked = await asyncio.to_thread(asking.one, rgb, depth, camera, about, self._quality)
         return await self._call(rest.localize(asked))
 
     async def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """As ``Client.localize_sequence``."""
-        asked = await asyncio.to_thread(asking.sequence, frames, about, self._encoding)
+        asked = await asyncio.to_thread(asking.sequence, frames, about, self._quality)
         return await self._call(rest.localize_sequence(asked))
 
     async def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
     ) -> list[LocalizeAnswer | RefusedError]:
         """As ``Client.localize_batch``."""
-        asked = await asyncio.to_thread(asking.several, frames, about, self._encoding)
+        asked = await asyncio.to_thread(asking.several, frames, about, self._quality)
         return await self._call(rest.localize_batch(asked))
 
     async def maps(self) -> list[MapEntry]:

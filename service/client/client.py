@@ -9,7 +9,7 @@ from typing import Any, Self, TypeVar, Unpack
 import httpx
 
 from service.client import asking, rest
-from service.client.asking import About, AboutSequence, Camera, Depth, Encoding, Frame, Rgb
+from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.encode import JPEG_QUALITY
 from service.client.retry import Attempts, RetryPolicy
 from service.contract.schema import LocalizeAnswer, MapEntry
@@ -44,7 +44,7 @@ class Client:
     ) -> None:  # fmt: skip
         how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s)
         self._url, self._timeout_s = url, timeout_s
-        self._encoding = Encoding(quality, compress_depth=not rest.is_loopback(url))
+        self._quality = quality
         self._policy = retry or RetryPolicy()
         self._sleep, self._clock, self._draw = sleep, clock, draw
         self._http = httpx.Client(**how, transport=transport)
@@ -79,7 +79,7 @@ class Client:
             UnavailableError: it refused for now, and did so until patience ended.
             UnreachableError: nothing answers.
         """
-        return self._call(rest.localize(asking.one(rgb, depth, camera, about, self._encoding)))
+        return self._call(rest.localize(asking.one(rgb, depth, camera, about, self._quality)))
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """Ask where the first of some frames was taken, whose cameras are known against each other, as by odometry.
@@ -87,7 +87,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``.
         """
-        return self._call(rest.localize_sequence(asking.sequence(frames, about, self._encoding)))
+        return self._call(rest.localize_sequence(asking.sequence(frames, about, self._quality)))
 
     def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
@@ -97,7 +97,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``, of the batch as a whole.
         """
-        return self._call(rest.localize_batch(asking.several(frames, about, self._encoding)))
+        return self._call(rest.localize_batch(asking.several(frames, about, self._quality)))
 
     def maps(self) -> list[MapEntry]:
         """All mounted maps.

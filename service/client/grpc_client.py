@@ -9,7 +9,7 @@ from typing import Any, Self, TypeVar, Unpack
 import grpc
 
 from service.client import asking, grpc_messages
-from service.client.asking import About, AboutSequence, Camera, Depth, Encoding, Frame, Rgb
+from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.encode import JPEG_QUALITY
 from service.client.grpc_errors import errors_of_grpc, refused_in_batch
 from service.client.rest import geojson
@@ -21,7 +21,6 @@ from service.grpc.generated.streetfix.v1.localization_pb2_grpc import Localizati
 
 A = TypeVar("A")
 M = TypeVar("M")
-_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 #: gRPC's own retries would come on top of ours, and know nothing of RetryInfo.
 _OPTIONS = (
     ("grpc.enable_retries", 0),
@@ -63,7 +62,7 @@ class GrpcClient:
             raise RequestError(f"timeout_s: {timeout_s} is no time to wait; give seconds", field="timeout_s")
         self._address, self._timeout_s = address, timeout_s
         self._metadata = () if api_key is None else (("authorization", f"Bearer {api_key}"),)
-        self._encoding = Encoding(quality, compress_depth=host not in _LOOPBACK)
+        self._quality = quality
         self._policy = retry or RetryPolicy()
         self._sleep, self._clock, self._draw = sleep, clock, draw
         self._channel = (
@@ -89,19 +88,19 @@ class GrpcClient:
 
     def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
         """As ``Client.localize``."""
-        message = grpc_messages.request_message(asking.one(rgb, depth, camera, about, self._encoding))
+        message = grpc_messages.request_message(asking.one(rgb, depth, camera, about, self._quality))
         return self._call(self._stub.Localize, message, grpc_messages.answer_of)
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """As ``Client.localize_sequence``."""
-        message = grpc_messages.sequence_message(asking.sequence(frames, about, self._encoding))
+        message = grpc_messages.sequence_message(asking.sequence(frames, about, self._quality))
         return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer))
 
     def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
     ) -> list[LocalizeAnswer | RefusedError]:
         """As ``Client.localize_batch``."""
-        message = grpc_messages.batch_message(asking.several(frames, about, self._encoding))
+        message = grpc_messages.batch_message(asking.several(frames, about, self._quality))
         return self._call(self._stub.LocalizeBatch, message, _outcomes)
 
     def maps(self) -> list[MapEntry]:

@@ -19,7 +19,7 @@ from service.contract import schema
 from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, RequestError, UnreachableError
 
 A = TypeVar("A")
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
 #: Statuses that say "not now".
 _COME_BACK = (429, 503)
 
@@ -120,19 +120,14 @@ def settings_for(url: str, *, api_key: str | None, timeout_s: float) -> dict[str
         address = httpx.URL(url)
     except (httpx.InvalidURL, TypeError) as error:
         raise RequestError(f"url: {url!r} is no address ({error}); give http://HOST:PORT", field="url") from error
-    if address.scheme not in ("http", "https") or not address.host:
+    if address.scheme not in ("http", "https") or not address.host or "%" in address.host:
         raise RequestError(f"url: {url!r} is no address; give http://HOST:PORT", field="url")
     return {
         "base_url": url.rstrip("/"), "timeout": timeout_s,
         "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
         # A proxy named in the environment is for other machines: it could not reach this one's loopback.
-        "trust_env": address.host not in LOOPBACK,
+        "trust_env": address.host not in _LOOPBACK,
     }  # fmt: skip
-
-
-def is_loopback(url: str) -> bool:
-    """Whether a service runs on this machine."""
-    return httpx.URL(url).host in LOOPBACK
 
 
 def answer_of(call: Call[A], response: httpx.Response) -> A:
