@@ -13,8 +13,6 @@ from typing import Any
 import pytest
 import uvicorn
 
-pytest.importorskip("cyclonedds")
-
 from benchmarks.real.ros2 import LOOPBACK, answers_over_dds
 from service.http.app import create_app
 from service.runtime.engine import Engine
