@@ -55,33 +55,34 @@ class AsyncClient:
     async def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
         """As ``Client.localize``."""
         asked = await asyncio.to_thread(asking.one, rgb, depth, camera, about, self._quality)
-        return await self._call(rest.localize(asked))
+        return await self.call(rest.localize(asked))
 
     async def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """As ``Client.localize_sequence``."""
         asked = await asyncio.to_thread(asking.sequence, frames, about, self._quality)
-        return await self._call(rest.localize_sequence(asked))
+        return await self.call(rest.localize_sequence(asked))
 
     async def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
     ) -> list[LocalizeAnswer | RefusedError]:
         """As ``Client.localize_batch``."""
         asked = await asyncio.to_thread(asking.several, frames, about, self._quality)
-        return await self._call(rest.localize_batch(asked))
+        return await self.call(rest.localize_batch(asked))
 
     async def maps(self) -> list[MapEntry]:
         """As ``Client.maps``."""
-        return await self._call(rest.maps())
+        return await self.call(rest.maps())
 
     async def streets(self, map_name: str) -> dict[str, Any]:
         """As ``Client.streets``."""
-        return await self._call(rest.streets(map_name))
+        return await self.call(rest.streets(map_name))
 
     async def coverage(self) -> dict[str, Any]:
         """As ``Client.coverage``."""
-        return await self._call(rest.coverage())
+        return await self.call(rest.coverage())
 
-    async def _call(self, call: rest.Call[A]) -> A:
+    async def call(self, call: rest.Call[A]) -> A:
+        """As ``Client.call``."""
         attempts = Attempts(self._policy, self._clock, self._draw)
         while True:
             try:

@@ -79,7 +79,7 @@ class Client:
             UnavailableError: it refused for now, and did so until patience ended.
             UnreachableError: nothing answers.
         """
-        return self._call(rest.localize(asking.one(rgb, depth, camera, about, self._quality)))
+        return self.call(rest.localize(asking.one(rgb, depth, camera, about, self._quality)))
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """Ask where the first of some frames was taken, whose cameras are known against each other, as by odometry.
@@ -87,7 +87,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``.
         """
-        return self._call(rest.localize_sequence(asking.sequence(frames, about, self._quality)))
+        return self.call(rest.localize_sequence(asking.sequence(frames, about, self._quality)))
 
     def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
@@ -97,7 +97,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``, of the batch as a whole.
         """
-        return self._call(rest.localize_batch(asking.several(frames, about, self._quality)))
+        return self.call(rest.localize_batch(asking.several(frames, about, self._quality)))
 
     def maps(self) -> list[MapEntry]:
         """All mounted maps.
@@ -105,7 +105,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``.
         """
-        return self._call(rest.maps())
+        return self.call(rest.maps())
 
     def streets(self, map_name: str) -> dict[str, Any]:
         """A map's streets, a GeoJSON FeatureCollection of polygons in map metres, or WGS-84 where the map is georeferenced.
@@ -113,7 +113,7 @@ class Client:
         Raises:
             StreetfixError: as ``localize``.
         """
-        return self._call(rest.streets(map_name))
+        return self.call(rest.streets(map_name))
 
     def coverage(self) -> dict[str, Any]:
         """Where the maps can answer, a GeoJSON FeatureCollection with a MultiPolygon of each.
@@ -121,9 +121,14 @@ class Client:
         Raises:
             StreetfixError: as ``localize``.
         """
-        return self._call(rest.coverage())
+        return self.call(rest.coverage())
 
-    def _call(self, call: rest.Call[A]) -> A:
+    def call(self, call: rest.Call[A]) -> A:
+        """Send a call of one's own making, as one with pictures from files, and read what comes back.
+
+        Raises:
+            StreetfixError: as ``localize``.
+        """
         attempts = Attempts(self._policy, self._clock, self._draw)
         while True:
             try:
