@@ -20,7 +20,10 @@ StreetfixError                     code            kind
 ├── DatasetError                   dataset         invalid      a dataset folder is incomplete or contradicts itself
 ├── EncoderError                   encoder         not_ready    an encoder file is missing or is not an encoder of ours
 ├── UnreachableError               unreachable     not_ready    a service does not answer
+│   ├── NoAnswerInTimeError        no-answer       not_ready    a service was asked, and the caller's time ended
+│   └── ForeignServiceError        foreign         not_ready    what answers speaks another language
 ├── RefusedError                   refused         invalid      a service refused a request (seen by its client)
+│   └── UnavailableError           unavailable     not_ready    it refused for now, and still did when patience ended
 ├── AddressError                   address         not_ready    the service cannot listen where it was told to
 ├── KeysError                      keys            not_ready    the file of API keys, or a certificate, cannot be used
 └── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
@@ -178,10 +181,53 @@ class UnreachableError(StreetfixError):
     kind = "not_ready"
 
 
+class NoAnswerInTimeError(UnreachableError):
+    """A service was asked, and the time that its caller gave it ended before the answer came."""
+
+    code = "no-answer"
+
+
+class ForeignServiceError(UnreachableError):
+    """What answers at an address is no Streetfix, or one of another contract."""
+
+    code = "foreign"
+
+
 class RefusedError(StreetfixError):
-    """A service refused a request; the message carries the problem it answered with."""
+    """A service refused a request; the message carries the problem it answered with.
+
+    Args:
+        message: for people.
+        field: dotted path of the request's field at fault.
+        problem: code of the service's problem, as ``image-size`` (docs/problems.md); empty where it named none.
+        detail: what the service said.
+        status: as the face spelled it, ``422`` or ``INVALID_ARGUMENT``.
+        request_id: by which the service's operator finds it in the log.
+    """
 
     code = "refused"
+
+    def __init__(
+        self, message: str, *, field: str = "", problem: str = "", detail: str = "", status: str = "", request_id: str = ""
+    ) -> None:  # fmt: skip
+        super().__init__(message, field=field)
+        self.problem = problem
+        self.detail = detail
+        self.status = status
+        self.request_id = request_id
+
+
+class UnavailableError(RefusedError):
+    """A service refused for now, as when its queue is full, and still did when its client's patience ended.
+
+    Attributes:
+        retry_after_s: when to come back, by the service's last advice; None where it gave none.
+    """
+
+    code = "unavailable"
+    kind = "not_ready"
+
+    retry_after_s: float | None = None
 
 
 class AddressError(StreetfixError):

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.errors import RefusedError, RequestError, UnreachableError
+from service.errors import RequestError
 
 _TIMEOUT_S = 60.0
 
@@ -83,11 +83,11 @@ def localize(
         key: API key, where the service asks for one.
 
     Raises:
-        RequestError: a file cannot be read, or the camera file is no JSON object.
+        RequestError: a file cannot be read, the camera file is no JSON object, or the address is none.
         UnreachableError: nothing answers at the address, or something that is no Streetfix.
         RefusedError: the service answered with a problem.
     """
-    import httpx
+    from service.client import Client, RetryPolicy, rest
 
     request = _camera_parts(camera) | ({} if map_name is None else {"map": map_name})
     request |= {} if prior is None else {"prior": prior}
@@ -96,25 +96,20 @@ def localize(
         "depth": (depth.name, _bytes_of(depth, "depth"), "application/octet-stream"),
         "request": ("request.json", json.dumps(request).encode(), "application/json"),
     }
-    try:
-        # A proxy named in the environment is for other machines: it could not reach this one's loopback.
-        own = httpx.URL(url).host in ("127.0.0.1", "localhost", "::1")
-        with httpx.Client(timeout=_TIMEOUT_S, trust_env=not own) as client:
-            headers = {} if key is None else {"Authorization": f"Bearer {key}"}
-            response = client.post(f"{url.rstrip('/')}/v1/localize", files=files, headers=headers)
-        answer = response.json()
-    except (httpx.HTTPError, httpx.InvalidURL) as error:
-        raise UnreachableError(
-            f"{url}: no service answers ({error}); start one with: streetfix serve BUNDLE", field="url"
-        ) from error
-    except ValueError as error:
-        raise UnreachableError(
-            f"{url}: what answers there (status {response.status_code}) is no Streetfix; check --url", field="url"
-        ) from error
-    if not isinstance(answer, dict) or (response.is_success and "pose" not in answer):
-        raise UnreachableError(f"{url}: what answers there is no Streetfix; check --url", field="url")
-    if not response.is_success:
-        raise RefusedError(_problem_text(answer, response.status_code), field=str(answer.get("field") or ""))
+    # Who types a command wants to know at once.
+    with Client(url, api_key=key, timeout_s=_TIMEOUT_S, retry=RetryPolicy(attempts=1)) as client:
+        return client.call(rest.Call("POST", "/v1/localize", _answer, files))
+
+
+def _answer(body: bytes) -> dict[str, Any]:
+    """As it came, whatever a later service has put beside what we know.
+
+    Raises:
+        ValueError: it is no answer.
+    """
+    answer = json.loads(body)
+    if not isinstance(answer, dict) or "pose" not in answer:
+        raise ValueError("no answer")
     return answer
 
 
@@ -133,9 +128,3 @@ def _bytes_of(path: Path, field: str) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise RequestError(f"{path}: it cannot be read ({error.strerror}); check --{field}", field=field) from error
-
-
-def _problem_text(problem: dict[str, Any], status: int) -> str:
-    title, detail = problem.get("title", f"status {status}"), problem.get("detail", "")
-    field = f" [field {problem['field']}]" if problem.get("field") else ""
-    return f"the service refused: {title}\n  {detail}{field}\n  request id {problem.get('request_id', 'unknown')}"

@@ -1,4 +1,4 @@
-"""The command ``streetfix``: two commands of the service, and those that other packages bring by entry point."""
+"""The command ``streetfix``: the commands of the service, and those that other packages bring by entry point."""
 
 import functools
 import sys
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import ValidationError
 
-from service.cli import health, keys, localize, serve
+from service.cli import bridge, health, keys, localize, serve
 from service.errors import ExtraMissingError, StreetfixError
 
 GROUP = "streetfix.commands"
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        app_for(given)(given, prog_name="streetfix")
+        _run(given)
     except StreetfixError as error:
         typer.echo(f"streetfix: {error.message}", err=True)
         sys.exit(1)
@@ -65,6 +65,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(1)
 
 
+def _run(arguments: list[str]) -> None:
+    """A command, with a package that one of the service's own misses told as a missing extra."""
+    try:
+        app_for(arguments)(arguments, prog_name="streetfix")
+    except ModuleNotFoundError as error:
+        if _package(error) not in _EXTRA_OF_PACKAGE:
+            raise
+        raise _extra_missing(" ".join(arguments[:1]), None, error) from error
+
+
 def app_for(arguments: Sequence[str]) -> typer.Typer:
     """The application; of the commands that other packages bring only the one that is called is imported."""
     called = next((argument for argument in arguments if not argument.startswith("-")), None)
@@ -76,6 +86,7 @@ def app_for(arguments: Sequence[str]) -> typer.Typer:
     app.command("localize")(localize.command)
     app.command("keys")(keys.command)
     app.command("health")(health.command)
+    app.add_typer(bridge.app, name="bridge")
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         summary, extra = _KNOWN.get(point.name, (f"From the package {point.dist.name if point.dist else '?'}.", None))
         function = _load(point, extra) if point.name == called else _not_called
@@ -109,19 +120,23 @@ def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any]:
     try:
         function: Callable[..., Any] = point.load()
     except ModuleNotFoundError as error:
-        raise _extra_missing(point, extra, error) from error
+        raise _extra_missing(point.name, extra, error) from error
 
     @functools.wraps(function)
     def run(*args: object, **kwargs: object) -> object:
         try:
             return function(*args, **kwargs)
         except ModuleNotFoundError as error:
-            raise _extra_missing(point, extra, error) from error
+            raise _extra_missing(point.name, extra, error) from error
 
     return run
 
 
-def _extra_missing(point: EntryPoint, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
-    extra = _EXTRA_OF_PACKAGE.get((error.name or "").partition(".")[0], extra)
+def _package(error: ModuleNotFoundError) -> str:
+    return (error.name or "").partition(".")[0]
+
+
+def _extra_missing(command: str, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
+    extra = _EXTRA_OF_PACKAGE.get(_package(error), extra)
     remedy = f'pip install "streetfix[{extra}]"' if extra else "install the packages it needs"
-    return ExtraMissingError(f"the command {point.name!r} needs the package {error.name!r}: {remedy}", field=point.name)
+    return ExtraMissingError(f"the command {command!r} needs the package {error.name!r}: {remedy}", field=command)

@@ -51,11 +51,13 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[httpx.Response], lis
     def put(response: httpx.Response) -> list[dict[str, Any]]:
         posted: list[dict[str, Any]] = []
 
-        def post(_client: httpx.Client, url: str, **given: Any) -> httpx.Response:
-            posted.append({"url": url} | given)
+        def request(client: httpx.Client, method: str, path: str, **given: Any) -> httpx.Response:
+            url = f"{str(client.base_url).rstrip('/')}{path}"
+            posted.append({"method": method, "url": url} | given)
+            response.request = httpx.Request(method, url)
             return response
 
-        monkeypatch.setattr(httpx.Client, "post", post)
+        monkeypatch.setattr(httpx.Client, "request", request)
         return posted
 
     return put
@@ -69,7 +71,7 @@ def test_the_parts_are_posted_with_the_map_of_the_flag(files: dict[str, Path], a
 
 
 def test_a_problem_is_told_with_field_and_request_id(files: dict[str, Path], answering: Callable[..., Any]) -> None:
-    problem = {"title": "T.", "detail": "what and why", "field": "camera.fx", "request_id": "r1"}
+    problem = {"title": "T.", "detail": "what and why", "code": "request", "field": "camera.fx", "request_id": "r1"}
     answering(httpx.Response(422, json=problem))
     with pytest.raises(RefusedError) as caught:
         localize("http://x", **files)
@@ -83,7 +85,7 @@ def test_something_else_at_the_address_is_told_so(
     files: dict[str, Path], answering: Callable[..., Any], response: httpx.Response
 ) -> None:
     answering(response)
-    with pytest.raises(UnreachableError, match="no Streetfix; check --url"):
+    with pytest.raises(UnreachableError, match="no Streetfix"):
         localize("http://x", **files)
 
 
@@ -96,7 +98,7 @@ def test_nobody_at_the_address_is_told_with_the_remedy(files: dict[str, Path]) -
 
 @pytest.mark.parametrize("url", ["", "localhost:8000", "http://[", "ftp://x"])
 def test_an_address_that_is_none_is_told_so(files: dict[str, Path], url: str) -> None:
-    with pytest.raises(UnreachableError):
+    with pytest.raises(RequestError, match="give http://HOST:PORT"):
         localize(url, **files)
 
 

@@ -1,0 +1,186 @@
+"""Frames as a robot sends them, over DDS on loopback, to a bridge in another process; counted are the poses that come back."""
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+from numpy.typing import NDArray
+
+from service.bridge import messages
+from service.bridge.bridge import Topics
+from service.bridge.pairs import nanoseconds_of
+from service.bridge.ros2 import dds_name, qos_of, stamp_message
+from service.errors import UnreachableError
+from service.geometry.camera import PinholeCamera
+
+Pictures = tuple[NDArray[np.uint8], NDArray[np.float32], PinholeCamera]
+#: Discovery and data on loopback alone, without multicast, which not every container has.
+LOOPBACK = """<CycloneDDS><Domain>
+<General><Interfaces><NetworkInterface name="lo"/></Interfaces><AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+#: Frames that are under way at once; more would lie in queues.
+_UNDER_WAY = 4
+_FIRST_NS, _PERIOD_NS = 1_700_000_000 * 10**9, 10**8
+
+
+def answers_over_dds(
+    url_or_bundle: str, frames: Iterable[Pictures], count: int = 100, *, patience_s: float = 60.0
+) -> int:
+    """How many of the frames that were sent came back as poses with their stamps.
+
+    The bridge is the command itself, without its gates: every answer has a pose, and that all of them arrive is what is measured.
+
+    Args:
+        url_or_bundle: a service's address, or the folder of a map bundle, which the bridge then answers from by itself.
+        frames: colour (H, W, 3), depth (H, W) in metres, and camera; from the start again where there are fewer than ``count``.
+        count: frames to send.
+        patience_s: end where nothing has come back for so long.
+
+    Raises:
+        UnreachableError: the bridge has ended, or was never heard of.
+    """
+    domain = 20 + os.getpid() % 200  # two at once on a machine are not to hear each other
+    with _bridge(url_or_bundle, domain) as process:
+        robot = Robot(domain)
+        robot.meet(process, patience_s)
+        for number, frame in enumerate(itertools.islice(itertools.cycle(frames), count)):
+            robot.send(frame, _FIRST_NS + number * _PERIOD_NS)
+            if not robot.wait(lambda sent=number + 1: robot.asked > sent - _UNDER_WAY, patience_s):
+                break
+        robot.wait(lambda: robot.asked >= robot.sent and len(robot.posed) >= robot.published, patience_s)
+    return len(robot.posed)
+
+
+class Robot:
+    """The other end: a camera's topics out, poses and diagnostics in.
+
+    Attributes:
+        sent: frames.
+        posed: stamps of poses that came for them.
+        asked, published: what the bridge says of itself.
+    """
+
+    def __init__(self, domain: int) -> None:
+        self._domain = Domain(domain, LOOPBACK)  # this process' environment stays as it is
+        self._participant = DomainParticipant(domain)
+        topics = Topics()
+        self._color = self._of(DataWriter, topics.color, messages.Image)
+        self._depth = self._of(DataWriter, topics.depth, messages.Image)
+        self._info = self._of(DataWriter, topics.info, messages.CameraInfo)
+        # Made before that of the diagnostics: who hears of this robot's second reader has heard of the first.
+        self._poses = self._of(DataReader, topics.pose, messages.PoseWithCovarianceStamped)
+        self._diagnostics = self._of(DataReader, topics.diagnostics, messages.DiagnosticArray)
+        self._waiting = WaitSet(self._participant)
+        for reader in (self._poses, self._diagnostics):
+            self._waiting.attach(ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any))
+        self.asked = self.published = 0
+        self._stamps: set[int] = set()
+        self.posed: set[int] = set()
+        self._met = False
+
+    @property
+    def sent(self) -> int:
+        """Frames."""
+        return len(self._stamps)
+
+    def meet(self, process: "subprocess.Popen[bytes]", patience_s: float) -> None:
+        """Wait until the bridge hears all that is sent, and what it says is heard.
+
+        Raises:
+            UnreachableError: it has ended, or is not heard.
+        """
+
+        def know() -> bool:
+            if process.poll() is not None:
+                raise UnreachableError(f"the bridge ended with {process.returncode}; why it says above")
+            writers = (self._color, self._depth, self._info)
+            return self._met and all(writer.get_matched_subscriptions() for writer in writers)
+
+        if not self.wait(know, patience_s):
+            raise UnreachableError(f"no bridge is heard after {patience_s:g} s; does this machine have a loopback?")
+
+    def send(self, frame: Pictures, stamp_ns: int) -> None:
+        """One frame as a driver sends it."""
+        rgb, depth_m, camera = frame
+        header = messages.Header(stamp_message(stamp_ns), "camera_color_optical_frame")
+        k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+        p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+        self._stamps.add(stamp_ns)
+        self._info.write(
+            messages.CameraInfo(
+                header=header, height=camera.height, width=camera.width, k=k, p=p, distortion_model="plumb_bob"
+            )
+        )
+        self._color.write(_image(header, "rgb8", rgb))
+        self._depth.write(_image(header, "32FC1", depth_m.astype("<f4", copy=False)))
+
+    def wait(self, until: Any, patience_s: float) -> bool:
+        """Listen until a condition holds; False where nothing has come for so long."""
+        heard_s = time.monotonic()
+        while not until():
+            self._waiting.wait(duration(milliseconds=200))
+            if self._listen():
+                heard_s = time.monotonic()
+            elif time.monotonic() - heard_s > patience_s:
+                return False
+        return True
+
+    def _listen(self) -> bool:
+        """Take what has come; whether it was news."""
+        before = (self._met, self.asked, len(self.posed))
+        for pose in self._poses.take(N=100):
+            self.posed |= {nanoseconds_of(pose)} & self._stamps
+        for array in self._diagnostics.take(N=100):
+            self._met = True
+            told = {value.key: value.value for value in array.status[0].values}
+            self.asked, self.published = int(told["asked"]), int(told["published"])
+        return (self._met, self.asked, len(self.posed)) != before
+
+    def _of(self, end: Any, topic: str, kind: type) -> Any:
+        return end(
+            self._participant,
+            Topic(self._participant, dds_name(topic), kind),
+            qos=qos_of(reliable=True, depth=0),
+        )
+
+
+def _image(header: messages.Header, encoding: str, picture: NDArray[Any]) -> messages.Image:
+    height, width = picture.shape[:2]
+    data = np.ascontiguousarray(picture).tobytes()
+    return messages.Image(
+        header=header, height=height, width=width, encoding=encoding, step=len(data) // height, data=data
+    )
+
+
+@contextmanager
+def _bridge(url_or_bundle: str, domain: int) -> "Iterator[subprocess.Popen[bytes]]":
+    """The command in a process of its own, which Ctrl-C ends."""
+    where = ["--url" if "://" in url_or_bundle else "--map", url_or_bundle]
+    open_gates = ["--rate", "0", "--min-confidence", "0", "--publish-doubtful", "--reliable", "--queue", "0"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from service.cli.main import main; main()", "bridge", "ros2", *where, "--domain", str(domain), *open_gates],
+        env=os.environ | {"CYCLONEDDS_URI": LOOPBACK}, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -1,0 +1,147 @@
+"""The bridge, whatever carries its messages: pictures come in, poses and diagnoses go out."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.bridge.diagnostics import Counts, Diagnosis, Level, of_answer
+from service.bridge.gate import Gate
+from service.bridge.pairs import Pair, Pairs, nanoseconds_of
+from service.bridge.pictures import camera_from, depth_from, rgb_from
+from service.bridge.pose import CAMERA_AS_BODY, StampedPose, pose_of
+from service.contract.schema import LocalizeAnswer
+from service.errors import StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import Transform
+
+#: (H, W, 3) uint8, (H, W) metres, intrinsics: a client's ``localize``, or the pipeline in this process.
+Localize = Callable[[NDArray[np.uint8], NDArray[np.float32], PinholeCamera], LocalizeAnswer]
+#: The rate that is told is over so many questions.
+_RECENT = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """Names as ROS has them."""
+
+    color: str = "/camera/color/image_raw"
+    depth: str = "/camera/aligned_depth_to_color/image_raw"
+    info: str = "/camera/color/camera_info"
+    pose: str = "/initialpose"
+    diagnostics: str = "/diagnostics"
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """What one look at the pictures leads to.
+
+    Attributes:
+        pose: to publish, if any.
+        diagnosis: to publish.
+        answer: of the service, if there was one.
+    """
+
+    pose: StampedPose | None
+    diagnosis: Diagnosis
+    answer: LocalizeAnswer | None
+
+
+@dataclass(slots=True, kw_only=True)
+class Bridge:
+    """Pairs pictures, asks, and says what is to be published.
+
+    Attributes:
+        localize: whom to ask; errors of ours become diagnoses.
+        topics: for messages to people.
+        gate: how often to ask, and what goes out.
+        pairs: what has come.
+        T_vehicle_camera: where the camera sits on what is posed.
+        frame_id: of the map.
+        rectified: see ``camera_from``.
+        clock: monotonic seconds.
+    """
+
+    localize: Localize
+    topics: Topics = field(default_factory=Topics)
+    gate: Gate = field(default_factory=Gate)
+    pairs: Pairs = field(default_factory=Pairs)
+    T_vehicle_camera: Transform = field(default_factory=CAMERA_AS_BODY.copy)
+    frame_id: str = "map"
+    rectified: bool = False
+    clock: Callable[[], float] = time.monotonic
+    counts: Counts = field(default_factory=Counts)
+    _recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
+
+    def wait_s(self) -> float:
+        """Seconds until the next question may be asked; until then nobody needs to look at messages."""
+        return self.gate.wait_s(self.clock())
+
+    def step(self) -> Published | None:
+        """Ask about the newest pair (every pair in its turn, where there is no limit on the rate), if there is one and it is time.
+
+        Blocks as long as the answer takes.
+        """
+        if self.wait_s() > 0:
+            return None
+        pair = self.pairs.newest() if self.gate.rate_hz else self.pairs.oldest()
+        return None if pair is None else self._ask(pair)
+
+    def quiet_s(self) -> float:
+        """So long without a question is no silence of the camera's, but a slow rate."""
+        return 2.0 / self.gate.rate_hz if self.gate.rate_hz else 0.0
+
+    def idle(self) -> Diagnosis:
+        """What to say where no pair has come for a while."""
+        missing = self.pairs.missing()
+        if missing:
+            told = ", ".join(f"{name} ({getattr(self.topics, name)})" for name in missing)
+            message = f"nothing comes by: {told}; do the topics have publishers?"
+        else:
+            message = "no colour and depth of one instant; are they synchronised? see --tolerance"
+        return Diagnosis(0, Level.WARN, message, self._counted())
+
+    def _ask(self, pair: Pair) -> Published:
+        stamp_ns, began = nanoseconds_of(pair.color), self.clock()
+        self.gate.asked(began)
+        self._recent_s.append(began)
+        self.counts.asked += 1
+        try:
+            camera = camera_from(pair.info, self.topics.info, rectified=self.rectified)
+            rgb, depth_m = rgb_from(pair.color, self.topics.color), depth_from(pair.depth, self.topics.depth)
+            answer = self.localize(rgb, depth_m, camera)
+        except StreetfixError as error:
+            self.counts.failed += 1
+            return Published(None, Diagnosis(stamp_ns, Level.ERROR, error.message, self._counted()), None)
+        self.counts.answered += 1
+        why_not = self.gate.why_not(answer)
+        pose = None
+        if not why_not:
+            pose = pose_of(answer, self.T_vehicle_camera, stamp_ns=stamp_ns, frame_id=self.frame_id)
+            self.counts.published += 1
+        latency_s = self.clock() - began
+        diagnosis = of_answer(answer, why_not, stamp_ns=stamp_ns, latency_s=latency_s, counted=self._counted())
+        return Published(pose, diagnosis, answer)
+
+    def _counted(self) -> tuple[tuple[str, str], ...]:
+        return self.counts.values(self.pairs.dropped, self._rate_hz())
+
+    def _rate_hz(self) -> float:
+        span_s = self._recent_s[-1] - self._recent_s[0] if len(self._recent_s) > 1 else 0.0
+        return (len(self._recent_s) - 1) / span_s if span_s > 0 else 0.0
+
+
+def line_of(published: Published) -> str:
+    """One look, as a line for people."""
+    answer, diagnosis = published.answer, published.diagnosis
+    at = f"{diagnosis.stamp_ns / 1e9:.3f}"
+    if answer is None:
+        return f"{at} failed: {diagnosis.message}"
+    p, confidence = answer.pose.position, answer.confidence
+    street = "" if answer.street is None else f"  {answer.street.name}"
+    sure = "" if confidence is None else f" {confidence:.3f}"
+    told = "" if published.pose is not None else f"  ({diagnosis.message})"
+    return f"{at} {answer.status}{sure}  x {p.x:.2f}  y {p.y:.2f}  heading {answer.pose.heading_deg:.1f}{street}{told}"

@@ -1,0 +1,42 @@
+"""The pipeline in the bridge's own process: no service, no encoding of pictures."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.contract.convert import answer_from
+from service.contract.schema import LocalizeAnswer
+from service.geometry.camera import PinholeCamera
+from service.imaging.decode import require_sizes
+from service.imaging.depth_units import depth_from_values
+from service.localization.query import Query
+from service.runtime.engine import Located
+from service.runtime.map_registry import MapRegistry
+from service.runtime.threads import limit_pools
+
+
+class InPlace:
+    """A map that this process has open.
+
+    Args:
+        bundle: its folder.
+
+    Raises:
+        BundleError: it is missing or damaged.
+    """
+
+    def __init__(self, bundle: Path) -> None:
+        limit_pools()
+        self._localizer = MapRegistry.open((bundle,)).get(None)
+
+    def __call__(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera) -> LocalizeAnswer:
+        """Where a pair was taken, as ``Client.localize`` says it.
+
+        Raises:
+            RequestError: a picture is of another size than the camera's, or holds no depth.
+        """
+        z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
+        require_sizes(rgb, z_m, camera)
+        answer = self._localizer.localize(Query(rgb=rgb, depth_m=z_m, camera=camera))
+        return answer_from(Located(answer, self._localizer.bundle))

@@ -1,0 +1,139 @@
+"""Messages of ROS 2 as DDS has them: type names and fields as rosidl makes them, so that a ROS node on the same domain reads them.
+
+Definitions: common_interfaces and rcl_interfaces (builtin_interfaces, std_msgs, geometry_msgs, sensor_msgs, diagnostic_msgs) of
+ROS 2 Humble and later, which have not changed since. A ROS topic ``/a`` is the DDS topic ``rt/a``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    """An instant."""
+
+    sec: int32 = 0
+    nanosec: uint32 = 0
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    """When, and in which frame."""
+
+    stamp: Time = field(default_factory=Time)
+    frame_id: str = ""
+
+
+@dataclass
+class Image(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):
+    """A picture, row by row; ``step`` bytes a row."""
+
+    header: Header = field(default_factory=Header)
+    height: uint32 = 0
+    width: uint32 = 0
+    encoding: str = ""
+    is_bigendian: uint8 = 0
+    step: uint32 = 0
+    data: Annotated[Sequence[int] | bytes, sequence(uint8)] = b""
+
+
+@dataclass
+class RegionOfInterest(IdlStruct, typename="sensor_msgs.msg.dds_.RegionOfInterest_"):
+    """A window of a sensor; all zero means the whole."""
+
+    x_offset: uint32 = 0
+    y_offset: uint32 = 0
+    height: uint32 = 0
+    width: uint32 = 0
+    do_rectify: bool = False
+
+
+@dataclass
+class CameraInfo(IdlStruct, typename="sensor_msgs.msg.dds_.CameraInfo_"):
+    """A camera's calibration: K of the raw picture, P of the rectified one."""
+
+    header: Header = field(default_factory=Header)
+    height: uint32 = 0
+    width: uint32 = 0
+    distortion_model: str = ""
+    d: Annotated[Sequence[float], sequence(float64)] = field(default_factory=list)
+    k: Annotated[Sequence[float], array(float64, 9)] = field(default_factory=lambda: [0.0] * 9)
+    r: Annotated[Sequence[float], array(float64, 9)] = field(default_factory=lambda: [0.0] * 9)
+    p: Annotated[Sequence[float], array(float64, 12)] = field(default_factory=lambda: [0.0] * 12)
+    binning_x: uint32 = 0
+    binning_y: uint32 = 0
+    roi: RegionOfInterest = field(default_factory=RegionOfInterest)
+
+
+@dataclass
+class Point(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
+    """A position, metres."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
+    """A rotation."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+    w: float64 = 1.0
+
+
+@dataclass
+class Pose(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
+    """Position and orientation."""
+
+    position: Point = field(default_factory=Point)
+    orientation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.PoseWithCovariance_"):
+    """A pose, and its 6 x 6 covariance row by row: x, y, z, rotations about the fixed axes x, y, z."""
+
+    pose: Pose = field(default_factory=Pose)
+    covariance: Annotated[Sequence[float], array(float64, 36)] = field(default_factory=lambda: [0.0] * 36)
+
+
+@dataclass
+class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs.msg.dds_.PoseWithCovarianceStamped_"):
+    """The same with its instant and frame."""
+
+    header: Header = field(default_factory=Header)
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+
+
+@dataclass
+class KeyValue(IdlStruct, typename="diagnostic_msgs.msg.dds_.KeyValue_"):
+    """A word about a component."""
+
+    key: str = ""
+    value: str = ""
+
+
+@dataclass
+class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticStatus_"):
+    """How a component does; ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE (ROS' octet)."""
+
+    level: uint8 = 0
+    name: str = ""
+    message: str = ""
+    hardware_id: str = ""
+    values: Annotated[Sequence[KeyValue], sequence(KeyValue)] = field(default_factory=list)
+
+
+@dataclass
+class DiagnosticArray(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticArray_"):
+    """How components do."""
+
+    header: Header = field(default_factory=Header)
+    status: Annotated[Sequence[DiagnosticStatus], sequence(DiagnosticStatus)] = field(default_factory=list)

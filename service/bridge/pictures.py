@@ -1,0 +1,142 @@
+"""Messages of ROS as numpy pictures and a camera. Whatever has ROS' fields will do: rclpy's messages as well as our own."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import RequestError
+from service.geometry.camera import PinholeCamera
+
+#: Channels, and what OpenCV calls the way to RGB; None where it is RGB already.
+_COLOURS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+}
+#: REP 118: unsigned millimetres, or floating metres. mono16 is what some drivers call the former.
+_DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+
+
+class StampLike(Protocol):
+    """builtin_interfaces/Time."""
+
+    sec: int
+    nanosec: int
+
+
+class HeaderLike(Protocol):
+    """std_msgs/Header."""
+
+    stamp: Any
+    frame_id: str
+
+
+class ImageLike(Protocol):
+    """sensor_msgs/Image."""
+
+    header: Any
+    height: int
+    width: int
+    encoding: str
+    is_bigendian: int
+    step: int
+    data: Any
+
+
+class CameraInfoLike(Protocol):
+    """sensor_msgs/CameraInfo."""
+
+    header: Any
+    height: int
+    width: int
+    d: Sequence[float]
+    k: Sequence[float]
+    p: Sequence[float]
+    roi: Any
+
+
+def rgb_from(message: ImageLike, topic: str) -> NDArray[np.uint8]:
+    """A colour picture, (H, W, 3) sRGB.
+
+    Raises:
+        RequestError: an encoding that is not read, or sizes that contradict each other; ``field`` is the topic.
+    """
+    known = _COLOURS.get(message.encoding)
+    if known is None:
+        raise _unread(message, topic, _COLOURS)
+    channels, to_rgb = known
+    pixels = _rows(message, topic, np.dtype(np.uint8), channels)
+    if to_rgb is None:
+        return pixels
+    return cv2.cvtColor(pixels, to_rgb).astype(np.uint8, copy=False)
+
+
+def depth_from(message: ImageLike, topic: str) -> NDArray[np.float32]:
+    """Depth along the optical axis, (H, W), metres; 0 and NaN where nothing was measured.
+
+    Raises:
+        RequestError: as ``rgb_from``.
+    """
+    known = _DEPTHS.get(message.encoding)
+    if known is None:
+        raise _unread(message, topic, _DEPTHS)
+    dtype = np.dtype(known).newbyteorder(">" if message.is_bigendian else "<")
+    values = _rows(message, topic, dtype, 1)[..., 0].astype(np.float32)
+    return values if known == "f4" else values * np.float32(0.001)
+
+
+def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False) -> PinholeCamera:
+    """The rectified camera: P where it is set, else K; moved into the region of interest.
+
+    Args:
+        message: of the colour picture.
+        topic: that it came by.
+        rectified: the pictures are rectified already, whatever distortion the message tells of the lens.
+
+    Raises:
+        RequestError: it is not calibrated, or the pictures are not rectified.
+    """
+    if any(message.d) and not rectified:
+        raise RequestError(
+            f"{topic}: the lens distorts (d = {[round(each, 4) for each in message.d]}), and pictures must be rectified; subscribe to "
+            "image_proc's rectified topics and say --rectified", field=topic,
+        )  # fmt: skip
+    p, k = message.p, message.k
+    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] else (k[0], k[4], k[2], k[5])
+    width, height = message.width, message.height
+    if not (fx > 0 and fy > 0 and width > 1 and height > 1):
+        raise RequestError(
+            f"{topic}: this camera is not calibrated (fx {fx:g}, fy {fy:g}, {width}x{height}); calibrate it, or change --info-topic",
+            field=topic,
+        )
+    if message.roi.width and message.roi.height:
+        width, height = message.roi.width, message.roi.height
+        cx, cy = cx - message.roi.x_offset, cy - message.roi.y_offset
+    return PinholeCamera(width, height, fx, fy, cx, cy)
+
+
+def _rows(message: ImageLike, topic: str, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
+    """Pixels without the padding of their rows, (H, W, channels)."""
+    height, width, step = message.height, message.width, message.step
+    row = width * channels * dtype.itemsize
+    # DDS' own library gives a list of numbers, rclpy an array.
+    data = np.frombuffer(bytes(message.data) if isinstance(message.data, list) else message.data, np.uint8)
+    if height < 1 or width < 1 or step < row or data.size < height * step:
+        raise RequestError(
+            f"{topic}: {data.size} bytes are no picture of {width}x{height} {message.encoding} with rows of {step} bytes (a row needs "
+            f"{row}, all of them {height * max(step, row)}); mend the publisher", field=topic,
+        )  # fmt: skip
+    rows = data[: height * step].reshape(height, step)[:, :row]
+    return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
+
+
+def _unread(message: ImageLike, topic: str, known: dict[str, Any]) -> RequestError:
+    return RequestError(
+        f"{topic}: pictures come as {message.encoding!r}, which is not read here; publish one of {', '.join(known)}",
+        field=topic,
+    )

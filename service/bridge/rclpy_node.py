@@ -1,0 +1,97 @@
+"""The same bridge as a node of rclpy, for those who have ROS 2: its parameters, remappings and executors then hold."""
+
+from collections.abc import Callable
+from threading import Event
+from typing import Any
+
+from service.bridge.bridge import Bridge, Published
+from service.bridge.diagnostics import NAME, Diagnosis
+from service.bridge.pose import StampedPose
+from service.errors import ExtraMissingError
+
+#: Pictures are looked at so often, and diagnoses come after so long without any.
+_LOOK_S, _IDLE_S = 0.05, 1.0
+
+
+def run(
+    bridge: Bridge, over: Event, told: Callable[[Published], None] = lambda _: None, *,
+    domain: int = 0, reliable: bool = False, depth: int = 5,
+) -> None:  # fmt: skip
+    """Answer pictures until it is over; arguments as for ``DdsNode``.
+
+    Raises:
+        ExtraMissingError: there is no rclpy.
+    """
+    try:
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import PoseWithCovarianceStamped
+        from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+        from sensor_msgs.msg import CameraInfo, Image
+    except ModuleNotFoundError as error:
+        raise ExtraMissingError(
+            f"--node rclpy needs the package {error.name!r}, which comes with ROS 2: source /opt/ros/DISTRIBUTION/setup.bash in an "
+            "environment with system packages, or say --node dds, which needs no ROS", field="node",
+        ) from error  # fmt: skip
+    rclpy.init(domain_id=domain)
+    node = rclpy.create_node("streetfix_bridge")
+    pictures = QoSProfile(
+        depth=depth or 1000,
+        history=HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+    )
+    topics, pairs = bridge.topics, bridge.pairs
+    node.create_subscription(Image, topics.color, pairs.color, pictures)
+    node.create_subscription(Image, topics.depth, pairs.depth, pictures)
+    node.create_subscription(CameraInfo, topics.info, pairs.info, pictures)
+    poses = node.create_publisher(PoseWithCovarianceStamped, topics.pose, 10)
+    diagnoses = node.create_publisher(DiagnosticArray, topics.diagnostics, 10)
+    spoken_s = bridge.clock()
+    try:
+        while rclpy.ok() and not over.is_set():
+            rclpy.spin_once(node, timeout_sec=_LOOK_S)
+            now = node.get_clock().now().to_msg()
+            if (published := bridge.step()) is not None:
+                if published.pose is not None:
+                    poses.publish(filled_pose(PoseWithCovarianceStamped(), published.pose))
+                diagnoses.publish(filled_diagnostics(DiagnosticArray(), published.diagnosis, now))
+                told(published)
+            elif bridge.clock() - spoken_s < max(_IDLE_S, bridge.quiet_s()):
+                continue
+            else:
+                diagnoses.publish(filled_diagnostics(DiagnosticArray(), bridge.idle(), now))
+            spoken_s = bridge.clock()
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def filled_pose(message: Any, pose: StampedPose) -> Any:
+    """A geometry_msgs/PoseWithCovarianceStamped with a pose in it."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(pose.stamp_ns, 10**9)
+    message.header.frame_id = pose.frame_id
+    at, turned = message.pose.pose.position, message.pose.pose.orientation
+    at.x, at.y, at.z = pose.T_map_vehicle[:3, 3].tolist()
+    turned.x, turned.y, turned.z, turned.w = pose.quaternion_xyzw.tolist()
+    message.pose.covariance = pose.covariance.reshape(-1).tolist()
+    return message
+
+
+def filled_diagnostics(message: Any, diagnosis: Diagnosis, now: Any) -> Any:
+    """A diagnostic_msgs/DiagnosticArray with a diagnosis in it.
+
+    Args:
+        message: empty.
+        diagnosis: to tell.
+        now: builtin_interfaces/Time.
+    """
+    from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+    message.header.stamp = now
+    message.status = [
+        DiagnosticStatus(
+            level=bytes([diagnosis.level]), name=NAME, message=diagnosis.message, hardware_id="streetfix",
+            values=[KeyValue(key=name, value=value) for name, value in diagnosis.values],
+        )
+    ]  # fmt: skip
+    return message

@@ -1,0 +1,151 @@
+"""The bridge over DDS, which ROS 2 speaks: no ROS installation is needed on this side."""
+
+import time
+from collections.abc import Callable
+from threading import Event
+from typing import TypeVar
+
+from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from service.bridge import messages
+from service.bridge.bridge import Bridge, Published
+from service.bridge.diagnostics import NAME, Diagnosis
+from service.bridge.pose import StampedPose
+from service.errors import AddressError
+
+M = TypeVar("M", bound=IdlStruct)
+#: Diagnoses come at least so often, whether pictures do or not.
+IDLE_S = 1.0
+#: A signal is noticed after so long at the latest.
+_LOOK_S = 0.2
+#: What ROS 2 speaks on the wire.
+_CDR = Policy.DataRepresentation(use_cdrv0_representation=True)
+
+
+def qos_of(*, reliable: bool, depth: int) -> Qos:
+    """Quality of service as ROS 2 has it.
+
+    Args:
+        reliable: lost messages are sent again; a best-effort reader hears reliable writers as well, a reliable one no best-effort ones.
+        depth: messages that wait; 0 keeps all.
+    """
+    history = Policy.History.KeepLast(depth) if depth else Policy.History.KeepAll
+    reliability = Policy.Reliability.Reliable(duration(seconds=10)) if reliable else Policy.Reliability.BestEffort
+    return Qos(reliability, history, Policy.Durability.Volatile, _CDR)
+
+
+def dds_name(topic: str) -> str:
+    """A ROS topic's name on DDS."""
+    return f"rt/{topic.strip('/')}"
+
+
+class DdsNode:
+    """Readers and writers of one bridge.
+
+    Args:
+        bridge: what it is for.
+        domain: ``ROS_DOMAIN_ID`` of those it talks to.
+        reliable: ask for lost pictures again; publishers of sensor data are often best effort, which such a reader does not hear.
+        depth: pictures that wait while a question is under way; 0 keeps all.
+
+    Raises:
+        AddressError: DDS does not start, as with a wrong ``CYCLONEDDS_URI``.
+    """
+
+    def __init__(self, bridge: Bridge, *, domain: int = 0, reliable: bool = False, depth: int = 5) -> None:
+        self._bridge = bridge
+        topics = bridge.topics
+        try:
+            self._participant = DomainParticipant(domain)
+            pictures = qos_of(reliable=reliable, depth=depth)
+            self._color = self._reader(topics.color, messages.Image, pictures)
+            self._depth = self._reader(topics.depth, messages.Image, pictures)
+            self._info = self._reader(topics.info, messages.CameraInfo, pictures)
+            self._pose = self._writer(topics.pose, messages.PoseWithCovarianceStamped)
+            self._diagnostics = self._writer(topics.diagnostics, messages.DiagnosticArray)
+            self._waiting = WaitSet(self._participant)
+            for reader in (self._color, self._depth, self._info):
+                unread = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
+                self._waiting.attach(unread)
+        except DDSException as error:
+            raise AddressError(
+                f"DDS does not start on domain {domain} ({error}); check --domain and the environment's CYCLONEDDS_URI",
+                field="domain",
+            ) from error
+
+    def run(self, over: Event, told: Callable[[Published], None] = lambda _: None) -> None:
+        """Answer pictures until it is over.
+
+        Args:
+            over: set from elsewhere, as by a signal.
+            told: hears of every look at a pair.
+        """
+        spoken_s = time.monotonic() - IDLE_S
+        while not over.is_set():
+            if (wait_s := self._bridge.wait_s()) > 0:  # what comes meanwhile nobody needs to unpack
+                over.wait(min(wait_s, _LOOK_S))
+            else:
+                self._waiting.wait(duration(seconds=_LOOK_S))
+                self._take()
+                while not over.is_set() and (published := self._bridge.step()) is not None:
+                    self._publish(published)
+                    told(published)
+                    spoken_s = time.monotonic()
+            if time.monotonic() - spoken_s >= max(IDLE_S, self._bridge.quiet_s()):
+                self._say(self._bridge.idle())
+                spoken_s = time.monotonic()
+
+    def _take(self) -> None:
+        pairs = self._bridge.pairs
+        for info in self._info.take(N=pairs.most):
+            pairs.info(info)
+        for color in self._color.take(N=pairs.most):
+            pairs.color(color)
+        for depth in self._depth.take(N=pairs.most):
+            pairs.depth(depth)
+
+    def _publish(self, published: Published) -> None:
+        if published.pose is not None:
+            self._pose.write(pose_message(published.pose))
+        self._say(published.diagnosis)
+
+    def _say(self, diagnosis: Diagnosis) -> None:
+        self._diagnostics.write(diagnostics_message(diagnosis))
+
+    def _reader(self, name: str, kind: type[M], qos: Qos) -> DataReader[M]:
+        return DataReader(self._participant, Topic(self._participant, dds_name(name), kind), qos=qos)
+
+    def _writer(self, name: str, kind: type[M]) -> DataWriter[M]:
+        topic = Topic(self._participant, dds_name(name), kind)
+        return DataWriter(self._participant, topic, qos=qos_of(reliable=True, depth=10))
+
+
+def pose_message(pose: StampedPose) -> messages.PoseWithCovarianceStamped:
+    """As geometry_msgs has it."""
+    x, y, z, w = pose.quaternion_xyzw.tolist()
+    position = messages.Point(*pose.T_map_vehicle[:3, 3].tolist())
+    posed = messages.Pose(position, messages.Quaternion(x, y, z, w))
+    return messages.PoseWithCovarianceStamped(
+        header=messages.Header(stamp_message(pose.stamp_ns), pose.frame_id),
+        pose=messages.PoseWithCovariance(posed, pose.covariance.reshape(-1).tolist()),
+    )
+
+
+def diagnostics_message(diagnosis: Diagnosis) -> messages.DiagnosticArray:
+    """As diagnostic_msgs has it; its stamp is now's."""
+    status = messages.DiagnosticStatus(
+        level=int(diagnosis.level), name=NAME, message=diagnosis.message, hardware_id="streetfix",
+        values=[messages.KeyValue(name, value) for name, value in diagnosis.values],
+    )  # fmt: skip
+    return messages.DiagnosticArray(header=messages.Header(stamp_message(time.time_ns())), status=[status])
+
+
+def stamp_message(stamp_ns: int) -> messages.Time:
+    """As builtin_interfaces has it."""
+    return messages.Time(*divmod(stamp_ns, 10**9))

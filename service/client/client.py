@@ -1,0 +1,140 @@
+"""The client that waits for its answers."""
+
+import random
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Self, TypeVar, Unpack
+
+import httpx
+
+from service.client import asking, rest
+from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client.encode import JPEG_QUALITY
+from service.client.retry import Attempts, RetryPolicy
+from service.contract.schema import LocalizeAnswer, MapEntry
+from service.errors import RefusedError, StreetfixError
+
+A = TypeVar("A")
+
+
+class Client:
+    """A service over HTTP; safe to call from several threads.
+
+    Args:
+        url: of the service, ``http://HOST:PORT``.
+        api_key: where the service asks for one.
+        timeout_s: for one attempt: to connect, and between two pieces of what is sent or comes back.
+        retry: when to ask again.
+        quality: of the JPEG that colour is sent as, 1 to 100; None sends PNG.
+        transport: httpx', in place of sockets.
+        sleep: waits between attempts.
+        clock: monotonic seconds.
+        draw: a random number in [0, 1).
+
+    Raises:
+        RequestError: the address is none, or a number makes no sense.
+    """
+
+    def __init__(
+        self, url: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
+        quality: int | None = JPEG_QUALITY, transport: httpx.BaseTransport | None = None,
+        sleep: Callable[[float], None] = time.sleep, clock: Callable[[], float] = time.monotonic,
+        draw: Callable[[], float] = random.random,
+    ) -> None:  # fmt: skip
+        how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s)
+        self._url, self._timeout_s = url, timeout_s
+        self._quality = quality
+        self._policy = retry or RetryPolicy()
+        self._sleep, self._clock, self._draw = sleep, clock, draw
+        self._http = httpx.Client(**how, transport=transport)
+
+    def __enter__(self) -> Self:
+        """Keep connections open inside."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close them."""
+        self.close()
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._http.close()
+
+    def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
+        """Ask where a pair of pictures was taken.
+
+        Args:
+            rgb: (H, W, 3) uint8, sRGB.
+            depth: (H, W), metres along the optical axis as floating values, or uint16 (millimetres unless ``depth_scale_m`` says
+                otherwise); 0 and NaN where nothing was measured.
+            camera: rectified intrinsics, pixels; either picture may be a uniformly resized one of its.
+            **about: what else is known; see ``About``.
+
+        Raises:
+            RequestError: an argument makes no sense.
+            RefusedError: the service answered with a problem.
+            UnavailableError: it refused for now, and did so until patience ended.
+            UnreachableError: nothing answers.
+        """
+        return self.call(rest.localize(asking.one(rgb, depth, camera, about, self._quality)))
+
+    def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
+        """Ask where the first of some frames was taken, whose cameras are known against each other, as by odometry.
+
+        Raises:
+            StreetfixError: as ``localize``.
+        """
+        return self.call(rest.localize_sequence(asking.sequence(frames, about, self._quality)))
+
+    def localize_batch(
+        self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
+    ) -> list[LocalizeAnswer | RefusedError]:
+        """Ask where each of some pairs was taken, each on its own; what one is refused with stands in its place.
+
+        Raises:
+            StreetfixError: as ``localize``, of the batch as a whole.
+        """
+        return self.call(rest.localize_batch(asking.several(frames, about, self._quality)))
+
+    def maps(self) -> list[MapEntry]:
+        """All mounted maps.
+
+        Raises:
+            StreetfixError: as ``localize``.
+        """
+        return self.call(rest.maps())
+
+    def streets(self, map_name: str) -> dict[str, Any]:
+        """A map's streets, a GeoJSON FeatureCollection of polygons in map metres, or WGS-84 where the map is georeferenced.
+
+        Raises:
+            StreetfixError: as ``localize``.
+        """
+        return self.call(rest.streets(map_name))
+
+    def coverage(self) -> dict[str, Any]:
+        """Where the maps can answer, a GeoJSON FeatureCollection with a MultiPolygon of each.
+
+        Raises:
+            StreetfixError: as ``localize``.
+        """
+        return self.call(rest.coverage())
+
+    def call(self, call: rest.Call[A]) -> A:
+        """Send a call of one's own making, as one with pictures from files, and read what comes back.
+
+        Raises:
+            StreetfixError: as ``localize``.
+        """
+        attempts = Attempts(self._policy, self._clock, self._draw)
+        while True:
+            try:
+                with rest.errors_of_httpx(self._url, self._timeout_s):
+                    response = self._http.request(call.method, call.path, files=call.files or None)
+                return rest.answer_of(call, response)
+            except StreetfixError as error:
+                wait_s = attempts.wait_after(error)
+            self._sleep(wait_s)

@@ -1,0 +1,135 @@
+"""The client over gRPC: the same calls, the same answers."""
+
+import random
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Self, TypeVar, Unpack
+
+import grpc
+
+from service.client import asking, grpc_messages
+from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
+from service.client.encode import JPEG_QUALITY
+from service.client.grpc_errors import errors_of_grpc, refused_in_batch
+from service.client.rest import geojson
+from service.client.retry import Attempts, RetryPolicy
+from service.contract.schema import LocalizeAnswer, MapEntry
+from service.errors import RefusedError, RequestError, StreetfixError
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+
+A = TypeVar("A")
+M = TypeVar("M")
+#: gRPC's own retries would come on top of ours, and know nothing of RetryInfo.
+_OPTIONS = (
+    ("grpc.enable_retries", 0),
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.max_send_message_length", -1),
+)
+
+
+class GrpcClient:
+    """A service over gRPC, with the methods of ``Client``; safe to call from several threads.
+
+    Args:
+        address: of the service, ``HOST:PORT``.
+        api_key: where the service asks for one.
+        timeout_s: for one attempt.
+        retry: when to ask again.
+        quality: of the JPEG that colour is sent as, 1 to 100; None sends PNG.
+        credentials: TLS; None speaks without.
+        sleep: waits between attempts.
+        clock: monotonic seconds.
+        draw: a random number in [0, 1).
+
+    Raises:
+        RequestError: the address is none.
+    """
+
+    def __init__(
+        self, address: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
+        quality: int | None = JPEG_QUALITY, credentials: grpc.ChannelCredentials | None = None,
+        sleep: Callable[[float], None] = time.sleep, clock: Callable[[], float] = time.monotonic,
+        draw: Callable[[], float] = random.random,
+    ) -> None:  # fmt: skip
+        host, _, port = address.rpartition(":")
+        if not (host and port.isdecimal()) or "/" in address:
+            raise RequestError(
+                f"address: {address!r} is no gRPC address; give HOST:PORT, as 127.0.0.1:50051", field="address"
+            )
+        if not timeout_s > 0:
+            raise RequestError(f"timeout_s: {timeout_s} is no time to wait; give seconds", field="timeout_s")
+        self._address, self._timeout_s = address, timeout_s
+        self._metadata = () if api_key is None else (("authorization", f"Bearer {api_key}"),)
+        self._quality = quality
+        self._policy = retry or RetryPolicy()
+        self._sleep, self._clock, self._draw = sleep, clock, draw
+        self._channel = (
+            grpc.insecure_channel(address, options=_OPTIONS)
+            if credentials is None
+            else grpc.secure_channel(address, credentials, options=_OPTIONS)
+        )
+        self._stub = LocalizationServiceStub(self._channel)  # type: ignore[no-untyped-call]  # generated code
+
+    def __enter__(self) -> Self:
+        """Keep the channel open inside."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the channel."""
+        self._channel.close()
+
+    def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
+        """As ``Client.localize``."""
+        message = grpc_messages.request_message(asking.one(rgb, depth, camera, about, self._quality))
+        return self._call(self._stub.Localize, message, grpc_messages.answer_of)
+
+    def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
+        """As ``Client.localize_sequence``."""
+        message = grpc_messages.sequence_message(asking.sequence(frames, about, self._quality))
+        return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer))
+
+    def localize_batch(
+        self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
+    ) -> list[LocalizeAnswer | RefusedError]:
+        """As ``Client.localize_batch``."""
+        message = grpc_messages.batch_message(asking.several(frames, about, self._quality))
+        return self._call(self._stub.LocalizeBatch, message, _outcomes)
+
+    def maps(self) -> list[MapEntry]:
+        """As ``Client.maps``."""
+        return self._call(
+            self._stub.ListMaps, pb.ListMapsRequest(), lambda got: [grpc_messages.map_of(each) for each in got.maps]
+        )
+
+    def streets(self, map_name: str) -> dict[str, Any]:
+        """As ``Client.streets``."""
+        return self._call(self._stub.GetStreets, pb.GetStreetsRequest(map=map_name), lambda got: geojson(got.geojson))
+
+    def coverage(self) -> dict[str, Any]:
+        """As ``Client.coverage``."""
+        return self._call(self._stub.GetCoverage, pb.GetCoverageRequest(), lambda got: geojson(got.geojson))
+
+    def _call(self, method: Callable[..., M], message: object, read: Callable[[M], A]) -> A:
+        attempts = Attempts(self._policy, self._clock, self._draw)
+        while True:
+            try:
+                with errors_of_grpc(self._address, self._timeout_s):
+                    return read(method(message, timeout=self._timeout_s, metadata=self._metadata))
+            except StreetfixError as error:
+                wait_s = attempts.wait_after(error)
+            self._sleep(wait_s)
+
+
+def _outcomes(message: pb.LocalizeBatchResponse) -> list[LocalizeAnswer | RefusedError]:
+    return [
+        grpc_messages.answer_of(each.answer) if each.HasField("answer") else refused_in_batch(each.problem)
+        for each in message.outcomes
+    ]

@@ -1,0 +1,99 @@
+"""What ends a gRPC call, as errors of ours."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import grpc
+from google.protobuf.message import Message
+from google.rpc import error_details_pb2, status_pb2
+from grpc_status import rpc_status
+
+from service.client.problems import refused
+from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, StreetfixError, UnreachableError
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+
+REQUEST_ID = "x-request-id"
+
+
+@contextmanager
+def errors_of_grpc(address: str, timeout_s: float) -> Iterator[None]:
+    """Errors of the library as ours.
+
+    Raises:
+        RefusedError: the service answered with a problem.
+        NoAnswerInTimeError: the time has ended.
+        UnreachableError: the connection failed.
+        ForeignServiceError: what answers there does not know our calls, or answers what is none.
+    """
+    try:
+        yield
+    except grpc.RpcError as error:
+        raise _of(error, address, timeout_s) from error
+    except ValueError as error:
+        raise ForeignServiceError(
+            f"{address}: what answers there is of another contract ({error}); check the address", field="url"
+        ) from error
+
+
+def refused_in_batch(problem: pb.Problem) -> RefusedError:
+    """A problem of one request among several."""
+    return refused(
+        problem.title, problem.detail, problem=problem.code, status="", field=problem.field,
+        may_come_back=problem.code in ("busy", "not-ready"),
+    )  # fmt: skip
+
+
+def _of(error: grpc.RpcError, address: str, timeout_s: float) -> StreetfixError:
+    if not isinstance(error, grpc.Call):
+        return UnreachableError(f"{address}: the call failed ({error}); check the address", field="url")
+    code, said = error.code(), error.details() or ""
+    told = _details(error)
+    info = told.get(error_details_pb2.ErrorInfo.DESCRIPTOR.full_name)
+    if isinstance(info, error_details_pb2.ErrorInfo):
+        return _refused(error, told, info)
+    if code == grpc.StatusCode.DEADLINE_EXCEEDED:
+        return NoAnswerInTimeError(
+            f"{address}: no answer within {timeout_s:g} s; ask again, or give more timeout_s", field="timeout_s"
+        )
+    if code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
+        return UnreachableError(
+            f"{address}: no service answers ({said}); start one with: streetfix serve BUNDLE --grpc-port PORT",
+            field="url",
+        )
+    if code in (grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.UNKNOWN):
+        return ForeignServiceError(
+            f"{address}: what answers there is no Streetfix ({said}); check the address", field="url"
+        )
+    # What gRPC itself refuses, as a message beyond its limit, and what nobody foresaw.
+    problem = "internal" if code == grpc.StatusCode.INTERNAL else ""
+    return refused(code.name, said, problem=problem, status=code.name, request_id=_request_id(error))
+
+
+def _refused(error: grpc.Call, told: dict[str, Message], info: error_details_pb2.ErrorInfo) -> StreetfixError:
+    bad = told.get(error_details_pb2.BadRequest.DESCRIPTOR.full_name)
+    fields = bad.field_violations if isinstance(bad, error_details_pb2.BadRequest) else ()
+    again = told.get(error_details_pb2.RetryInfo.DESCRIPTOR.full_name)
+    wait = again.retry_delay if isinstance(again, error_details_pb2.RetryInfo) else None
+    return refused(
+        info.reason, error.details() or "", problem=info.reason, status=error.code().name,
+        field=fields[0].field if fields else "", request_id=_request_id(error), may_come_back=wait is not None,
+        retry_after_s=None if wait is None else wait.ToTimedelta().total_seconds(),
+    )  # fmt: skip
+
+
+def _details(error: grpc.Call) -> dict[str, Message]:
+    """The details of google.rpc.Status that we know, by their type's name."""
+    try:
+        status: status_pb2.Status | None = rpc_status.from_call(error)
+    except ValueError:  # a status whose code or message contradicts the trailers': somebody else's
+        return {}
+    found: dict[str, Message] = {}
+    for packed in () if status is None else status.details:
+        for known in (error_details_pb2.ErrorInfo(), error_details_pb2.BadRequest(), error_details_pb2.RetryInfo()):
+            if packed.Unpack(known):
+                found[known.DESCRIPTOR.full_name] = known
+    return found
+
+
+def _request_id(error: grpc.Call) -> str:
+    return next((str(value) for key, value in error.initial_metadata() or () if key == REQUEST_ID), "")

@@ -1,0 +1,160 @@
+"""Between the contract's models and protobuf messages, as a client needs it: requests there, answers back."""
+
+from typing import Any
+
+from service.client.asking import Asked
+from service.contract import schema
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+
+_KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
+_STATUS_PREFIX, _SECTION_PREFIX = "LOCALIZATION_STATUS_", "STREET_SECTION_"
+
+
+def request_message(asked: Asked[schema.LocalizeRequest]) -> pb.LocalizeRequest:
+    """A single pair."""
+    return _pair(asked.document, asked.pictures[0])
+
+
+def batch_message(asked: Asked[schema.BatchRequest]) -> pb.LocalizeBatchRequest:
+    """Pairs each on its own."""
+    pairs = zip(asked.document.requests, asked.pictures, strict=True)
+    return pb.LocalizeBatchRequest(requests=[_pair(request, pictures) for request, pictures in pairs])
+
+
+def sequence_message(asked: Asked[schema.SequenceRequest]) -> pb.LocalizeSequenceRequest:
+    """Frames as one."""
+    request = asked.document
+    frames = [
+        pb.SequenceFrame(
+            rgb=rgb, depth=depth, camera=_camera(frame.camera), depth_format=_depth(frame.depth), gravity=_vector(frame.gravity),
+            reference_from_camera=_transform(frame.T_reference_camera),
+        )
+        for frame, (rgb, depth) in zip(request.frames, asked.pictures, strict=True)
+    ]  # fmt: skip
+    return pb.LocalizeSequenceRequest(
+        map=request.map, frames=frames, vehicle_from_camera=_transform(request.T_vehicle_camera), prior=_prior(request.prior),
+        options=_options(request.options),
+    )  # fmt: skip
+
+
+def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
+    """The contract's answer.
+
+    Raises:
+        ValueError: a value that the contract does not have.
+    """
+    times = message.timings
+    return schema.LocalizeAnswer.model_validate(
+        {
+            "status": pb.LocalizationStatus.Name(message.status).removeprefix(_STATUS_PREFIX),
+            "confidence": message.confidence if message.HasField("confidence") else None,
+            "street": _street_content(message.street) if message.HasField("street") else None,
+            "pose": _pose_content(message.pose),
+            "vehicle_pose": _pose_content(message.vehicle_pose) if message.HasField("vehicle_pose") else None,
+            "geopose": _geopose_content(message.geopose) if message.HasField("geopose") else None,
+            "hypotheses": [
+                {
+                    "pose": _pose_content(each.pose), "share": each.share, "inliers": each.inliers, "similarity": each.similarity,
+                }
+                for each in message.hypotheses
+            ],
+            "neighbours": [
+                {
+                    "place": each.place, "distance": each.distance, "similarity": each.similarity,
+                    "street": each.street if each.HasField("street") else None,
+                    "position": _xyz(each.position), "heading_deg": each.heading_deg,
+                }
+                for each in message.neighbours
+            ],
+            "map": {"name": message.map.name, "version": message.map.version},
+            "timings_ms": {
+                stage: getattr(times, f"{stage}_ms") for stage in ("decode", "fuse", "encode", "search", "register", "total")
+            },
+        }
+    )  # fmt: skip
+
+
+def map_of(message: pb.MapEntry) -> schema.MapEntry:
+    """A mounted map.
+
+    Raises:
+        ValueError: a value that the contract does not have.
+    """
+    content = {name: getattr(message, name) for name in schema.MapEntry.model_fields if name != "versions"}
+    return schema.MapEntry.model_validate(content | {"versions": list(message.versions)})
+
+
+def _pair(request: schema.LocalizeRequest, pictures: tuple[bytes, bytes]) -> pb.LocalizeRequest:
+    rgb, depth = pictures
+    return pb.LocalizeRequest(
+        map=request.map, rgb=rgb, depth=depth, camera=_camera(request.camera), depth_format=_depth(request.depth),
+        gravity=_vector(request.gravity), vehicle_from_camera=_transform(request.T_vehicle_camera),
+        options=_options(request.options), prior=_prior(request.prior),
+    )  # fmt: skip
+
+
+def _camera(camera: schema.Camera) -> pb.Camera:
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")}
+    return pb.Camera(model=pb.CAMERA_MODEL_PINHOLE, **numbers)
+
+
+def _depth(depth: schema.Depth) -> pb.DepthFormat:
+    return pb.DepthFormat(
+        scale_m=depth.scale_m, kind=_KINDS[depth.kind], max_range_m=depth.max_range_m, baseline_m=depth.baseline_m
+    )
+
+
+def _options(options: schema.Options) -> pb.Options:
+    return pb.Options(**options.model_dump(exclude_unset=True))
+
+
+def _prior(prior: schema.Prior | None) -> pb.Prior | None:
+    if prior is None:
+        return None
+    position, wgs84 = prior.position, prior.wgs84
+    return pb.Prior(
+        position=None if position is None else pb.PriorPosition(**position.model_dump()),
+        wgs84=None if wgs84 is None else pb.PriorWgs84(**wgs84.model_dump()),
+        heading_deg=prior.heading_deg, heading_std_deg=prior.heading_std_deg,
+    )  # fmt: skip
+
+
+def _vector(vector: schema.Vector | None) -> pb.Vector3 | None:
+    return None if vector is None else pb.Vector3(x=vector.x, y=vector.y, z=vector.z)
+
+
+def _transform(transform: schema.RigidTransform | None) -> pb.RigidTransform | None:
+    if transform is None:
+        return None
+    p, q = transform.position, transform.orientation
+    return pb.RigidTransform(
+        position=pb.Vector3(x=p.x, y=p.y, z=p.z), orientation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w)
+    )
+
+
+def _xyz(message: pb.Vector3) -> dict[str, float]:
+    return {"x": message.x, "y": message.y, "z": message.z}
+
+
+def _xyzw(message: pb.Quaternion) -> dict[str, float]:
+    return {"x": message.x, "y": message.y, "z": message.z, "w": message.w}
+
+
+def _pose_content(message: pb.Pose) -> dict[str, Any]:
+    return {
+        "position": _xyz(message.position), "orientation": _xyzw(message.orientation), "heading_deg": message.heading_deg,
+        "covariance": list(message.covariance) or None,
+    }  # fmt: skip
+
+
+def _geopose_content(message: pb.GeoPose) -> dict[str, Any]:
+    position = {"lat": message.latitude_deg, "lon": message.longitude_deg, "h": message.height_m}
+    return {"position": position, "quaternion": _xyzw(message.orientation)}
+
+
+def _street_content(message: pb.Street) -> dict[str, Any]:
+    section = pb.StreetSection.Name(message.section).removeprefix(_SECTION_PREFIX).lower()
+    return {
+        "id": message.id, "name": message.name, "street": message.street, "class_index": message.class_index,
+        "section": None if section == "unspecified" else section, "vote": message.vote,
+    }  # fmt: skip

@@ -1,0 +1,196 @@
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.bridge.bridge import Bridge, line_of
+from service.bridge.diagnostics import Level
+from service.bridge.gate import Gate
+from service.contract.schema import LocalizeAnswer
+from service.errors import RequestError, UnreachableError
+
+S, MS = 10**9, 10**6
+RGB, DEPTH = np.full((4, 6, 3), 7, np.uint8), np.full((4, 6), 2500, np.uint16)
+Make = Callable[..., Any]
+Answer = Callable[..., LocalizeAnswer]
+
+
+class Robot:
+    """A bridge, its clock, and pictures for it; each answer takes half a second."""
+
+    def __init__(self, image_of: Make, info_of: Make, answer_of: Answer) -> None:
+        self.now_s = 50.0
+        self.asked: list[Any] = []
+        self.answer: Any = answer_of()
+        self._image_of, self._info_of = image_of, info_of
+
+    def localize(self, *given: Any) -> LocalizeAnswer:
+        self.asked.append(given)
+        self.now_s += 0.5
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer  # type: ignore[no-any-return]
+
+    def bridge(self, **how: Any) -> Bridge:
+        return Bridge(localize=self.localize, clock=lambda: self.now_s, **how)
+
+    def see(self, bridge: Bridge, stamp_ns: int, *, encoding: str = "rgb8") -> None:
+        bridge.pairs.info(self._info_of(stamp_ns))
+        bridge.pairs.color(self._image_of(RGB, encoding, stamp_ns))
+        bridge.pairs.depth(self._image_of(DEPTH, "16UC1", stamp_ns + 3 * MS))
+
+
+@pytest.fixture
+def robot(image_of: Make, info_of: Make, answer_of: Answer) -> Robot:
+    return Robot(image_of, info_of, answer_of)
+
+
+def test_a_sure_answer_is_a_pose_with_the_pictures_stamp(robot: Robot) -> None:
+    bridge = robot.bridge(frame_id="world")
+    robot.see(bridge, 5 * S)
+    published = bridge.step()
+    assert published is not None
+    assert published.pose is not None
+    assert (published.pose.stamp_ns, published.pose.frame_id) == (5 * S, "world")
+    assert published.diagnosis.level == Level.OK
+    (rgb, depth_m, camera), *_ = robot.asked
+    np.testing.assert_array_equal(rgb, RGB)
+    np.testing.assert_allclose(depth_m, 2.5)
+    assert camera.fx == 3.0
+
+
+def test_diagnoses_carry_what_an_operator_looks_for(robot: Robot) -> None:
+    bridge = robot.bridge()
+    robot.see(bridge, 5 * S)
+    published = bridge.step()
+    assert published is not None
+    assert dict(published.diagnosis.values) == {
+        "status": "LOCALIZED", "confidence": "0.950", "street": "End", "map": "tiny@abc", "latency_ms": "500", "asked": "1",
+        "answered": "1", "published": "1", "failed": "0", "dropped": "0", "rate_hz": "0.00",
+    }  # fmt: skip
+
+
+def test_nothing_is_asked_without_a_pair(robot: Robot) -> None:
+    assert robot.bridge().step() is None
+    assert robot.asked == []
+
+
+def test_the_rate_is_kept_and_the_newest_pair_is_asked_about(robot: Robot) -> None:
+    bridge = robot.bridge(gate=Gate(rate_hz=1.0))
+    robot.see(bridge, 1 * S)
+    assert bridge.step() is not None
+    robot.see(bridge, 2 * S)
+    robot.see(bridge, 3 * S)
+    assert bridge.wait_s() == pytest.approx(0.5)
+    assert bridge.step() is None
+    robot.now_s += 0.5
+    published = bridge.step()
+    assert published is not None
+    assert published.diagnosis.stamp_ns == 3 * S
+    assert dict(published.diagnosis.values)["dropped"] == "2"
+    assert dict(published.diagnosis.values)["rate_hz"] == "1.00"
+
+
+def test_without_a_limit_every_pair_has_its_turn(robot: Robot) -> None:
+    bridge = robot.bridge(gate=Gate(rate_hz=0.0))
+    for second in (1, 2, 3):
+        robot.see(bridge, second * S)
+    stamps = []
+    while (published := bridge.step()) is not None:
+        stamps.append(published.diagnosis.stamp_ns // S)
+    assert stamps == [1, 2, 3]
+    assert bridge.quiet_s() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changed", "gate", "why"),
+    [
+        ({"confidence": 0.9}, Gate(min_confidence=0.9), ""),
+        ({"confidence": 0.899}, Gate(min_confidence=0.9), "confidence 0.899 is below 0.9"),
+        ({"status": "AMBIGUOUS"}, Gate(min_confidence=0.0), "AMBIGUOUS"),
+        ({"status": "OUT_OF_MAP"}, Gate(min_confidence=0.0), "OUT_OF_MAP"),
+        ({"confidence": None}, Gate(min_confidence=0.1), "no confidence: the map is not calibrated"),
+        ({"confidence": None}, Gate(min_confidence=0.0), ""),
+        ({"status": "AMBIGUOUS"}, Gate(min_confidence=0.9, publish_doubtful=True), ""),
+        (
+            {"status": "AMBIGUOUS", "confidence": 0.1},
+            Gate(min_confidence=0.9, publish_doubtful=True),
+            "confidence 0.100",
+        ),
+    ],
+)
+def test_only_what_passes_the_gate_goes_out_and_the_rest_is_told(
+    robot: Robot, answer_of: Answer, changed: dict[str, Any], gate: Gate, why: str
+) -> None:
+    robot.answer = answer_of(**changed)
+    bridge = robot.bridge(gate=gate)
+    gate._asked_s = None
+    robot.see(bridge, 1 * S)
+    published = bridge.step()
+    assert published is not None
+    assert (published.pose is None) == bool(why)
+    assert why in published.diagnosis.message
+    assert published.diagnosis.level == (Level.WARN if why else Level.OK)
+
+
+@pytest.mark.parametrize("error", [UnreachableError("nobody there"), RequestError("too dark")])
+def test_a_question_that_fails_is_told_and_the_next_is_asked(robot: Robot, answer_of: Answer, error: Exception) -> None:
+    bridge = robot.bridge(gate=Gate(rate_hz=0.0))
+    robot.answer = error
+    robot.see(bridge, 1 * S)
+    published = bridge.step()
+    assert published is not None
+    assert (published.pose, published.diagnosis.level, published.diagnosis.message) == (None, Level.ERROR, str(error))
+    assert dict(published.diagnosis.values)["failed"] == "1"
+    robot.answer = answer_of()
+    robot.see(bridge, 2 * S)
+    assert (bridge.step() or published).pose is not None
+
+
+def test_a_picture_that_is_none_is_told_with_its_topic(robot: Robot) -> None:
+    bridge = robot.bridge()
+    robot.see(bridge, 1 * S, encoding="bayer_rggb8")
+    published = bridge.step()
+    assert published is not None
+    assert published.diagnosis.message.startswith("/camera/color/image_raw: pictures come as 'bayer_rggb8'")
+    assert robot.asked == []
+
+
+def test_silence_names_the_topics_that_bring_nothing(robot: Robot, info_of: Make, image_of: Make) -> None:
+    bridge = robot.bridge()
+    bridge.pairs.info(info_of(0))
+    told = bridge.idle()
+    assert told.level == Level.WARN
+    assert "color (/camera/color/image_raw), depth (/camera/aligned_depth_to_color/image_raw); do" in told.message
+    bridge.pairs.color(image_of(RGB, "rgb8", 0))
+    bridge.pairs.depth(image_of(DEPTH, "16UC1", S))
+    assert "--tolerance" in bridge.idle().message
+
+
+def test_lines_for_people(robot: Robot, answer_of: Answer) -> None:
+    bridge = robot.bridge(gate=Gate(rate_hz=0.0))
+    lines = []
+    for answer in (
+        answer_of(),
+        answer_of(status="AMBIGUOUS", street=None, confidence=None),
+        UnreachableError("nobody"),
+    ):
+        robot.answer = answer
+        robot.see(bridge, (len(lines) + 1) * S)
+        published = bridge.step()
+        assert published is not None
+        lines.append(line_of(published))
+    assert lines == [
+        "1.000 LOCALIZED 0.950  x 10.00  y 20.00  heading 0.0  End",
+        "2.000 AMBIGUOUS  x 10.00  y 20.00  heading 0.0  (not published: AMBIGUOUS)",
+        "3.000 failed: nobody",
+    ]
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"rate_hz": -1.0}, {"rate_hz": float("nan")}, {"min_confidence": 1.1}, {"min_confidence": -0.1}]
+)
+def test_a_gate_that_is_none_is_refused_with_its_option(wrong: dict[str, float]) -> None:
+    with pytest.raises(RequestError, match=r"^--(rate|min-confidence): "):
+        Gate(**wrong)  # type: ignore[arg-type]  # numbers alone

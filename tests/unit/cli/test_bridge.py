@@ -1,0 +1,73 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.cli.main import main
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(("bridge", *arguments))
+    return int(end.value.code or 0)
+
+
+def test_the_help_names_every_topic(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ros2", "--help") == 0
+    out = capsys.readouterr().out
+    for option in (
+        "--url",
+        "--map",
+        "--color-topic",
+        "--depth-topic",
+        "--info-topic",
+        "--pose-topic",
+        "--mount",
+        "--rate",
+    ):
+        assert option in out
+
+
+def test_bridge_alone_lists_what_it_bridges(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 2
+    assert "ros2" in "".join(capsys.readouterr())
+
+
+def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in [
+        name for name in sys.modules if name.partition(".")[0] == "cyclonedds" or name == "service.bridge.ros2"
+    ]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "service.bridge.messages", None)
+    monkeypatch.delitem(sys.modules, "service.bridge.messages")
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    assert run("ros2") == 1
+    assert 'pip install "streetfix[ros2]"' in capsys.readouterr().err
+
+
+def test_rclpy_without_ros_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ros2", "--node", "rclpy") == 1
+    assert "source /opt/ros/DISTRIBUTION/setup.bash" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--rate", "-1"], "--rate: -1.0 is no rate"),
+        (["--min-confidence", "2"], "--min-confidence: 2.0 is no probability"),
+        (["--tolerance", "-1"], "tolerance: -1.0 is no time"),
+        (["--mount", "1,2"], "--mount: '1,2' is not X,Y,Z,QX,QY,QZ,QW"),
+        (["--url", "nowhere"], "url: 'nowhere' is no address"),
+        (["--map", "m", "--map-name", "n"], "--map has one map alone"),
+    ],
+)
+def test_bad_options_are_told_with_what_to_write(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    assert run("ros2", *arguments) == 1
+    assert words in capsys.readouterr().err
+
+
+def test_a_bundle_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("ros2", "--map", str(tmp_path / "none")) == 1
+    assert "none" in capsys.readouterr().err

@@ -1,0 +1,352 @@
+"""The sync and the async client do the same; what is sent and what comes back is in the transport's hands."""
+
+import asyncio
+import email
+import email.policy
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from service.client import AsyncClient, Client, Frame, Options, PinholeCamera, Prior, PriorPosition, PriorWgs84, rest
+from service.client.retry import RetryPolicy
+from service.errors import (
+    ForeignServiceError,
+    NoAnswerInTimeError,
+    RefusedError,
+    RequestError,
+    StreetfixError,
+    UnavailableError,
+    UnreachableError,
+)
+
+RGB, DEPTH = np.full((4, 6, 3), 7, np.uint8), np.full((4, 6), 2.5, np.float32)
+CAMERA = PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
+Handler = Callable[[httpx.Request], httpx.Response]
+Json = Callable[..., dict[str, Any]]
+
+
+class Asking:
+    """Calls a method of either client; what was waited for is in ``waited_s``."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self.waited_s: list[float] = []
+
+    def __call__(
+        self, handler: Handler, method: str, *args: Any, url: str = "http://x:1", given: Any = None, **how: Any
+    ) -> Any:
+        settings: dict[str, Any] = {"transport": httpx.MockTransport(handler), "draw": lambda: 0.0} | (given or {})
+        if self.kind == "sync":
+            with Client(url, sleep=self.waited_s.append, **settings) as client:
+                return getattr(client, method)(*args, **how)
+
+        async def sleep(seconds: float) -> None:
+            self.waited_s.append(seconds)
+
+        async def ask() -> Any:
+            async with AsyncClient(url, sleep=sleep, **settings) as client:
+                return await getattr(client, method)(*args, **how)
+
+        return asyncio.run(ask())
+
+
+@pytest.fixture(params=["sync", "async"])
+def ask(request: pytest.FixtureRequest) -> Asking:
+    return Asking(request.param)
+
+
+def parts_of(request: httpx.Request) -> dict[str, bytes]:
+    """Of a multipart body, by Python's own parser of mail."""
+    head = f"Content-Type: {request.headers['content-type']}\r\n\r\n".encode()
+    message = email.message_from_bytes(head + request.content, policy=email.policy.HTTP)
+    parts = [part for part in message.walk() if not part.is_multipart()]
+    return {str(part.get_param("name", header="content-disposition")): part.get_payload(decode=True) for part in parts}
+
+
+def problem(status: int, **changed: Any) -> httpx.Response:
+    content = {
+        "type": "/problems/x",
+        "title": "T.",
+        "status": status,
+        "detail": "D",
+        "code": "x",
+        "field": "camera.fx",
+        "request_id": "r1",
+    }
+    return httpx.Response(status, json=content | changed)
+
+
+def test_the_parts_are_what_the_contract_asks_for(ask: Asking, answer_json: Json) -> None:
+    seen: list[httpx.Request] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer_json())
+
+    T = np.eye(4)
+    T[:3, 3] = (1.0, 2.0, 3.0)
+    answer = ask(
+        handler, "localize", RGB, DEPTH, CAMERA, given={"api_key": "k"}, map="tiny", gravity=[0.0, 1.0, 0.0], T_vehicle_camera=T,
+        prior=Prior(position=PriorPosition(x=1.0, y=2.0), heading_deg=90.0), options=Options(neighbours=3),
+    )  # fmt: skip
+    parts = parts_of(seen[0])
+    document = json.loads(parts["request"])
+    assert (seen[0].method, seen[0].url.path, seen[0].headers["authorization"]) == ("POST", "/v1/localize", "Bearer k")
+    assert (parts["rgb"][:2], parts["depth"][:4]) == (b"\xff\xd8", b"SFD1")
+    assert document["map"] == "tiny"
+    assert document["gravity"] == {"x": 0, "y": 1, "z": 0}
+    assert document["depth"] == {"scale_m": 0.001, "kind": "z", "max_range_m": None, "baseline_m": None}
+    assert document["T_vehicle_camera"]["position"] == {"x": 1, "y": 2, "z": 3}
+    assert document["prior"] == {"position": {"x": 1, "y": 2}, "heading_deg": 90}
+    assert document["options"] == {"neighbours": 3}
+    assert (answer.status, answer.confidence, answer.pose.position.x) == ("LOCALIZED", 0.75, 1.0)
+
+
+def test_a_sequence_says_where_each_camera_stood(ask: Asking, answer_json: Json) -> None:
+    def handler(request: httpx.Request) -> httpx.Response:
+        parts = parts_of(request)
+        frames = json.loads(parts["request"])["frames"]
+        assert request.url.path == "/v1/localize/sequence"
+        assert sorted(parts) == ["depth0", "depth1", "request", "rgb0", "rgb1"]
+        assert frames[0]["T_reference_camera"] is None
+        assert frames[1]["T_reference_camera"]["position"]["z"] == 1.0
+        return httpx.Response(200, json=answer_json())
+
+    ahead = np.eye(4)
+    ahead[2, 3] = 1.0
+    frames = [Frame(rgb=RGB, depth=DEPTH, camera=CAMERA, T_reference_camera=T) for T in (None, ahead)]
+    assert ask(handler, "localize_sequence", frames).map.name == "tiny"
+
+
+def test_a_batch_has_answers_and_refusals_in_their_places(ask: Asking, answer_json: Json) -> None:
+    refusal = {
+        "title": "T.",
+        "status": 422,
+        "detail": "D",
+        "code": "no-depth",
+        "field": "requests.1.depth",
+        "request_id": "r",
+    }
+    outcomes = [{"answer": answer_json(), "problem": None}, {"answer": None, "problem": refusal}]
+    frames = [Frame(rgb=RGB, depth=DEPTH, camera=CAMERA)] * 2
+    first, second = ask(lambda _: httpx.Response(200, json={"outcomes": outcomes}), "localize_batch", frames, map="m")
+    assert first.status == "LOCALIZED"
+    assert isinstance(second, RefusedError)
+    assert (second.problem, second.field) == ("no-depth", "requests.1.depth")
+
+
+def test_maps_streets_and_coverage_are_read(ask: Asking) -> None:
+    entry = {
+        "name": "a/b", "version": "v", "made_at": "2026", "places": 1, "views": 2, "streets": 3, "spacing_m": 1.0,
+        "encoder_sha256": "e", "georeferenced": False, "licence": "L", "versions": ["v"],
+    }  # fmt: skip
+    collection = {"type": "FeatureCollection", "features": []}
+    answers = {"/v1/maps": {"maps": [entry]}, "/v1/maps/a%2Fb/streets": collection, "/v1/coverage": collection}
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        return httpx.Response(200, json=answers[request.url.raw_path.decode()])
+
+    assert [each.name for each in ask(handler, "maps")] == ["a/b"]
+    assert ask(handler, "streets", "a/b") == collection
+    assert ask(handler, "coverage") == collection
+
+
+def test_a_problem_is_told_with_all_that_it_says(ask: Asking) -> None:
+    with pytest.raises(RefusedError) as caught:
+        ask(lambda _: problem(422), "localize", RGB, DEPTH, CAMERA)
+    error = caught.value
+    assert (error.problem, error.field, error.detail, error.status, error.request_id) == (
+        "x",
+        "camera.fx",
+        "D",
+        "422",
+        "r1",
+    )
+    assert error.message == "the service refused: T.\n  D [field camera.fx]\n  request id r1"
+
+
+@pytest.mark.parametrize("status", [400, 401, 404, 413, 415, 422, 500, 504])
+def test_what_is_refused_for_good_is_asked_once(ask: Asking, status: int) -> None:
+    seen: list[httpx.Request] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return problem(status)
+
+    with pytest.raises(RefusedError):
+        ask(handler, "maps")
+    assert (len(seen), ask.waited_s) == (1, [])
+
+
+@pytest.mark.parametrize("status", [429, 503])
+def test_a_service_that_is_busy_is_asked_again_when_it_said(ask: Asking, answer_json: Json, status: int) -> None:
+    responses = [
+        httpx.Response(status, headers={"Retry-After": "3"}),
+        problem(status),
+        httpx.Response(200, json=answer_json()),
+    ]
+    assert ask(lambda _: responses.pop(0), "localize", RGB, DEPTH, CAMERA).confidence == 0.75
+    assert ask.waited_s == [3.0, 0.4]
+
+
+def test_a_service_that_stays_busy_is_told_with_its_last_advice(ask: Asking) -> None:
+    with pytest.raises(UnavailableError) as caught:
+        ask(
+            lambda _: httpx.Response(503, headers={"Retry-After": "1"}),
+            "maps",
+            given={"retry": RetryPolicy(attempts=2)},
+        )
+    assert (caught.value.retry_after_s, ask.waited_s) == (1.0, [1.0])
+
+
+def test_pictures_are_sent_again_whole(ask: Asking, answer_json: Json) -> None:
+    bodies: list[bytes] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        bodies.append(parts_of(request)["rgb"])
+        return problem(503) if len(bodies) == 1 else httpx.Response(200, json=answer_json())
+
+    ask(handler, "localize", RGB, DEPTH, CAMERA)
+    assert bodies[0] == bodies[1]
+
+
+@pytest.mark.parametrize(
+    ("status", "content"),
+    [
+        (200, {"text": "<html>"}),
+        (200, {"json": {}}),
+        (404, {"text": "<html>"}),
+        (302, {}),
+        (200, {"json": {"type": "Feature"}}),
+    ],
+)
+@pytest.mark.parametrize("method", ["maps", "coverage"])
+def test_something_else_at_the_address_is_told_so(
+    ask: Asking, method: str, status: int, content: dict[str, Any]
+) -> None:
+    with pytest.raises(ForeignServiceError, match="no Streetfix"):
+        ask(lambda _: httpx.Response(status, **content), method)
+
+
+def subclasses(root: type[Exception]) -> list[type[Exception]]:
+    found = root.__subclasses__()
+    return found + [deeper for each in found for deeper in subclasses(each)]
+
+
+OF_HTTPX = sorted(
+    {each for root in (httpx.HTTPError, httpx.StreamError) for each in subclasses(root) if each.__module__ == "httpx"}
+    | {httpx.InvalidURL, httpx.CookieConflict},
+    key=lambda each: each.__name__,
+)
+
+
+@pytest.mark.parametrize("kind", OF_HTTPX, ids=lambda kind: kind.__name__)
+def test_every_exception_of_httpx_is_one_of_ours(kind: type[Exception]) -> None:
+    error = kind.__new__(kind)
+    Exception.__init__(error, "why")
+    with pytest.raises(StreetfixError) as caught, rest.errors_of_httpx("http://x", 1.0):
+        raise error
+    assert caught.value.__cause__ is error
+    assert "http://x" in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("raised", "kind", "waits"),
+    [
+        (httpx.ConnectError("refused"), UnreachableError, 3), (httpx.ReadError("reset"), UnreachableError, 3),
+        (httpx.ConnectTimeout("slow"), UnreachableError, 3), (httpx.ReadTimeout("slow"), NoAnswerInTimeError, 0),
+        (httpx.PoolTimeout("slow"), NoAnswerInTimeError, 0), (httpx.LocalProtocolError("bad"), RequestError, 0),
+    ],
+    ids=lambda each: type(each).__name__,
+)  # fmt: skip
+def test_only_a_lost_connection_is_tried_again(
+    ask: Asking, raised: Exception, kind: type[Exception], waits: int
+) -> None:
+    def handler(_: httpx.Request) -> httpx.Response:
+        raise raised
+
+    with pytest.raises(kind):
+        ask(handler, "maps")
+    assert len(ask.waited_s) == waits
+
+
+@pytest.mark.parametrize("url", ["", "localhost:8000", "http://[", "ftp://x", "http://"])
+def test_an_address_that_is_none_is_refused(url: str) -> None:
+    with pytest.raises(RequestError, match="give http://HOST:PORT"):
+        Client(url)
+
+
+@pytest.mark.parametrize("timeout_s", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_time_that_is_none_is_refused(timeout_s: float) -> None:
+    with pytest.raises(RequestError, match="timeout_s"):
+        AsyncClient("http://x", timeout_s=timeout_s)
+
+
+@pytest.mark.parametrize(
+    ("header", "seconds"),
+    [
+        (None, None), ("2", 2.0), (" 5 ", 5.0), ("Sun, 22 Nov 2026 00:00:30 GMT", 30.0), ("Sat, 21 Nov 2026 00:00:00 GMT", 0.0),
+        ("Sun, 22 Nov 2026 00:00:30 -0000", 30.0), ("soon", None), ("-1", None), ("1.5", None),
+    ],
+)  # fmt: skip
+def test_retry_after_is_a_number_or_a_date(header: str | None, seconds: float | None) -> None:
+    assert rest.retry_after_s(header, now=datetime(2026, 11, 22, tzinfo=UTC)) == seconds
+
+
+@pytest.mark.parametrize(
+    ("about", "field"),
+    [
+        ({"gravity": [0.0, 1.0]}, "gravity"),
+        ({"T_vehicle_camera": np.eye(3)}, "T_vehicle_camera"),
+        ({"T_vehicle_camera": 2 * np.eye(4)}, "T_vehicle_camera"),
+        ({"T_vehicle_camera": np.diag([1.0, 2.0, 1.0, 1.0])}, "T_vehicle_camera"),
+        ({"depth_kind": "up"}, "depth.kind"),
+        ({"depth_scale_m": -1.0}, "depth_scale_m"),
+        ({"map": "m" * 65}, "map"),
+        (
+            {"prior": Prior(position=PriorPosition(x=0, y=0), wgs84=PriorWgs84(latitude_deg=0, longitude_deg=0))},
+            "prior",
+        ),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_sent(ask: Asking, about: dict[str, Any], field: str) -> None:
+    with pytest.raises(RequestError) as caught:
+        ask(lambda _: pytest.fail("sent"), "localize", RGB, DEPTH, CAMERA, **about)
+    assert caught.value.field == field
+
+
+def test_an_unknown_argument_is_a_type_error(ask: Asking) -> None:
+    with pytest.raises(TypeError, match="unknown argument 'heading'"):
+        ask(lambda _: pytest.fail("sent"), "localize", RGB, DEPTH, CAMERA, heading=3)
+
+
+def test_a_bad_frame_is_named_by_its_number(ask: Asking) -> None:
+    frames = [Frame(rgb=RGB, depth=DEPTH, camera=CAMERA), Frame(rgb=DEPTH, depth=DEPTH, camera=CAMERA)]  # type: ignore[arg-type]  # on purpose
+    for method in ("localize_sequence", "localize_batch"):
+        with pytest.raises(RequestError, match=r"^frames\.1\.rgb: ") as caught:
+            ask(lambda _: pytest.fail("sent"), method, frames)
+        assert caught.value.field == "frames.1.rgb"
+
+
+def test_pairs_of_a_batch_stand_alone(ask: Asking) -> None:
+    frames = [Frame(rgb=RGB, depth=DEPTH, camera=CAMERA, T_reference_camera=np.eye(4))]
+    with pytest.raises(RequestError, match="ask localize_sequence"):
+        ask(lambda _: pytest.fail("sent"), "localize_batch", frames)
+
+
+def test_nothing_to_ask_is_refused(ask: Asking) -> None:
+    for method in ("localize_sequence", "localize_batch"):
+        with pytest.raises(RequestError, match="at least 1 item"):
+            ask(lambda _: pytest.fail("sent"), method, [])
+
+
+def test_all_that_is_exported_is_there() -> None:
+    import service.client as package
+
+    assert package.__all__ == sorted(package.__all__)
+    assert all(hasattr(package, name) for name in package.__all__)
