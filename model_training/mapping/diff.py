@@ -111,12 +111,8 @@ def _parameters(a: MapBundle, b: MapBundle) -> dict[str, list[Any]]:
     def told(bundle: MapBundle) -> dict[str, Any]:
         manifest: dict[str, Any] = bundle.manifest.model_dump(mode="json")
         grid = {f"grid.{name}": value for name, value in manifest["grid"].items()}
-        return (
-            manifest["parameters"]
-            | grid
-            | {name: manifest[name] for name in _SAME}
-            | {"rows_seen": sum(manifest["rows_seen"])}
-        )
+        same = {name: manifest[name] for name in _SAME}
+        return {**manifest["parameters"], **grid, **same, "rows_seen": sum(manifest["rows_seen"])}
 
     old, new = told(a), told(b)
     return {
