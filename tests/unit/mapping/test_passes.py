@@ -183,7 +183,9 @@ def targets_at(position, normal):
     ],
 )
 def test_one_ray_by_hand(end_m, normal, through):
-    found = looked_through(targets_at([10.0, 0.0, 0.0], normal), np.array([0]), np.array([[end_m, 0.0, 0.0]]), np.eye(4))
+    found = looked_through(
+        targets_at([10.0, 0.0, 0.0], normal), np.array([0]), np.array([[end_m, 0.0, 0.0]]), np.eye(4)
+    )
     assert found.tolist() == ([0] if through else [])
 
 

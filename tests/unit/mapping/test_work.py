@@ -183,13 +183,18 @@ def test_the_lock_of_a_killed_process_is_taken_over(holder, tmp_path):
     assert not work_folder(tmp_path / "m").exists()
 
 
+def killed_with_part(out, key, make):
+    with work_beside(out, key) as mine:
+        mine.part("one", make)
+        raise KilledError
+
+
 def test_parts_of_another_key_are_removed(tmp_path):
-    with pytest.raises(KilledError), work_beside(tmp_path / "m", "a" * 24) as first:
-        first.part("one", lambda: {"x": np.arange(3)})
-        raise KilledError
-    with pytest.raises(KilledError), work_beside(tmp_path / "m", "b" * 24) as second:
-        assert second.part("one", lambda: {"x": np.arange(5)})["x"].shape == (5,)
-        raise KilledError
+    made = []
+    for key in "aab":
+        with pytest.raises(KilledError):
+            killed_with_part(tmp_path / "m", key * 24, lambda key=key: made.append(key) or {"x": np.arange(3)})
+    assert made == ["a", "b"]
     assert sorted(p.name for p in work_folder(tmp_path / "m").iterdir()) == ["lock", f"one-{'b' * 24}.npz"]
 
 

@@ -1,0 +1,1 @@
+"""Figures on recordings and of what is done with real maps."""
