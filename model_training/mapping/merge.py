@@ -23,7 +23,7 @@ def merge_maps(
     """Merge two bundles.
 
     All places of the first stay; of the second, those no closer to them than the spacing. Sums of voxels add up, so the cloud is that
-    of a map built of both surveys at once (bundles of before 0.2 keep no sums: ``stored_map.voxels_of`` says what is
+    of a map built of both surveys at once (of bundles that keep no sums ``stored_map.voxels_of`` says what is
     approximated). That both lie in the same frame is the caller's word; only their georeferences can be compared.
 
     Args:

@@ -191,6 +191,8 @@ def looked_through(
         points: of the scan (n, 3), LiDAR frame.
         T_map_lidar: where it was taken.
     """
+    if not len(points):  # a scan without a single return looks through nothing
+        return candidates[:0]
     ranges = np.linalg.norm(points, axis=1)
     cells, on_grid = _cells(points, ranges)
     order = np.flatnonzero(on_grid)

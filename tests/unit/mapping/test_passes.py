@@ -200,3 +200,8 @@ def test_where_no_ray_goes_there_is_no_vote():
     targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
     points = np.array([[0.0, 20.0, 0.0]])
     assert looked_through(targets, np.array([0]), points, np.eye(4)).tolist() == []
+
+
+def test_an_empty_scan_looks_through_nothing():
+    targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
+    assert looked_through(targets, np.array([0]), np.zeros((0, 3)), np.eye(4)).tolist() == []
