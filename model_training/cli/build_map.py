@@ -26,13 +26,16 @@ def command(
     voxel: Annotated[float, typer.Option(help="edge of the cloud's voxels, metres", min=0.01)] = 0.3,
     lidar_height: Annotated[float, typer.Option(help="of the LiDAR above the ground, roughly, metres", min=0.1)] = 1.8,
     remove_weather: Annotated[bool, typer.Option(help="drop lone points such as rain and snow by local PCA")] = False,
+    passes_vote: Annotated[
+        bool, typer.Option(help="drop what more passes of the survey look through than hit: vehicles that were moved")
+    ] = False,
     licence: Annotated[str, typer.Option(help="licence text kept in the manifest")] = "",
     calibration: Annotated[
         Path, typer.Option(help="of `streetfix calibrate` for the same encoder [default: the stock encoder's]")
     ] = CALIBRATION,
     overwrite: Annotated[bool, typer.Option(help="replace a bundle that is there")] = False,
 ) -> None:
-    """Build a map bundle of a dataset's survey.
+    """Build a map bundle of a dataset's survey. Killed at any moment, the same command goes on where it was.
 
     \b
     Example:
@@ -41,7 +44,7 @@ def command(
     opened = Dataset(dataset)
     settings = BuildSettings(
         name=name or opened.name, spacing_m=spacing, headings=headings, voxel_m=voxel, expected_lidar_height_m=lidar_height,
-        remove_weather=remove_weather, licence=licence, calibration=calibration,
+        remove_weather=remove_weather, passes_vote=passes_vote, licence=licence, calibration=calibration,
     )  # fmt: skip
     with bars() as report:
         manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)

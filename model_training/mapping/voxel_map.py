@@ -15,17 +15,23 @@ from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M
 
 _SPAN = 1 << 20  # cells along an axis: a key is 3 x 20 bits
-_MOMENTS = 10  # count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's corner
+_MOMENTS = 10  # count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre
+_WAITING = 1 << 20  # rows of sums that wait to be merged, at least
+
+#: What a bundle keeps of a voxel, so that maps can be merged: its cell (voxels of all maps of one edge lie on one lattice through
+#: the map frame's zero), how many points it has, and their sums and sums of products about its centre (m, m2).
+VOXEL = np.dtype([("cell", "<i4", (3,)), ("points", "<u4"), ("sums", "<f4", (9,))])
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Surface elements: ``positions`` and unit ``normals`` (n, 3), ``thickness_m`` and ``points`` in the voxel (n)."""
+    """Surface elements: ``positions`` and unit ``normals`` (n, 3), ``thickness_m`` and ``points`` in the voxel, its ``keys`` (n)."""
 
     positions: NDArray[np.float64]
     normals: NDArray[np.float32]
     thickness_m: NDArray[np.float32]
     points: NDArray[np.uint32]
+    keys: NDArray[np.int64]
 
 
 class VoxelMap:
@@ -33,7 +39,8 @@ class VoxelMap:
 
     Args:
         voxel_m: edge of a voxel.
-        origin: a point near the map's middle, metres; coordinates stay small around it.
+        origin: a point near the map's middle, metres; coordinates stay small around it. ``lattice_origin`` gives one at which the
+            voxels are those of other maps.
     """
 
     def __init__(self, voxel_m: float, origin: NDArray[np.float64]) -> None:
@@ -44,14 +51,71 @@ class VoxelMap:
 
     def add(self, points_map: NDArray[np.float64]) -> None:
         """Add points (n, 3), metres, map frame."""
-        cell = np.floor((points_map - self.origin) / self.voxel_m).astype(np.int64)
+        cell = self._cells(points_map)
         local = (points_map - self.origin) - (cell + 0.5) * self.voxel_m
-        key = ((cell[:, 0] + _SPAN // 2) * _SPAN + cell[:, 1] + _SPAN // 2) * _SPAN + cell[:, 2] + _SPAN // 2
-        self._waiting.append(_summed(key, _moments_of(local)))
-        if len(self._waiting) >= 64:
+        self.add_sums(*_summed(_keys_of_cells(cell), _moments_of(local)))
+
+    def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.float64]) -> None:
+        """Add what ``sums`` of a map of the same voxels and the same origin gave."""
+        self._waiting.append((keys, moments))
+        # By the amount of what waits, so that a map of any size is copied seldom, and whoever adds the same gets the same.
+        if sum(len(k) for k, _ in self._waiting) >= max(_WAITING, len(self._keys) // 4):
             self._merge()
 
+    def sums(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Keys of all voxels, sorted, and their moments."""
+        self._merge()
+        return self._keys, self._moments
+
+    def keys_of(self, points_map: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Key of the voxel that each point (n, 3), metres, map frame, lies in."""
+        return _keys_of_cells(self._cells(points_map))
+
+    def keep(self, wanted: NDArray[np.bool_]) -> None:
+        """Forget the other voxels; one flag for each, in the order of ``sums``."""
+        self._merge()
+        self._keys, self._moments = self._keys[wanted], self._moments[wanted]
+
+    def means(self) -> NDArray[np.float64]:
+        """Mean of each voxel's points (n, 3), metres, map frame, in the order of ``sums``."""
+        keys, moments = self.sums()
+        return self.origin + (_cells_of_keys(keys) + 0.5) * self.voxel_m + moments[:, 1:4] / moments[:, :1]
+
+    def statistics(self) -> NDArray[Any]:
+        """All voxels as a bundle keeps them (``VOXEL``); the origin must be of the lattice."""
+        keys, moments = self.sums()
+        found = np.zeros(len(keys), VOXEL)
+        found["cell"] = _cells_of_keys(keys) + self._lattice()
+        found["points"], found["sums"] = moments[:, 0], moments[:, 1:]
+        return found
+
+    def add_statistics(self, statistics: NDArray[Any]) -> None:
+        """Add what ``statistics`` of a map of the same voxels gave; single precision loses less than a micrometre of a mean."""
+        keys = _keys_of_cells(statistics["cell"].astype(np.int64) - self._lattice())
+        self.add_sums(
+            *_summed(keys, np.c_[statistics["points"].astype(np.float64), statistics["sums"].astype(np.float64)])
+        )
+
+    def add_moments(self, means: NDArray[np.float64], points: NDArray[Any], covariances: NDArray[np.float64]) -> None:
+        """Add groups of points of which only the mean (n, 3; m, map frame), number (n) and covariance (n, 3, 3; m2) are known.
+
+        A group goes into the voxel that its mean lies in.
+        """
+        cell = self._cells(means)
+        moments = _moments_of((means - self.origin) - (cell + 0.5) * self.voxel_m)
+        moments[:, 4:] += covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        self.add_sums(*_summed(_keys_of_cells(cell), moments * points.astype(np.float64)[:, None]))
+
+    def _cells(self, points_map: NDArray[np.float64]) -> NDArray[np.int64]:
+        return np.floor((points_map - self.origin) / self.voxel_m).astype(np.int64)
+
+    def _lattice(self) -> NDArray[np.int64]:
+        """Cell of the lattice that the origin is the corner of."""
+        return np.rint(self.origin / self.voxel_m).astype(np.int64)
+
     def _merge(self) -> None:
+        if not self._waiting:
+            return
         keys = np.concatenate([self._keys, *(k for k, _ in self._waiting)])
         moments = np.concatenate([self._moments, *(m for _, m in self._waiting)])
         self._keys, self._moments = _summed(keys, moments)
@@ -70,12 +134,11 @@ class VoxelMap:
             total[found] += _shifted(own[at[found]], np.array([dx, dy, dz]) * self.voxel_m)
         keep = total[:, 0] >= fewest
         keys, own, total = keys[keep], own[keep], total[keep]
-        cell = np.stack([keys // (_SPAN * _SPAN), keys // _SPAN % _SPAN, keys % _SPAN], axis=1) - _SPAN // 2
-        centre = self.origin + (cell + 0.5) * self.voxel_m
+        centre = self.origin + (_cells_of_keys(keys) + 0.5) * self.voxel_m
         variances, axes = np.linalg.eigh(_covariances(total))
         normals = axes[:, :, 0].astype(np.float32)
         thickness = np.sqrt(np.maximum(variances[:, 0], 0)).astype(np.float32)
-        return Surfels(centre + own[:, 1:4] / own[:, :1], normals, thickness, own[:, 0].astype(np.uint32))
+        return Surfels(centre + own[:, 1:4] / own[:, :1], normals, thickness, own[:, 0].astype(np.uint32), keys)
 
     def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Surfels relative to ``origin``, sorted by tile, and tiles (n, 4): centre x, y (m, same frame), first surfel, count.
@@ -91,6 +154,20 @@ class VoxelMap:
         surfels["normal"], surfels["thickness_m"] = found.normals[order], found.thickness_m[order]
         surfels["points"] = found.points[order]
         return surfels, np.c_[(corners + 0.5) * TILE_M, first, count]
+
+
+def lattice_origin(voxel_m: float, near: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The corner of the common lattice of voxels that is nearest to a point (3,), metres, map frame."""
+    return np.asarray(np.round(near / voxel_m) * voxel_m)
+
+
+def _keys_of_cells(cell: NDArray[np.int64]) -> NDArray[np.int64]:
+    shifted = cell + _SPAN // 2
+    return np.asarray((shifted[:, 0] * _SPAN + shifted[:, 1]) * _SPAN + shifted[:, 2])
+
+
+def _cells_of_keys(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.stack([keys // (_SPAN * _SPAN), keys // _SPAN % _SPAN, keys % _SPAN], axis=1) - _SPAN // 2
 
 
 def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:

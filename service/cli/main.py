@@ -22,6 +22,7 @@ _KNOWN = {
     "convert": ("Write a dataset as a ROS bag or in KITTI's layout.", "mapping"),
     "streets": ("Name streets: from GeoJSON, OpenDRIVE or OpenStreetMap into a dataset.", "mapping"),
     "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
+    "map": ("Look after map bundles: info, verify, diff, merge, update.", "mapping"),
     "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
     "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
     "loadtest": ("Load a running service with a dataset's queries.", "mapping"),
@@ -89,8 +90,14 @@ def app_for(arguments: Sequence[str]) -> typer.Typer:
     app.add_typer(bridge.app, name="bridge")
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         summary, extra = _KNOWN.get(point.name, (f"From the package {point.dist.name if point.dist else '?'}.", None))
-        function = _load(point, extra) if point.name == called else _not_called
-        app.command(point.name, help=None if point.name == called else summary)(function)
+        if point.name != called:
+            app.command(point.name, help=summary)(_not_called)
+            continue
+        loaded = _load(point, extra)
+        if isinstance(loaded, typer.Typer):
+            app.add_typer(loaded, name=point.name)
+        else:
+            app.command(point.name)(loaded)
     return app
 
 
@@ -115,13 +122,24 @@ def _not_called() -> None:
     """Stand in the list of commands for one that is not imported."""
 
 
-def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any]:
-    """The command's function, with a missing package told as a missing extra, whether now or when it runs."""
+def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any] | typer.Typer:
+    """The command's function, or its application where it has commands of its own.
+
+    A missing package is told as a missing extra, whether now or when it runs.
+    """
     try:
-        function: Callable[..., Any] = point.load()
+        loaded: Callable[..., Any] | typer.Typer = point.load()
     except ModuleNotFoundError as error:
         raise _extra_missing(point.name, extra, error) from error
+    if isinstance(loaded, typer.Typer):
+        for info in loaded.registered_commands:
+            if info.callback is not None:
+                info.callback = _telling_extras(point, extra, info.callback)
+        return loaded
+    return _telling_extras(point, extra, loaded)
 
+
+def _telling_extras(point: EntryPoint, extra: str | None, function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def run(*args: object, **kwargs: object) -> object:
         try:

@@ -15,6 +15,8 @@ PLACES_FILE, VIEWS_FILE = "places.npy", "views.npy"
 ENCODER_FILE = "encoder.onnx"
 CALIBRATION_FILE, PREVIEW_FILE = "calibration.json", "preview.webp"
 CLOUD_FOLDER = "cloud"
+#: What maps are merged by; a service only checks its hash.
+STATISTICS_FILE = "voxels.npy"
 
 UNCALIBRATED = {"calibrated": False, "why": "nobody calibrated it; answers carry confidence null"}
 
@@ -41,6 +43,7 @@ class BundleContent:
         encoder: the ONNX file that made them.
         streets: GeoJSON, or None where the map knows no streets.
         cloud: the prepared cloud, or None where there is nothing to register on.
+        statistics: sums of the points of every voxel of the cloud, for whoever adds to the map; None keeps none.
         calibration: confidence calibration; by default there is none.
         preview_webp: the map from above; may be empty.
         parameters: further numbers the map was built with; ``lidar_height_m`` must be there.
@@ -60,6 +63,7 @@ class BundleContent:
     parameters: Mapping[str, float]
     streets: Mapping[str, Any] | None = None
     cloud: SurfelMap | None = None
+    statistics: NDArray[Any] | None = None
     calibration: Mapping[str, Any] = field(default_factory=lambda: dict(UNCALIBRATED))
     preview_webp: bytes = b""
     georeference: Mapping[str, Any] | None = None

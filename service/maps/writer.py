@@ -74,6 +74,8 @@ def _write_files(folder: Path, content: BundleContent) -> Manifest:
         writers[parts.PREVIEW_FILE] = lambda path: path.write_bytes(content.preview_webp)
     if content.streets is not None:
         writers[streets.FILE] = lambda path: path.write_bytes(_json(content.streets))
+    if content.statistics is not None:
+        writers[parts.STATISTICS_FILE] = _array_writer(content.statistics)
     for name, array in ({} if content.cloud is None else content.cloud.arrays()).items():
         writers[f"{parts.CLOUD_FOLDER}/{name}.npy"] = _array_writer(array)
     for name, write in writers.items():

@@ -90,6 +90,41 @@ def test_a_mounted_commands_own_help_is_shown(mount: Callable[..., None], capsys
     assert "Raise a city from its seed." in capsys.readouterr().out
 
 
+@pytest.fixture
+def care(mount: Callable[..., None]) -> None:
+    """A command with commands of its own."""
+    app = typer.Typer(no_args_is_help=True, help="Look after maps.")
+
+    @app.command()
+    def info(bundle: Path) -> None:
+        """Tell what is in it."""
+        typer.echo(bundle.name)
+
+    @app.command()
+    def merge() -> None:
+        """Need what is not there."""
+        import a_package_that_is_not_there  # noqa: F401  # type: ignore[import-not-found]  # that is the point
+
+    mount(map=app)
+
+
+@pytest.mark.usefixtures("care")
+def test_a_mounted_command_may_have_commands_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("map", "info", "maps/town") == 0
+    assert capsys.readouterr().out == "town\n"
+    assert run("map", "info") == 2
+    assert run("map", "--help") == 0
+    assert "Tell what is in it." in capsys.readouterr().out
+    assert run("--help") == 0
+    assert "\n  map " in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("care")
+def test_a_missing_package_of_a_commands_command_names_the_extra(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("map", "merge") == 1
+    assert 'pip install "streetfix[mapping]"' in capsys.readouterr().err
+
+
 def test_only_the_called_command_is_imported(mount: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
     # The function ``train`` is not there: loading it would fail.
     mount(simulate=lambda: None, train=None)

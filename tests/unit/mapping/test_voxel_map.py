@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from model_training.mapping.voxel_map import TILE_M, VoxelMap
+from model_training.mapping.voxel_map import TILE_M, VOXEL, VoxelMap, lattice_origin
 
 
 def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
@@ -95,3 +95,46 @@ def test_coordinates_far_from_zero_lose_nothing():
     near_found = map_of(cloud, origin=(0, 0, 0)).surfels()
     far_found = map_of(cloud + far, origin=far).surfels()
     np.testing.assert_allclose(far_found.positions - far, near_found.positions, atol=1e-6)
+
+
+def test_the_lattice_goes_through_the_frames_zero():
+    np.testing.assert_allclose(lattice_origin(0.3, np.array([1.0, -0.2, 100.0])), [0.9, -0.3, 99.9])
+
+
+def test_sums_of_two_maps_with_other_origins_are_those_of_one(cloud):
+    """By single precision."""
+    near = [lattice_origin(0.5, np.array(point)) for point in ((98.0, -50.0, 1.0), (140.3, -20.0, 5.0))]
+    one, other, whole = (
+        map_of(c, origin=o) for c, o in ((cloud[:500], near[0]), (cloud[500:], near[1]), (cloud, near[0]))
+    )
+    one.add_statistics(other.statistics())
+    found, expected = one.surfels(), whole.surfels()
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_allclose(found.positions, expected.positions, atol=1e-6)
+    np.testing.assert_allclose(found.thickness_m, expected.thickness_m, atol=1e-4)
+
+
+def test_statistics_by_hand():
+    """Two points in the voxel from (1, -0.5, 0) on, 0.5 m wide: its centre lies at (1.25, -0.25, 0.25)."""
+    found = map_of([[1.25, -0.25, 0.25], [1.35, -0.25, 0.05]], origin=(0.0, 0.0, 0.0)).statistics()
+    assert found.dtype == VOXEL
+    assert found["cell"].tolist() == [[2, -1, 0]]
+    assert found["points"].tolist() == [2]
+    np.testing.assert_allclose(found["sums"], [[0.1, 0, -0.2, 0.01, 0, -0.02, 0, 0, 0.04]], atol=1e-7)
+
+
+def test_moments_of_a_group_are_those_of_its_points():
+    rng = np.random.default_rng(5)
+    points = rng.uniform([0.05, 0.05, 0.05], [0.45, 0.45, 0.45], (200, 3))
+    whole, group = map_of(points, origin=(0, 0, 0)), map_of(origin=(0, 0, 0))
+    group.add_moments(points.mean(axis=0)[None], np.array([200]), np.cov(points, rowvar=False, bias=True)[None])
+    for one, other in zip(group.sums(), whole.sums(), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_forgotten_voxels_are_gone(cloud):
+    voxels = map_of(cloud)
+    means = voxels.means()
+    voxels.keep(means[:, 0] < 101.0)
+    np.testing.assert_array_equal(voxels.means(), means[means[:, 0] < 101.0])
+    np.testing.assert_array_equal(voxels.keys_of(voxels.means()), voxels.sums()[0])

@@ -1,0 +1,170 @@
+"""``streetfix map``: look after bundles."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from model_training.cli.progress import bars
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.build import describe
+from model_training.mapping.diff import diff_of, difference_png
+from model_training.mapping.info import info_of
+from model_training.mapping.merge import merge_maps
+from model_training.mapping.update import update_map
+from model_training.mapping.verify import damage_of
+from service.errors import BundleError
+from service.maps.reader import MapBundle
+
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Look after map bundles: info, verify, diff, merge, update."
+)
+
+_Bundle = Annotated[Path, typer.Argument(help="folder of a bundle")]
+_Json = Annotated[bool, typer.Option("--json", help="print JSON")]
+_Out = Annotated[Path, typer.Option(help="folder of the new bundle")]
+_Overwrite = Annotated[bool, typer.Option(help="replace a bundle that is there")]
+
+
+@app.command()
+def info(bundle: _Bundle, as_json: _Json = False) -> None:
+    """Tell what a bundle holds.
+
+    \b
+    Example:
+      streetfix map info maps/paper-city
+    """
+    found = info_of(bundle)
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+        return
+    for line in _info_lines(found):
+        typer.echo(line)
+
+
+@app.command()
+def verify(bundle: _Bundle) -> None:
+    """Check a bundle: hashes, sizes, format, index against places, streets. Leaves with 1 and a line for each defect.
+
+    \b
+    Example:
+      streetfix map verify maps/paper-city
+    """
+    with bars() as report:
+        damaged = damage_of(bundle, report=report)
+    for line in damaged:
+        typer.echo(line)
+    if damaged:
+        raise typer.Exit(1)
+    typer.echo(f"{bundle}: whole")
+
+
+@app.command()
+def diff(
+    before: _Bundle, after: _Bundle, as_json: _Json = False,
+    picture: Annotated[Path | None, typer.Option(help="write a PNG of both clouds from above")] = None,
+) -> None:  # fmt: skip
+    """Tell what changed from one bundle to another: places, cloud by area, streets, parameters, encoder.
+
+    \b
+    Example:
+      streetfix map diff maps/town maps/town-may --picture changes.png
+    """
+    a, b = MapBundle.open(before), MapBundle.open(after)
+    found = diff_of(a, b)
+    if picture is not None:
+        try:
+            picture.write_bytes(difference_png(a, b))
+        except OSError as error:
+            raise BundleError(
+                f"{picture} cannot be written ({error.strerror}); choose another file", field="picture"
+            ) from error
+    if as_json:
+        typer.echo(json.dumps(found, indent=1))
+        return
+    for line in _diff_lines(found):
+        typer.echo(line)
+
+
+@app.command()
+def merge(
+    first: _Bundle, second: _Bundle, out: _Out,
+    name: Annotated[str | None, typer.Option(help="how requests address the map [default: that of the first]")] = None,
+    overwrite: _Overwrite = False,
+) -> None:  # fmt: skip
+    """Make one bundle of two in the same frame, of the same encoder and parameters.
+
+    \b
+    Example:
+      streetfix map merge maps/north maps/south --out maps/town
+    """
+    with bars() as report:
+        made = merge_maps(first, second, out, name=name, overwrite=overwrite, report=report)
+    Console().print(f"{describe(made)}: {out}")
+
+
+@app.command()
+def update(
+    bundle: _Bundle, dataset: Annotated[Path, typer.Argument(help="dataset folder with a survey in the map's frame")], out: _Out,
+    replace: Annotated[bool, typer.Option("--replace", help="replace what the new drive covered: a rebuilt block")] = False,
+    replace_area: Annotated[
+        Path | None, typer.Option(help="GeoJSON of a polygon in map metres: replace what lies in it")
+    ] = None,
+    passes_vote: Annotated[
+        bool, typer.Option(help="drop what more passes of the new drive look through than hit")
+    ] = False,
+    overwrite: _Overwrite = False,
+) -> None:  # fmt: skip
+    """Add a survey drive to a map, with the map's own encoder and settings; or replace what was rebuilt.
+
+    \b
+    Example:
+      streetfix map update maps/town data/may --replace-area block.geojson --out maps/town-may
+    """
+    if replace and replace_area is not None:
+        raise typer.BadParameter("give --replace or --replace-area, not both")
+    with bars() as report:
+        made = update_map(
+            bundle, Dataset(dataset), out, replace_covered=replace, replace_area=replace_area, passes_vote=passes_vote,
+            overwrite=overwrite, report=report,
+        )  # fmt: skip
+    Console().print(f"{describe(made)}: {out}")
+
+
+def _info_lines(found: dict[str, Any]) -> list[str]:
+    counts, low, high = found["counts"], found["extent_m"]["min"], found["extent_m"]["max"]
+    place = found["georeference"]
+    site = found["site"]
+    checked = "" if site is None else f", {site['right']} of {site['queries']} right in the site check"
+    return [
+        f"map {found['name']}, version {found['version']}, made {found['made_at']}, {found['size_bytes'] / 1e6:.1f} MB",
+        f"places:      {counts['places']}, {found['spacing_m']:g} m apart, x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m",
+        f"views:       {counts['views']}, {found['headings']} a place, descriptors of {counts['descriptor_size']}",
+        f"cloud:       {counts['cloud_points']} points" + (", sums kept" if found["keeps_sums"] else ", no sums kept"),
+        f"streets:     {len(found['streets'])}, {counts['streets']} classes, {found['places_in_no_street']} places in none",
+        f"encoder:     {found['encoder']['sha256'][:16]}",
+        f"confidence:  {'calibrated' if found['calibrated'] else 'not calibrated'}{checked}",
+        "on earth:    "
+        + ("unknown" if place is None else f"{place['latitude_deg']:.6f}, {place['longitude_deg']:.6f}"),
+        "parameters:  " + ", ".join(f"{name} {value:g}" for name, value in sorted(found["parameters"].items())),
+        f"licence:     {found['licence'] or '-'}",
+    ]
+
+
+def _diff_lines(found: dict[str, Any]) -> list[str]:
+    places, cloud, streets = found["places"], found["cloud"], found["streets"]
+    lines = [
+        f"version:     {found['versions'][0]} -> {found['versions'][1]}",
+        f"places:      {len(places['added'])} added, {len(places['removed'])} removed, {places['kept']} kept",
+        f"             of which {places['moved']} moved, by up to {places['largest_move_m']:g} m",
+        f"cloud:       {cloud['appeared']} points appeared, {cloud['vanished']} vanished, {cloud['kept']} kept",
+    ]
+    lines += [
+        f"             around ({area['x']:g}, {area['y']:g}): {area['appeared']} appeared, {area['vanished']} vanished"
+        for area in cloud["areas"][:10]
+    ]
+    lines += [f"streets:     {what}: {', '.join(names)}" for what, names in streets.items() if names]
+    lines += [f"parameters:  {name}: {old} -> {new}" for name, (old, new) in found["parameters"].items()]
+    return lines + ["encoder:     " + ("another" if found["encoder_changed"] else "the same")]

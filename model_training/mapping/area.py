@@ -1,0 +1,84 @@
+"""Which part of a map a new drive replaces: what it covered, or a polygon."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from service.errors import DatasetError
+
+#: Whether each of some positions (n, 2), metres, map frame, lies inside.
+Area = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
+
+CELL_M = 2.0
+COVERED_M = 25.0  # further away from the drive's places the points are too few to stand for what was there
+_OWN_M = 4.0  # around a place, where the vehicle hides the ground
+
+
+def covered_by(points: NDArray[np.float64], places: NDArray[np.float64]) -> Area:
+    """Where a drive measured anything: cells of the ground plan, gaps of a cell or two filled.
+
+    What stood where now nothing is measured, behind a new wall or inside a block, is not covered and stays in the map.
+
+    Args:
+        points: means of the drive's voxels (n, 2 or 3), metres, map frame.
+        places: positions of its places (P, 2 or 3), metres, map frame.
+    """
+    track = cKDTree(places[:, :2])
+    near = points[track.query(points[:, :2], distance_upper_bound=COVERED_M)[0] < np.inf, :2]
+    seen = np.concatenate([near, places[:, :2]])
+    corner = np.floor(seen.min(axis=0) / CELL_M).astype(np.int64) - 4
+    shape = np.floor(seen.max(axis=0) / CELL_M).astype(np.int64) - corner + 5
+    plan = np.zeros(shape, np.uint8)
+    cell = np.floor(seen / CELL_M).astype(np.int64) - corner
+    plan[cell[:, 0], cell[:, 1]] = 1
+    plan = cv2.morphologyEx(plan, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)).astype(np.uint8)
+
+    def inside(xy: NDArray[np.float64]) -> NDArray[np.bool_]:
+        at = np.floor(xy[:, :2] / CELL_M).astype(np.int64) - corner
+        on_plan = ((at >= 0) & (at < shape)).all(axis=1)
+        at[~on_plan] = 0
+        own = track.query(xy[:, :2], distance_upper_bound=_OWN_M)[0] < np.inf
+        return np.asarray(own | (on_plan & (plan[at[:, 0], at[:, 1]] > 0)))
+
+    return inside
+
+
+def polygon_of(path: Path) -> Area:
+    """The area of a GeoJSON file: Polygon, MultiPolygon, or a Feature or FeatureCollection of them, in metres of the map frame.
+
+    Raises:
+        DatasetError: the file is missing or holds no valid polygon.
+    """
+    try:
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read ({error.strerror}); give a GeoJSON file", field="area") from error
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(
+            f"{path} is no JSON; give a GeoJSON file of a polygon in map metres", field="area"
+        ) from error
+    try:
+        shapes = [shapely.geometry.shape(geometry) for geometry in _geometries(document)]
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, shapely.errors.ShapelyError) as error:
+        raise DatasetError(f"{path}: {error} is no geometry; give a polygon in map metres", field="area") from error
+    if not shapes or any(shape.geom_type not in ("Polygon", "MultiPolygon") or shape.is_empty for shape in shapes):
+        kinds = ", ".join(shape.geom_type for shape in shapes) or "nothing"
+        raise DatasetError(f"{path} holds {kinds}, not a polygon; give one in map metres", field="area")
+    if not all(shape.is_valid for shape in shapes):
+        raise DatasetError(f"{path}: the polygon's rim crosses itself; mend it", field="area")
+    whole = shapely.union_all(shapes)
+    shapely.prepare(whole)
+    return lambda xy: np.asarray(shapely.intersects_xy(whole, xy[:, 0], xy[:, 1]))
+
+
+def _geometries(document: Any) -> list[Any]:
+    if document["type"] == "FeatureCollection":
+        return [feature["geometry"] for feature in document["features"]]
+    return [document["geometry"] if document["type"] == "Feature" else document]

@@ -1,0 +1,99 @@
+"""A map that lies on the disk, as what it was written from: so that another can be made of it."""
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
+from service.errors import BundleError
+from service.imaging.npy_header import NPY_HEADER_ERRORS
+from service.maps import content as parts
+from service.maps import streets
+from service.maps.content import BundleContent
+from service.maps.reader import MapBundle
+
+
+def content_of(bundle: MapBundle) -> BundleContent:
+    """All of a map but its cloud (``voxels_of``) and the picture of it."""
+    manifest = bundle.manifest
+    return BundleContent(
+        name=manifest.name, grid=bundle.grid, headings=manifest.headings, spacing_m=manifest.spacing_m, rows_seen=bundle.rows_seen,
+        T_map_place=np.array(bundle.T_map_place), place_street=np.array(bundle.place_street), view_place=np.array(bundle.view_place),
+        view_heading_rad=np.array(bundle.view_heading_rad), descriptors=bundle.view_index.vectors(np.arange(len(bundle.views))),
+        encoder=bundle.encoder_bytes(), parameters=dict(manifest.parameters), streets=streets_of_bundle(bundle),
+        calibration=json.loads((bundle.path / parts.CALIBRATION_FILE).read_bytes()),
+        georeference=manifest.georeference, licence=manifest.licence, tool_versions=manifest.tool_versions,
+    )  # fmt: skip
+
+
+def streets_of_bundle(bundle: MapBundle) -> dict[str, Any] | None:
+    """The GeoJSON of a map's streets, None where it has none."""
+    if bundle.streets is None:
+        return None
+    document: dict[str, Any] = json.loads((bundle.path / streets.FILE).read_bytes())
+    return document
+
+
+def voxel_edge_m(bundle: MapBundle) -> float:
+    """Edge of the cloud's voxels, metres.
+
+    Raises:
+        BundleError: the manifest does not say.
+    """
+    edge = bundle.manifest.parameters.get("voxel_m", 0.0)
+    if not edge > 0:
+        raise BundleError(f"{bundle.path}: its parameters lack voxel_m; build the map again", field="voxel_m")
+    return edge
+
+
+def voxels_of(bundle: MapBundle) -> VoxelMap:
+    """The voxels of a map, ready to take more points.
+
+    Bundles that keep sums of their voxels' points give them as they were. Older ones have surfels alone: each then counts as its
+    points spread evenly over a disc as wide as the voxel, as thick as the surfel, at its mean; voxels with too few points for a
+    surfel are lost.
+
+    Raises:
+        BundleError: the sums are not ours.
+    """
+    edge = voxel_edge_m(bundle)
+    voxels = VoxelMap(edge, lattice_origin(edge, bundle.T_map_place[:, :3, 3].mean(axis=0)))
+    if parts.STATISTICS_FILE in bundle.manifest.files:
+        voxels.add_statistics(read_statistics(bundle))
+    elif bundle.cloud is not None:
+        surfels = bundle.cloud.surfels
+        across = surfels["normal"].astype(np.float64)
+        outer = across[:, :, None] * across[:, None, :]
+        flat, thick = edge**2 / 12, surfels["thickness_m"].astype(np.float64)[:, None, None] ** 2
+        voxels.add_moments(
+            surfels["xyz"] + bundle.cloud.origin_m,
+            np.maximum(surfels["points"], 1),
+            flat * (np.eye(3) - outer) + thick * outer,
+        )
+    return voxels
+
+
+def read_statistics(bundle: MapBundle) -> NDArray[Any]:
+    """Sums of the voxels' points, of dtype ``VOXEL``.
+
+    Raises:
+        BundleError: the file is not that.
+    """
+    path = bundle.path / parts.STATISTICS_FILE
+    try:
+        found = np.load(path, allow_pickle=False, mmap_mode="r")
+    except (OSError, *NPY_HEADER_ERRORS) as error:
+        raise _defect(bundle, f"it is no array of ours ({error})") from error
+    if found.dtype != VOXEL or found.ndim != 1:
+        raise _defect(bundle, f"it holds {found.dtype} in {found.ndim} dimensions")
+    if not np.isfinite(found["sums"]).all() or not (found["points"] > 0).all():
+        raise _defect(bundle, "a voxel has no points, or a sum that is not finite")
+    return np.asarray(found)
+
+
+def _defect(bundle: MapBundle, what: str) -> BundleError:
+    return BundleError(
+        f"{bundle.path / parts.STATISTICS_FILE}: {what}; copy or build the bundle again", field=parts.STATISTICS_FILE
+    )

@@ -1,0 +1,148 @@
+"""``streetfix map update``: a new survey drive goes into a map, beside what is there or in its place."""
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.area import Area, covered_by, polygon_of
+from model_training.mapping.build import tool_versions
+from model_training.mapping.cloud import with_cloud
+from model_training.mapping.join import joined, joined_streets, of_places
+from model_training.mapping.passes import moved
+from model_training.mapping.places import Drive, Places, views_of
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.stored_map import content_of, streets_of_bundle, voxel_edge_m, voxels_of
+from model_training.mapping.survey import kept_scans, rows_seen_by
+from model_training.mapping.voxel_map import VoxelMap
+from model_training.mapping.work import key_of, work_beside
+from service.errors import BundleError, DatasetError
+from service.localization.encoder import Encoder
+from service.maps.content import BundleContent
+from service.maps.manifest import Manifest
+from service.maps.reader import MapBundle
+from service.maps.writer import write_bundle
+
+Report = Callable[[str, int, int], None]
+
+
+def update_map(
+    old: Path, dataset: Dataset, out: Path, *, replace_covered: bool = False, replace_area: Path | None = None,
+    passes_vote: bool = False, overwrite: bool = False, threads: int | None = None, report: Report = lambda *_: None,
+) -> Manifest:  # fmt: skip
+    """Add a survey drive to a map, with the encoder and the settings that the map was built with.
+
+    Without replacing, the new drive's places that stand the spacing away from the old ones come in, and its points add to the cloud.
+    With it, old places, and voxels by their mean, go wherever the new drive covered the ground (or inside the polygon) before the new
+    ones come in. Old views elsewhere that look at the replaced block still show it as it was. A killed update goes on where it was.
+
+    Args:
+        old: the bundle; it stays as it is.
+        dataset: with the survey drive, its poses in the frame of the map.
+        out: folder of the new bundle; it appears whole or not at all.
+        replace_covered: replace what the drive covered.
+        replace_area: GeoJSON of a polygon, metres in the map frame; replace what lies in it.
+        passes_vote: drop voxels that more passes of the new drive look through than hit; the map counts as one pass that hit its own.
+        overwrite: replace a bundle at ``out``.
+        threads: of the encoder; by default one a core.
+        report: told after every place.
+
+    Raises:
+        BundleError: the bundle is damaged, ``out`` exists, streets contradict each other, or another process is at work on ``out``.
+        DatasetError: the survey is empty or damaged, lies in another frame, its LiDAR does not see what the map's does, or the polygon
+            holds none of its places.
+    """
+    if out.exists() and not overwrite:
+        raise BundleError(
+            f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
+        )
+    bundle = MapBundle.open(old)
+    voxel_edge_m(bundle)
+    _require_frame(dataset, bundle)
+    area = None if replace_area is None else polygon_of(replace_area)
+    # What would be refused at the end is refused before the work.
+    joined_streets(streets_of_bundle(bundle), dataset.streets(), newer=replace_covered or area is not None)
+    settings = BuildSettings.of_map(bundle.manifest, passes_vote=passes_vote)
+    threads = threads or os.cpu_count() or 1
+    encoder = Encoder.open(bundle.encoder_bytes(), threads=threads)
+    poses, kept = kept_scans(dataset, settings)
+    key = key_of(dataset, encoder.sha256, settings, threads=threads, map=bundle.manifest.version, replaced=_told(
+        replace_covered, replace_area
+    ))  # fmt: skip
+    with work_beside(out, key) as work:
+        _require_rows(
+            work.part("rows", lambda: {"seen": rows_seen_by(dataset, kept, bundle.grid, settings)})["seen"],
+            bundle,
+            dataset,
+        )
+        drive = Drive(dataset, poses, kept, settings, encoder, bundle.grid, bundle.rows_seen)
+        cloud = voxels_of(bundle)
+        fresh = VoxelMap(cloud.voxel_m, cloud.origin)
+        places = drive.places(fresh, work, report=report)
+        content = content_of(bundle)
+        if replace_covered or area is not None:
+            area = area or covered_by(fresh.means(), places.T_map_level[:, :3, 3])
+            content = _without(content, cloud, area, places, replace_area)
+        earlier = cloud.sums()[0].copy()
+        cloud.add_sums(*fresh.sums())
+        if passes_vote:
+            gone = moved(cloud, dataset, poses, kept, settings, work, earlier=earlier, report=report)
+            cloud.keep(~np.isin(cloud.sums()[0], gone))
+        whole = joined(content, _content(drive, places, content), newer_streets=area is not None)
+        return write_bundle(out, with_cloud(replace(whole, tool_versions=tool_versions()), cloud), overwrite=overwrite)
+
+
+def _told(replace_covered: bool, replace_area: Path | None) -> str:
+    return str(replace_covered) if replace_area is None else replace_area.read_text()
+
+
+def _require_frame(dataset: Dataset, bundle: MapBundle) -> None:
+    of_map, of_drive = bundle.manifest.georeference, dataset.description.georeference
+    if of_map != of_drive:
+        raise DatasetError(
+            f"{dataset.folder}: its frame lies at {of_drive or 'no known place'}, that of the map {bundle.path} at "
+            f"{of_map or 'no known place'}; bring the drive's poses into the map's frame and give it the map's georeference",
+            field="georeference",
+        )  # fmt: skip
+
+
+def _require_rows(rows_seen: np.ndarray, bundle: MapBundle, dataset: Dataset) -> None:
+    """A row at the rim may be seen by chance or not; more of them, and the views would be of another sensor's."""
+    missing = int((bundle.rows_seen & ~rows_seen).sum())
+    if missing > 0.1 * bundle.rows_seen.sum():
+        raise DatasetError(
+            f"{dataset.folder}: its LiDAR does not see {missing} of the {int(bundle.rows_seen.sum())} rows of the view grid that the map's "
+            "does; survey with one that looks as far up and down, or build a map of its own", field="survey",
+        )  # fmt: skip
+
+
+def _without(
+    content: BundleContent, cloud: VoxelMap, area: Area, places: Places, polygon: Path | None
+) -> BundleContent:
+    """The map without its places in the area; its voxels there go from the cloud."""
+    if not area(places.T_map_level[:, :2, 3]).any():
+        raise DatasetError(
+            f"{polygon}: none of the new drive's places lies in the polygon, so nothing would fill it; give one around where it drove, "
+            "in metres of the map frame", field="area",
+        )  # fmt: skip
+    cloud.keep(~area(cloud.means()[:, :2]))
+    return of_places(content, ~area(content.T_map_place[:, :2, 3]))
+
+
+def _content(drive: Drive, places: Places, old: BundleContent) -> BundleContent:
+    """The new drive as a map of its own, with what the map gives it."""
+    lidar_height_m = float(np.median(places.height_m))
+    T_map_place = places.at_height(lidar_height_m)
+    voted = {"passes_vote": 1.0} if drive.settings.passes_vote else {}
+    return replace(
+        old, T_map_place=T_map_place, place_street=np.full(len(T_map_place), -1, np.int32), streets=drive.dataset.streets(),
+        view_place=views_of(len(T_map_place), old.headings), view_heading_rad=places.heading_rad.ravel(), descriptors=places.descriptors,
+        parameters={
+            **{name: value for name, value in old.parameters.items() if name != "passes_vote"}, "lidar_height_m": lidar_height_m,
+            "survey_scans": float(len(drive.poses)), **voted,
+        },
+        calibration={**old.calibration, "site": None} if old.calibration["calibrated"] else old.calibration,
+    )  # fmt: skip

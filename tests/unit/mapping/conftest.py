@@ -1,0 +1,62 @@
+"""A drive in two halves, their maps, and the map of both built at once."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.build import BuildSettings, build_map
+
+SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None)
+
+
+class Part(Dataset):
+    """Some scans of a dataset, as a dataset; ``demolished`` tells which points (n, 3; map frame) are no longer there."""
+
+    def __init__(self, folder: Path, numbers: list[int], demolished: Callable[[Any], Any] | None = None) -> None:
+        super().__init__(folder)
+        self.numbers, self.demolished = numbers, demolished
+
+    def survey_poses(self) -> NDArray[np.float64]:
+        return super().survey_poses()[self.numbers]
+
+    def scan(self, number: int) -> NDArray[np.float32]:
+        points = super().scan(self.numbers[number])
+        if self.demolished is None:
+            return points
+        T = super().survey_poses()[self.numbers[number]]
+        return points[~self.demolished(points[:, :3] @ T[:3, :3].T + T[:3, 3])]
+
+
+@pytest.fixture(scope="session")
+def part_of(small_dataset: Dataset) -> Callable[..., Dataset]:
+    def made(numbers: Any, demolished: Any = None) -> Dataset:
+        return Part(small_dataset.folder, list(numbers), demolished)
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def halves(small_dataset: Dataset, part_of: Callable[..., Dataset]) -> tuple[Dataset, Dataset]:
+    count = len(small_dataset.survey_poses())
+    return part_of(range(count // 2)), part_of(range(count // 2, count))
+
+
+@pytest.fixture(scope="session")
+def map_of(encoder_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    def made(dataset: Dataset, *, encoder: Path = encoder_file, **changed: Any) -> Path:
+        out = tmp_path_factory.mktemp("maps") / "m"
+        build_map(dataset, encoder, out, replace(SETTINGS, **changed), threads=1)
+        return out
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def half_maps(halves: tuple[Dataset, Dataset], map_of: Callable[..., Path]) -> tuple[Path, Path]:
+    return map_of(halves[0]), map_of(halves[1])

@@ -1,0 +1,207 @@
+"""What moved between passes: a street worked by hand, and a simulated one."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from model_training.mapping import passes
+from model_training.mapping.passes import MOST, Passes, Targets, looked_through, moved, tile_of
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.voxel_map import VoxelMap
+from model_training.mapping.work import Work
+from service.geometry.rigid import transform_from, transform_points
+
+SETTINGS = BuildSettings(name="street", spacing_m=4.0, calibration=None)
+LIDAR_M = 1.8
+BOX = (np.array([27.0, 3.0, 0.0]), np.array([31.0, 4.8, 1.5]))  # a parked car
+POLE = (np.array([40.0, 5.0, 0.0]), np.array([40.08, 5.08, 4.0]))
+WALL_Y = 8.0
+
+
+def along(x_m):
+    """A LiDAR at each x, 1.8 m above the ground."""
+    return np.stack([transform_from(np.eye(3), np.array([x, 0.0, LIDAR_M])) for x in x_m])
+
+
+def drive(count):
+    """The same street of 60 m in the same direction so many times."""
+    return np.concatenate([along(np.arange(0.0, 61.0, 4.0))] * count)
+
+
+def scan_of(T, *, car):
+    """64 beams, 720 directions, in the LiDAR's frame: ground, a wall at y = 8 m, a pole, and a parked car if it is there."""
+    azimuth, elevation = np.meshgrid(np.arange(720) / 720 * 2 * np.pi, np.deg2rad(np.linspace(-25, 10, 64)))
+    flat = np.cos(elevation)
+    ray = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
+    at = T[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ground = np.where(ray[:, 2] < 0, -at[2] / ray[:, 2], np.inf)
+        wall = np.where(ray[:, 1] > 0, (WALL_Y - at[1]) / ray[:, 1], np.inf)
+        wall = np.where(at[2] + wall * ray[:, 2] < 6.0, wall, np.inf)
+        ranges = np.minimum(ground, wall)
+        for low, high in [POLE, *([BOX] if car else [])]:
+            first, second = (low - at) / ray, (high - at) / ray
+            enters, leaves = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
+            ranges = np.minimum(ranges, np.where((enters <= leaves) & (enters > 0), enters, np.inf))
+    seen = ranges < 60.0
+    return np.c_[ray[seen] * ranges[seen, None], np.zeros(seen.sum())].astype(np.float32)
+
+
+def voted(tmp_path, *, cars, earlier=None):
+    """The street driven once for each flag of ``cars``; the cloud before and after the vote."""
+    poses = drive(len(cars))
+    each = len(poses) // len(cars)
+    dataset = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=cars[number // each]))
+    cloud = VoxelMap(0.3, np.zeros(3))
+    for number, T in enumerate(poses):
+        points = dataset.scan(number)[:, :3].astype(np.float64)
+        cloud.add(transform_points(T, points[np.linalg.norm(points, axis=1) < 40.0]))
+    known = None if earlier is None else cloud.keys_of(earlier)
+    gone = moved(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, Work(tmp_path, "k"), earlier=known)
+    before = cloud.means()
+    removed = np.isin(cloud.sums()[0], gone)
+    return before, removed
+
+
+def inside(points, box, *, rim=0.15):
+    low, high = box
+    return ((points > low - rim) & (points < high + rim)).all(axis=1) & (points[:, 2] > 0.35)
+
+
+@pytest.fixture(scope="module")
+def one_of_three(tmp_path_factory):
+    return voted(tmp_path_factory.mktemp("work"), cars=[True, False, False])
+
+
+def test_a_car_of_one_pass_in_three_vanishes(one_of_three):
+    points, removed = one_of_three
+    car = inside(points, BOX)
+    assert car.sum() > 50
+    assert removed[car].mean() > 0.9
+
+
+def test_wall_pole_and_ground_stay(one_of_three):
+    points, removed = one_of_three
+    wall = np.abs(points[:, 1] - WALL_Y) < 0.15
+    pole = inside(points, POLE)
+    ground = np.abs(points[:, 2]) < 0.1
+    assert wall.sum() > 1000
+    assert pole.sum() >= 8
+    assert ground.sum() > 5000
+    assert not removed[wall].any()
+    assert not removed[pole].any()
+    assert not removed[ground].any()
+
+
+def test_a_car_of_two_passes_in_three_stays(tmp_path):
+    points, removed = voted(tmp_path, cars=[True, True, False])
+    assert not removed[inside(points, BOX)].any()
+
+
+def test_one_pass_against_one_decides_nothing(tmp_path):
+    assert not voted(tmp_path, cars=[True, False])[1].any()
+
+
+def test_a_single_pass_decides_nothing(tmp_path):
+    assert not voted(tmp_path, cars=[True])[1].any()
+
+
+def test_two_new_passes_overrule_what_the_map_had(tmp_path_factory):
+    """The map's car, which neither of two new passes hits: the map counts as one pass. One new pass is not enough."""
+    rng = np.random.default_rng(0)
+    sides = rng.uniform(BOX[0], BOX[1], (4000, 3))
+    sides[:, 1] = BOX[0][1]  # the side that looks at the street
+    for new_passes, share in ((2, 0.8), (1, 0.0)):
+        poses = drive(new_passes)
+        dataset = SimpleNamespace(scan=lambda number, poses=poses: scan_of(poses[number], car=False))
+        cloud = VoxelMap(0.3, np.zeros(3))
+        cloud.add(sides)
+        earlier = cloud.sums()[0].copy()
+        for number, T in enumerate(poses):
+            cloud.add(transform_points(T, dataset.scan(number)[:, :3].astype(np.float64)))
+        work = Work(tmp_path_factory.mktemp("work"), "k")
+        gone = moved(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, work, earlier=earlier)
+        above = cloud.means()[np.isin(cloud.sums()[0], earlier)][:, 2] > 0.35
+        found = np.isin(cloud.sums()[0][np.isin(cloud.sums()[0], earlier)], gone)[above].mean()
+        assert found >= share
+        assert share > 0 or found == 0
+
+
+def test_the_votes_of_finished_scans_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(passes, "CHUNK", 10)
+    first = voted(tmp_path, cars=[True, False, False])[1]
+    monkeypatch.setattr(passes, "looked_through", lambda *_: pytest.fail("it was finished"))
+    np.testing.assert_array_equal(voted(tmp_path, cars=[True, False, False])[1], first)
+
+
+def test_passes_count_up_where_a_tile_comes_into_reach_again():
+    """Out to 200 m and back, every 2 m: near the start two passes, at the turn one; and at a first visit always number 0."""
+    x = np.r_[np.arange(0.0, 201.0, 2.0), np.arange(198.0, -1.0, -2.0)]
+    found = Passes.of(along(x))
+    at = {place: tile_of(np.array([[place, 0.0, 0.0]]))[0] for place in (5.0, 195.0)}
+    number = {
+        (scan, place): found.number[scan][found.tiles[scan] == at[place]].tolist()
+        for scan in (0, 100, len(x) - 1)
+        for place in at
+    }
+    assert number[0, 5.0] == [0]
+    assert number[0, 195.0] == []  # out of reach
+    assert number[100, 195.0] == [0]
+    assert number[len(x) - 1, 5.0] == [1]
+    turned = np.flatnonzero((found.tiles == at[195.0]).any(axis=1))
+    assert set(found.number[turned][found.tiles[turned] == at[195.0]].tolist()) == {0}
+
+
+def test_passes_beyond_the_last_bit_count_as_one():
+    found = Passes.of(np.concatenate([along([0.0, 500.0])] * 80), spacing_m=1.0)
+    here = tile_of(np.zeros((1, 3)))[0]
+    numbers = found.number[::2][found.tiles[::2] == here]
+    np.testing.assert_array_equal(numbers, np.minimum(np.arange(80), MOST))
+
+
+def test_bits_are_nothing_out_of_reach():
+    found = Passes.of(along([0.0]))
+    tiles = tile_of(np.array([[0.0, 0.0], [500.0, 0.0]]))
+    assert found.bits(0, tiles).tolist() == [1, 0]
+
+
+def targets_at(position, normal):
+    keys = np.array([0])
+    tile = tile_of(np.array([position]))
+    return Targets(keys, np.array([position]), np.array([normal], np.float32), tile, np.array([0]), 0.3)
+
+
+@pytest.mark.parametrize(
+    ("end_m", "normal", "through"),
+    [
+        (20.0, (1.0, 0.0, 0.0), True),  # the ray goes on for 10 m
+        (10.7, (1.0, 0.0, 0.0), True),
+        (10.5, (1.0, 0.0, 0.0), False),  # less than two voxels behind
+        (8.0, (1.0, 0.0, 0.0), False),  # something stands before it
+        (20.0, (0.0, 0.0, 1.0), False),  # the ray ends on the voxel's own plane
+    ],
+)
+def test_one_ray_by_hand(end_m, normal, through):
+    found = looked_through(
+        targets_at([10.0, 0.0, 0.0], normal), np.array([0]), np.array([[end_m, 0.0, 0.0]]), np.eye(4)
+    )
+    assert found.tolist() == ([0] if through else [])
+
+
+def test_a_ray_beside_it_that_ends_before_it_saves_it():
+    beside = 9.9 * np.array([np.cos(0.006), np.sin(0.006), 0.0])
+    points = np.array([[20.0, 0.0, 0.0], beside])
+    targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
+    assert looked_through(targets, np.array([0]), points, np.eye(4)).tolist() == []
+
+
+def test_where_no_ray_goes_there_is_no_vote():
+    targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
+    points = np.array([[0.0, 20.0, 0.0]])
+    assert looked_through(targets, np.array([0]), points, np.eye(4)).tolist() == []
+
+
+def test_an_empty_scan_looks_through_nothing():
+    targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
+    assert looked_through(targets, np.array([0]), np.zeros((0, 3)), np.eye(4)).tolist() == []
