@@ -29,6 +29,10 @@ def command(
     passes_vote: Annotated[
         bool, typer.Option(help="drop what more passes of the survey look through than hit: vehicles that were moved")
     ] = False,
+    traffic_vote: Annotated[
+        bool,
+        typer.Option(help="drop what later scans of a drive look through: vehicles that drove while it was surveyed"),
+    ] = False,
     licence: Annotated[str, typer.Option(help="licence text kept in the manifest")] = "",
     calibration: Annotated[
         Path, typer.Option(help="of `streetfix calibrate` for the same encoder [default: the stock encoder's]")
@@ -44,7 +48,7 @@ def command(
     opened = Dataset(dataset)
     settings = BuildSettings(
         name=name or opened.name, spacing_m=spacing, headings=headings, voxel_m=voxel, expected_lidar_height_m=lidar_height,
-        remove_weather=remove_weather, passes_vote=passes_vote, licence=licence, calibration=calibration,
+        remove_weather=remove_weather, passes_vote=passes_vote, traffic_vote=traffic_vote, licence=licence, calibration=calibration,
     )  # fmt: skip
     with bars() as report:
         manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)

@@ -92,6 +92,9 @@ def build_map(
             site = _checked(drive, places, content, cloud, calibration, apart, work, report)
             checked = calibration.model_copy(update={"site": site})
             content = replace(content, calibration=checked.model_dump(mode="json"))
+        if settings.traffic_vote:
+            gone = moved(cloud, dataset, poses, kept, settings, work, each_scan=True, report=report)
+            cloud.keep(~np.isin(cloud.sums()[0], gone))
         if settings.passes_vote:
             gone = moved(cloud, dataset, poses, kept, settings, work, report=report)
             cloud.keep(~np.isin(cloud.sums()[0], gone))
@@ -104,7 +107,8 @@ def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
     lidar_height_m = float(np.median(places.height_m))
     T_map_place = places.at_height(lidar_height_m)
     streets = dataset.streets()
-    voted = {"passes_vote": 1.0} if settings.passes_vote else {}
+    votes = {"passes_vote": settings.passes_vote, "traffic_vote": settings.traffic_vote}
+    voted = {name: 1.0 for name, wanted in votes.items() if wanted}
     return BundleContent(
         name=settings.name, grid=drive.grid, headings=settings.headings, spacing_m=settings.spacing_m, rows_seen=drive.rows_seen,
         T_map_place=T_map_place, place_street=streets_of(streets, T_map_place),

@@ -4,6 +4,9 @@ Ours, after the visibility tests of map cleaning (for example Kim and Kim, "Remo
 that hits a voxel anywhere has no vote against it, so a thin pole that most rays miss stays; and a ray that ends on the voxel's own
 plane, as rays along the ground and along walls do, has not looked through it.
 
+Traffic is found in the same way where every scan votes for itself: what drives on before the vehicle is hit once and looked through by
+the scans after it, what stands is hit again.
+
 Passes count per tile of the ground: a tile that comes into reach again after some way elsewhere is passed again. Who turns round
 within reach is still on the same pass. Votes are bits, one a pass, so that they add up in any order.
 """
@@ -69,6 +72,13 @@ class Passes:
         number[order] = np.minimum(counted, MOST)
         return cls(tiles, number.reshape(tiles.shape))
 
+    @classmethod
+    def each_scan(cls, poses: NDArray[np.float64]) -> "Passes":
+        """Every scan a pass of its own, by the bits there are: those ``MOST`` + 1 scans apart share one."""
+        tiles = cls.of(poses).tiles
+        number = np.arange(len(poses), dtype=np.uint64)[:, None] % np.uint64(MOST + 1)
+        return cls(tiles, np.broadcast_to(number, tiles.shape))
+
     def bits(self, scan: int, tiles: NDArray[np.int64]) -> NDArray[np.uint64]:
         """The bit of a scan's pass over each of some tiles; 0 where it is out of reach."""
         at = np.minimum(np.searchsorted(self.tiles[scan], tiles), self.tiles.shape[1] - 1)
@@ -124,9 +134,9 @@ class Targets:
 
 def moved(
     cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64], settings: BuildSettings, work: Work, *,
-    earlier: NDArray[np.int64] | None = None, report: Report = lambda *_: None,
+    earlier: NDArray[np.int64] | None = None, each_scan: bool = False, report: Report = lambda *_: None,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Keys of the voxels that more passes look through than hit, two at least.
+    """Keys of the voxels that more passes look through than hit, two at least; of scans, as many as hit.
 
     Reads the scans once more, one at a time.
 
@@ -138,14 +148,19 @@ def moved(
         settings: the spacing, and whether weather is removed.
         work: keeps the votes of finished scans.
         earlier: keys of voxels that were in the map before this survey, which counts as one more pass that hit them.
+        each_scan: every scan votes for itself, which finds traffic, instead of with all of its pass.
         report: told after every scan.
     """
-    targets, passes = Targets.of(cloud), Passes.of(poses[numbers], spacing_m=settings.spacing_m)
+    targets = Targets.of(cloud)
+    drive = poses[numbers]
+    passes = Passes.each_scan(drive) if each_scan else Passes.of(drive, spacing_m=settings.spacing_m)
+    ballot = Ballot(targets, passes, behind_m=(1 if each_scan else 2) * cloud.voxel_m)
+    kind = "traffic" if each_scan else "votes"
     hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
     for first in range(0, len(numbers), CHUNK):
         scans = range(first, min(first + CHUNK, len(numbers)))
-        make = partial(_votes, targets, passes, cloud, dataset, poses, numbers, settings, scans, report)
-        votes = work.part(f"votes-{first:07d}", make)
+        make = partial(_votes, ballot, cloud, dataset, poses, numbers, settings, scans, report)
+        votes = work.part(f"{kind}-{first:07d}", make)
         hit[votes["of"]] |= votes["hit"]
         through[votes["of"]] |= votes["through"]
         report("passes", scans.stop, len(numbers))
@@ -153,13 +168,24 @@ def moved(
     if earlier is not None:
         known = np.isin(targets.keys, earlier)
         hits = np.where(known, np.bitwise_count(hit) + 1, hits)
-    return np.asarray(targets.keys[np.bitwise_count(through & ~hit) > hits])
+    against = np.bitwise_count(through & ~hit).astype(np.int64)
+    return np.asarray(targets.keys[against >= hits if each_scan else against > hits])
+
+
+@dataclass(frozen=True, eq=False)
+class Ballot:
+    """What is voted about, who has a vote, and how far behind a voxel a ray must end to have looked through it."""
+
+    targets: Targets
+    passes: Passes
+    behind_m: float
 
 
 def _votes(
-    targets: Targets, passes: Passes, cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64],
+    ballot: Ballot, cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64],
     settings: BuildSettings, scans: range, report: Report,
 ) -> Arrays:  # fmt: skip
+    targets, passes = ballot.targets, ballot.passes
     hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
     for scan in scans:
         T = poses[numbers[scan]]
@@ -170,7 +196,7 @@ def _votes(
         inside = at < len(targets.keys)
         at = at[inside][targets.keys[at[inside]] == touched[inside]]
         hit[at] |= passes.bits(scan, targets.tile[at])
-        seen = looked_through(targets, targets.of_tiles(passes.tiles[scan]), points, T)
+        seen = looked_through(targets, targets.of_tiles(passes.tiles[scan]), points, T, behind_m=ballot.behind_m)
         through[seen] |= passes.bits(scan, targets.tile[seen])
         report("passes", scan + 1, len(numbers))
     of = np.flatnonzero(hit | through)
@@ -178,18 +204,19 @@ def _votes(
 
 
 def looked_through(
-    targets: Targets, candidates: NDArray[np.int64], points: NDArray[np.float64], T_map_lidar: NDArray[np.float64]
-) -> NDArray[np.int64]:
+    targets: Targets, candidates: NDArray[np.int64], points: NDArray[np.float64], T_map_lidar: NDArray[np.float64], *, behind_m: float
+) -> NDArray[np.int64]:  # fmt: skip
     """Those of some voxels that a scan looks through.
 
     The scan is drawn all round in cells of half a degree, the nearest point in each. A voxel is looked through where a ray goes its
-    way, this one and all in the cells around end two voxels behind it or more, and this one leaves the voxel's plane.
+    way, this one and all in the cells around end far enough behind it, and this one leaves the voxel's plane.
 
     Args:
         targets: the voxels.
         candidates: numbers of those to look at.
         points: of the scan (n, 3), LiDAR frame.
         T_map_lidar: where it was taken.
+        behind_m: how far is far enough, and a hundredth of the range more, for what poses and beams are off.
     """
     if not len(points):  # a scan without a single return looks through nothing
         return candidates[:0]
@@ -208,7 +235,7 @@ def looked_through(
     away = np.linalg.norm(position, axis=1)
     cell, visible = _cells(position, away)
     visible &= (away <= REACH_M) & (point_at[cell] >= 0)
-    visible[visible] = around[cell[visible]] >= away[visible] + 2 * targets.voxel_m
+    visible[visible] = around[cell[visible]] >= away[visible] * 1.01 + behind_m
     candidates, position, end = candidates[visible], position[visible], points[point_at[cell[visible]]]
     normal = targets.normals[candidates] @ T_lidar_map[:3, :3].T
     off_plane = np.abs(((end - position) * normal).sum(axis=1)) > targets.voxel_m

@@ -24,6 +24,7 @@ class BuildSettings:
     expected_lidar_height_m: float = 1.8
     remove_weather: bool = False
     passes_vote: bool = False
+    traffic_vote: bool = False
     licence: str = ""
     calibration: Path | None = CALIBRATION
 

@@ -43,6 +43,7 @@ _EXTRA_OF_PACKAGE = {
     "pyproj": "geo",
     "gtsam": "odometry",
     "kiss_icp": "odometry",
+    "small_gicp": "odometry",
     "carla": "carla",
     "cyclonedds": "ros2",
 }

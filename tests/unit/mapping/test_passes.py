@@ -184,7 +184,7 @@ def targets_at(position, normal):
 )
 def test_one_ray_by_hand(end_m, normal, through):
     found = looked_through(
-        targets_at([10.0, 0.0, 0.0], normal), np.array([0]), np.array([[end_m, 0.0, 0.0]]), np.eye(4)
+        targets_at([10.0, 0.0, 0.0], normal), np.array([0]), np.array([[end_m, 0.0, 0.0]]), np.eye(4), behind_m=0.6
     )
     assert found.tolist() == ([0] if through else [])
 
@@ -193,15 +193,15 @@ def test_a_ray_beside_it_that_ends_before_it_saves_it():
     beside = 9.9 * np.array([np.cos(0.006), np.sin(0.006), 0.0])
     points = np.array([[20.0, 0.0, 0.0], beside])
     targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
-    assert looked_through(targets, np.array([0]), points, np.eye(4)).tolist() == []
+    assert looked_through(targets, np.array([0]), points, np.eye(4), behind_m=0.6).tolist() == []
 
 
 def test_where_no_ray_goes_there_is_no_vote():
     targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
     points = np.array([[0.0, 20.0, 0.0]])
-    assert looked_through(targets, np.array([0]), points, np.eye(4)).tolist() == []
+    assert looked_through(targets, np.array([0]), points, np.eye(4), behind_m=0.6).tolist() == []
 
 
 def test_an_empty_scan_looks_through_nothing():
     targets = targets_at([10.0, 0.0, 0.0], (1.0, 0.0, 0.0))
-    assert looked_through(targets, np.array([0]), np.zeros((0, 3)), np.eye(4)).tolist() == []
+    assert looked_through(targets, np.array([0]), np.zeros((0, 3)), np.eye(4), behind_m=0.6).tolist() == []
