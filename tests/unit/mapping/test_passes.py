@@ -29,8 +29,8 @@ def drive(count):
     return np.concatenate([along(np.arange(0.0, 61.0, 4.0))] * count)
 
 
-def scan_of(T, *, car):
-    """64 beams, 720 directions, in the LiDAR's frame: ground, a wall at y = 8 m, a pole, and a parked car if it is there."""
+def scan_of(T, *, car, van=None):
+    """64 beams, 720 directions, in the LiDAR's frame: ground, a wall at y = 8 m, a pole, a parked car and a van where they are."""
     azimuth, elevation = np.meshgrid(np.arange(720) / 720 * 2 * np.pi, np.deg2rad(np.linspace(-25, 10, 64)))
     flat = np.cos(elevation)
     ray = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1).reshape(-1, 3)
@@ -40,7 +40,7 @@ def scan_of(T, *, car):
         wall = np.where(ray[:, 1] > 0, (WALL_Y - at[1]) / ray[:, 1], np.inf)
         wall = np.where(at[2] + wall * ray[:, 2] < 6.0, wall, np.inf)
         ranges = np.minimum(ground, wall)
-        for low, high in [POLE, *([BOX] if car else [])]:
+        for low, high in [POLE, *([BOX] if car else []), *([van] if van else [])]:
             first, second = (low - at) / ray, (high - at) / ray
             enters, leaves = np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)
             ranges = np.minimum(ranges, np.where((enters <= leaves) & (enters > 0), enters, np.inf))
@@ -105,6 +105,31 @@ def test_one_pass_against_one_decides_nothing(tmp_path):
 
 def test_a_single_pass_decides_nothing(tmp_path):
     assert not voted(tmp_path, cars=[True])[1].any()
+
+
+def test_traffic_of_a_single_pass_vanishes_and_all_that_stands_stays(tmp_path):
+    """A van drives on 10 m ahead, in the lane to the right; the parked car is there in every scan."""
+    poses = along(np.arange(0.0, 41.0, 2.0))
+    vans = [(np.array([x + 10.0, -4.0, 0.3]), np.array([x + 14.0, -2.0, 2.3])) for x in poses[:, 0, 3]]
+    dataset = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=True, van=vans[number]))
+    cloud = VoxelMap(0.3, np.zeros(3))
+    for number, T in enumerate(poses):
+        points = dataset.scan(number)[:, :3].astype(np.float64)
+        cloud.add(transform_points(T, points[np.linalg.norm(points, axis=1) < 40.0]))
+    gone = moved(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, Work(tmp_path, "k"), each_scan=True)
+    points, removed = cloud.means(), np.isin(cloud.sums()[0], gone)
+    lane = (points[:, 1] < -1.8) & (points[:, 1] > -4.2) & (points[:, 2] > 0.5)
+    seen_later = lane & (points[:, 0] > 12.0) & (points[:, 0] < 38.0)  # where the last van stands nobody looked later
+    assert seen_later.sum() > 100
+    assert removed[seen_later].mean() > 0.8
+    stands = (
+        (np.abs(points[:, 1] - WALL_Y) < 0.15)
+        | inside(points, POLE)
+        | inside(points, BOX)
+        | (np.abs(points[:, 2]) < 0.1)
+    )
+    assert stands.sum() > 5000
+    assert removed[stands].mean() < 0.002
 
 
 def test_two_new_passes_overrule_what_the_map_had(tmp_path_factory):
