@@ -29,7 +29,7 @@ class OpenSettings:
 
     depth: DepthFrom = "recorded"
     topics: Mapping[str, str] = field(default_factory=dict)
-    extrinsics: Extrinsics = field(default_factory=Extrinsics)
+    extrinsics: Extrinsics | None = None
     camera: PinholeCamera | None = None
     rectified: bool | None = None
     poses: Path | None = None
@@ -43,6 +43,10 @@ class Kind:
     open: Callable[[Path, OpenSettings], Recording]
     depths: tuple[DepthFrom, ...]
     takes: frozenset[str] = frozenset()
+
+
+#: Settings that concern some formats only, and what the command line calls them.
+_OPTIONS = {"topics": "topic", "extrinsics": "extrinsics", "camera": "camera", "rectified": "rectified"}
 
 
 def open_recording(kind: str, source: Path, settings: OpenSettings) -> Recording:
@@ -70,9 +74,9 @@ def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
         raise DatasetError(
             f"depth: {kind} has no {settings.depth!r} depth; there is: {', '.join(known.depths)}", field="depth"
         )
-    for option in ("topics", "extrinsics", "camera", "rectified"):
-        if option not in known.takes and getattr(settings, option) != getattr(unasked, option):
-            raise DatasetError(f"{option.removesuffix('s')}: {kind} has no use for it; leave it out", field=option)
+    for field_name, option in _OPTIONS.items():
+        if field_name not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
+            raise DatasetError(f"{option}: {kind} has no use for it; leave it out", field=option)
 
 
 def _kitti_raw(source: Path, settings: OpenSettings) -> Recording:
@@ -117,7 +121,7 @@ def _rosbag(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.ros_content import BagSettings
 
     bag = BagSettings(
-        settings.topics, extrinsics=settings.extrinsics, camera=settings.camera, rectified=settings.rectified,
+        settings.topics, extrinsics=settings.extrinsics or Extrinsics(), camera=settings.camera, rectified=settings.rectified,
         want_pictures=settings.pictures, want_depth=settings.depth == "recorded",
     )  # fmt: skip
     return RosBag(source, bag)

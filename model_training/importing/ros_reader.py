@@ -9,7 +9,10 @@ from typing import Any
 from model_training.importing.ros_topics import Topic
 from service.errors import DatasetError
 
-_MEND = "if it was cut off, mend it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+_MEND = (
+    "if it was cut off, mend it with `rosbag reindex` (.bag), `mcap recover` (.mcap) or `sqlite3 FILE .recover` (.db3), "
+    "then `ros2 bag reindex` its folder"
+)
 
 
 @dataclass(frozen=True, slots=True)
