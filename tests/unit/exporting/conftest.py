@@ -39,8 +39,16 @@ def make_dataset(
         scan_path(folder, k).write_bytes(points.data)
     write_tum(folder / "survey" / "poses.txt", stamps, np.stack([pose(k) @ T_LIDAR for k in range(scans)]))
     camera = CameraSensor(
-        name="front", width=8, height=6, fx=7.5, fy=7.25, cx=3.5, cy=2.75, depth=DepthSpec(scale_m=scale_m), T_vehicle_sensor=T_CAMERA.tolist()
-    )  # fmt: skip
+        name="front",
+        width=8,
+        height=6,
+        fx=7.5,
+        fy=7.25,
+        cx=3.5,
+        cy=2.75,
+        depth=DepthSpec(scale_m=scale_m),
+        T_vehicle_sensor=T_CAMERA.tolist(),
+    )
     if queries:
         where = query_folder(folder, "drive")
         for k in range(frames):

@@ -184,7 +184,9 @@ class Ros:
             encoding=encoding, is_bigendian=0, step=pixels.strides[0], data=pixels.view(np.uint8).reshape(-1),
         )  # fmt: skip
 
-    def info(self, stamp_s: float, *, focal: float = 8.0, size: tuple[int, int] = (6, 8), frame: str = "camera", D: Any = ()) -> Any:  # fmt: skip
+    def info(
+        self, stamp_s: float, *, focal: float = 8.0, size: tuple[int, int] = (6, 8), frame: str = "camera", D: Any = ()
+    ) -> Any:
         K = np.array([focal, 0, 3.5, 0, focal, 2.5, 0, 0, 1.0])
         roi = self.make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         return self.make(
@@ -197,7 +199,9 @@ class Ros:
         x, y, z, w = (float(v) for v in quaternion_xyzw_from(T[:3, :3]))
         a, b, c = (float(v) for v in T[:3, 3])
         point = self.make("geometry_msgs/Point", x=a, y=b, z=c)
-        return self.make("geometry_msgs/Pose", position=point, orientation=self.make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w))  # fmt: skip
+        return self.make(
+            "geometry_msgs/Pose", position=point, orientation=self.make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
+        )
 
     def odometry(self, stamp_s: float, T: Any, *, child: str = "base_link") -> Any:
         zero = self.make("geometry_msgs/Vector3", x=0.0, y=0.0, z=0.0)

@@ -67,8 +67,10 @@ def test_the_field_of_view_reaches_from_edge_to_edge():
 
 
 SMALL = CarlaRecording(
-    town="Town01", lidar=CarlaLidar(mounting=Mounting(z=1.8)), camera=CarlaCamera(width=8, height=6, fov_deg=90.0, mounting=Mounting(x=0.5, y=0.25, z=1.5))
-)  # fmt: skip
+    town="Town01",
+    lidar=CarlaLidar(mounting=Mounting(z=1.8)),
+    camera=CarlaCamera(width=8, height=6, fov_deg=90.0, mounting=Mounting(x=0.5, y=0.25, z=1.5)),
+)
 
 
 def lidar_of(frame, points=((1, 2, 3, 0.5), (4, 5, 6, 0.25))):
@@ -223,7 +225,7 @@ class FakeWorld:
     def try_spawn_actor(self, blueprint, place):
         return None if place == 0 else self.spawn_actor(blueprint, place)
 
-    def spawn_actor(self, blueprint, place, attach_to=None):
+    def spawn_actor(self, blueprint, _place, **_mounting):
         self.actors.append(FakeActor(self, blueprint.name))
         return self.actors[-1]
 
@@ -238,7 +240,7 @@ class FakeWorld:
     def get_snapshot(self):
         return SimpleNamespace(timestamp=SimpleNamespace(elapsed_seconds=0.1 * self.frame))
 
-    def set_weather(self, weather):
+    def set_weather(self, _weather):
         self.log.append("weather")
 
 
@@ -252,12 +254,13 @@ def serve(carla, monkeypatch):
             return world
 
         traffic = SimpleNamespace(
-            set_synchronous_mode=lambda on: world.log.append(f"traffic {on}"), set_random_device_seed=lambda seed: world.log.append(f"seed {seed}")
-        )  # fmt: skip
+            set_synchronous_mode=lambda on: world.log.append(f"traffic {on}"),
+            set_random_device_seed=lambda seed: world.log.append(f"seed {seed}"),
+        )
         client = SimpleNamespace(
-            set_timeout=lambda s: None, get_world=get_world, load_world=lambda town: get_world(), get_trafficmanager=lambda: traffic
+            set_timeout=lambda _: None, get_world=get_world, load_world=lambda _: get_world(), get_trafficmanager=lambda: traffic
         )  # fmt: skip
-        monkeypatch.setattr(carla, "Client", lambda host, port: client)
+        monkeypatch.setattr(carla, "Client", lambda *_: client)
         return world
 
     return made
@@ -311,7 +314,7 @@ def test_ctrl_c_keeps_what_was_recorded_and_puts_all_back(serve, tmp_path):
 
 def test_a_server_that_stops_is_told_with_what_was_kept(serve, tmp_path):
     world = serve(FakeWorld(fails_at=3, failure=RuntimeError("time-out of 20000ms")))
-    with pytest.raises(DatasetError, match="host:2000 does not do its part .*time-out.*; 2 frames are in"):
+    with pytest.raises(DatasetError, match=r"host:2000 does not do its part .*time-out.*; 2 frames are in"):
         run(tmp_path / "out", frames=9)
     assert_put_back(world)
 
@@ -335,7 +338,7 @@ def test_no_server_is_told_with_the_remedy_and_nothing_is_written(serve, tmp_pat
         raise RuntimeError("time-out")
 
     serve(FakeWorld(), connects=refuse)
-    with pytest.raises(DatasetError, match="CARLA at host:2000 .*time-out.*start it, or name another --host"):
+    with pytest.raises(DatasetError, match=r"CARLA at host:2000 .*time-out.*start it, or name another --host"):
         run(tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -153,7 +153,7 @@ def test_stereo_without_the_right_cameras_calibration_is_refused(drive):
             kept = [text for text in path.read_text().splitlines() if not text.startswith(("P3", "P_rect_03"))]
             path.write_text("\n".join(kept))
     assert len(events_of(drive, RecordedPicture, "stored")) == 3
-    with pytest.raises(DatasetError, match="does not name the right camera .*--depth lidar"):
+    with pytest.raises(DatasetError, match=r"does not name the right camera .*--depth lidar"):
         events_of(drive, RecordedPicture, "sgbm")
 
 
@@ -211,7 +211,8 @@ def test_the_inertial_systems_poses_are_those_of_pyproj(raw):
     pyproj = pytest.importorskip("pyproj")
     latitude, longitude, height = OXTS[0][:3]
     pipeline = pyproj.Transformer.from_pipeline(
-        f"+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 +lat_0={latitude} +lon_0={longitude} +h_0={height}"
+        "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+        f"+lat_0={latitude} +lon_0={longitude} +h_0={height}"
     )
     expected = np.array([pipeline.transform(lon, lat, h) for lat, lon, h, *_ in OXTS])
     T_map_imu, georeference = read_oxts(sorted((raw / "oxts" / "data").iterdir()))
@@ -237,7 +238,7 @@ def test_a_packet_that_is_none_is_named(raw, text):
 def test_the_days_folder_will_do_where_it_holds_one_drive(raw):
     assert open_recording("kitti-raw", raw.parent, OpenSettings()).count() == 6
     (raw.parent / "2011_09_26_drive_0006_sync" / "velodyne_points").mkdir(parents=True)
-    with pytest.raises(DatasetError, match="the folder of one drive is wanted.*drive_0005_sync, .*drive_0006_sync"):
+    with pytest.raises(DatasetError, match=r"the folder of one drive is wanted.*drive_0005_sync, .*drive_0006_sync"):
         open_recording("kitti-raw", raw.parent, OpenSettings())
 
 

@@ -16,7 +16,9 @@ def camera_of(distortion):
 
 def project(points, camera, lens):
     if lens == "fisheye":
-        found, _ = cv2.fisheye.projectPoints(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))  # fmt: skip
+        found, _ = cv2.fisheye.projectPoints(
+            points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
+        )
     else:
         found, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))
     return found.reshape(-1, 2)

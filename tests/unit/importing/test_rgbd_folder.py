@@ -65,10 +65,15 @@ def test_tums_truth_is_of_the_optical_frame_and_becomes_that_of_the_body(tum):
 
 @pytest.mark.parametrize(
     ("file", "text", "why"),
-    [("rgb.txt", None, "rgb.txt is missing"), ("depth.txt", "# nothing\n", "depth.txt lists no picture"), ("rgb.txt", "0.0\n", "rgb.txt, line 1"),
-     ("depth.txt", "99 depth/0.png\n", "no colour picture has a depth within 0.02 s"), ("rgb.txt", "0 ../../etc/passwd\n", "outside of the recording"),
-     ("groundtruth.txt", "0 0 0\n", "groundtruth.txt, line 1")],
-)  # fmt: skip
+    [
+        ("rgb.txt", None, "rgb.txt is missing"),
+        ("depth.txt", "# nothing\n", "depth.txt lists no picture"),
+        ("rgb.txt", "0.0\n", "rgb.txt, line 1"),
+        ("depth.txt", "99 depth/0.png\n", "no colour picture has a depth within 0.02 s"),
+        ("rgb.txt", "0 ../../etc/passwd\n", "outside of the recording"),
+        ("groundtruth.txt", "0 0 0\n", "groundtruth.txt, line 1"),
+    ],
+)
 def test_what_tums_lists_lack_is_named(tum, file, text, why):
     (tum / file).unlink() if text is None else (tum / file).write_text(text)
     with pytest.raises(DatasetError, match=why):

@@ -99,7 +99,7 @@ def test_pictures_without_camera_info_need_a_camera_or_to_be_left_out(ros, drive
 
 def test_an_uncalibrated_camera_is_named_with_its_topic(ros, drive, tmp_path):
     messages = [m if m[0] != "/camera/color/camera_info" else (m[0], m[1], ros.info(m[1], focal=0.0)) for m in drive()]
-    with pytest.raises(DatasetError, match="topic /camera/color/camera_info: .*not calibrated"):
+    with pytest.raises(DatasetError, match=r"topic /camera/color/camera_info: .*not calibrated"):
         opened(ros.write(tmp_path / "bag", messages))
 
 
@@ -111,9 +111,13 @@ def test_without_poses_there_is_no_trajectory_and_the_lidar_is_the_vehicle(ros, 
 
 def test_a_missing_mounting_is_named_and_may_be_told(ros, drive, tmp_path):
     path = ros.write(tmp_path / "bag", drive(mountings=[("base_link", "lidar", T_LIDAR)]))
-    with pytest.raises(DatasetError, match="no way from 'lidar' to 'camera'; give T_vehicle_camera .*--extrinsics"):
+    with pytest.raises(DatasetError, match=r"no way from 'lidar' to 'camera'; give T_vehicle_camera .*--extrinsics"):
         opened(path)
-    (picture, *_) = [e for e in opened(path, extrinsics=Extrinsics(T_vehicle_camera=T_CAMERA)).events() if isinstance(e, RecordedPicture)]  # fmt: skip
+    (picture, *_) = [
+        e
+        for e in opened(path, extrinsics=Extrinsics(T_vehicle_camera=T_CAMERA)).events()
+        if isinstance(e, RecordedPicture)
+    ]
     np.testing.assert_allclose(picture.T_vehicle_camera, T_CAMERA)
     path = ros.write(tmp_path / "none", drive(mountings=[], without=PICTURES))
     with pytest.raises(DatasetError, match="no way from 'base_link' to 'lidar'; give T_vehicle_lidar"):
@@ -208,8 +212,10 @@ def test_a_bag_that_was_cut_off_gives_its_good_frames_or_the_remedy(ros, drive, 
     try:
         bag = opened(file)
     except DatasetError as error:
-        assert "bag" in error.message
-        assert "mcap recover" in error.message or "no sensor_msgs/PointCloud2" in error.message
+        told = error.message
+        remedies = ("mcap recover", "no sensor_msgs/PointCloud2")
+        if not any(remedy in told for remedy in remedies):
+            pytest.fail(f"no remedy in: {told}")
         return
     found = list(bag.events())
     whole = kinds(found).count("RecordedScan") == 60  # nothing but an index was lost

@@ -111,16 +111,26 @@ def test_a_fisheye_is_known_by_its_model():
 
 @pytest.mark.parametrize(
     ("changed", "why"),
-    [({"k": [0.0] * 9}, "not calibrated"), ({"distortion_model": "omni"}, "unknown distortion_model 'omni'"), ({"d": [0.1, 0.2]}, "2 coefficients"),
-     ({"distortion_model": "equidistant"}, "has 5 coefficients; 4 finite ones"), ({"d": [np.nan, 1, 0, 0]}, "finite")],
-)  # fmt: skip
+    [
+        ({"k": [0.0] * 9}, "not calibrated"),
+        ({"distortion_model": "omni"}, "unknown distortion_model 'omni'"),
+        ({"d": [0.1, 0.2]}, "2 coefficients"),
+        ({"distortion_model": "equidistant"}, "has 5 coefficients; 4 finite ones"),
+        ({"d": [np.nan, 1, 0, 0]}, "finite"),
+    ],
+)
 def test_a_camera_info_that_tells_no_camera_says_why(changed, why):
     assert why in camera_of(info(**changed), is_rectified=False)
 
 
 @pytest.mark.parametrize(
     ("topic", "is_rectified"),
-    [("/camera/image_rect_color", True), ("/camera/image_rect/compressed", True), ("/camera/image_raw", False), ("/rectory/image_raw/compressed", False)],
-)  # fmt: skip
+    [
+        ("/camera/image_rect_color", True),
+        ("/camera/image_rect/compressed", True),
+        ("/camera/image_raw", False),
+        ("/rectory/image_raw/compressed", False),
+    ],
+)
 def test_a_topics_name_says_whether_it_is_rectified(topic, is_rectified):
     assert is_rectified_by_name(topic) == is_rectified

@@ -37,10 +37,20 @@ def test_scans_and_pictures_stand_where_the_trajectory_was(taken, scan_at, pictu
 def test_what_cannot_be_used_is_counted_by_reason_with_the_first_name(taken, scan_at, picture_at):
     nan = [[np.nan, 0, 0, 0]]
     events = [
-        scan_at(0.5), scan_at(0.4), scan_at(0.5), scan_at(np.nan), scan_at(0.6, points=nan), scan_at(99.0), Unusable("scan", "a.bin", "truncated"),
-        Unusable("scan", "b.bin", "truncated"), picture_at(0.7, depth=None), picture_at(0.8, depth=np.zeros((6, 8), np.float32)),
-        picture_at(0.9, depth=np.ones((3, 4), np.float32)), picture_at(99.0), scan_at(1.0),
-    ]  # fmt: skip
+        scan_at(0.5),
+        scan_at(0.4),
+        scan_at(0.5),
+        scan_at(np.nan),
+        scan_at(0.6, points=nan),
+        scan_at(99.0),
+        Unusable("scan", "a.bin", "truncated"),
+        Unusable("scan", "b.bin", "truncated"),
+        picture_at(0.7, depth=None),
+        picture_at(0.8, depth=np.zeros((6, 8), np.float32)),
+        picture_at(0.9, depth=np.ones((3, 4), np.float32)),
+        picture_at(99.0),
+        scan_at(1.0),
+    ]
     summary, dataset = taken(events)
     assert (summary.scans, summary.pictures) == (2, 0)
     assert summary.dropped[:2] == (
@@ -176,7 +186,12 @@ def test_no_usable_scan_is_an_error_with_the_reasons_and_leaves_nothing(recordin
 @pytest.mark.parametrize("end", [KeyboardInterrupt, OSError("the disk is full")])
 def test_a_run_that_ends_early_leaves_nothing(recording_of, straight, scan_at, picture_at, tmp_path, end):
     with pytest.raises(KeyboardInterrupt if end is KeyboardInterrupt else OSError):
-        take(recording_of([scan_at(1.0), picture_at(1.0), end if isinstance(end, BaseException) else end()]), straight(), tmp_path / "out", TakeSettings())  # fmt: skip
+        take(
+            recording_of([scan_at(1.0), picture_at(1.0), end if isinstance(end, BaseException) else end()]),
+            straight(),
+            tmp_path / "out",
+            TakeSettings(),
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -188,7 +203,15 @@ def test_a_folder_that_is_taken_is_refused_untouched(recording_of, straight, sca
     assert (tmp_path / "out" / "mine").read_text() == "keep"
 
 
-@pytest.mark.parametrize(("settings", "field"), [({"hold_out": 1}, "hold_out"), ({"hold_out": -2}, "hold_out"), ({"tolerance_s": np.nan}, "tolerance_s"), ({"tolerance_s": -1}, "tolerance_s")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        ({"hold_out": 1}, "hold_out"),
+        ({"hold_out": -2}, "hold_out"),
+        ({"tolerance_s": np.nan}, "tolerance_s"),
+        ({"tolerance_s": -1}, "tolerance_s"),
+    ],
+)
 def test_settings_that_make_no_sense_are_refused_by_name(settings, field):
     with pytest.raises(DatasetError, match=f"^{field}: "):
         TakeSettings(**settings)
@@ -211,9 +234,13 @@ def test_what_a_dataset_says_of_itself_is_json_that_names_the_lidar(taken, scan_
 def test_odometry_reads_usable_scans_alone(recording_of, scan_at, picture_at):
     nan = np.nan
     events = [
-        scan_at(1.0, points=[[nan, 0, 0, 0], [1, 2, 3, 4]], offsets_s=[0.0, 0.1]), picture_at(1.0), scan_at(0.9), scan_at(1.1, points=[[nan] * 4]),
-        Unusable("scan", "x", "y"), scan_at(2.0, offsets_s=[99.0]),
-    ]  # fmt: skip
+        scan_at(1.0, points=[[nan, 0, 0, 0], [1, 2, 3, 4]], offsets_s=[0.0, 0.1]),
+        picture_at(1.0),
+        scan_at(0.9),
+        scan_at(1.1, points=[[nan] * 4]),
+        Unusable("scan", "x", "y"),
+        scan_at(2.0, offsets_s=[99.0]),
+    ]
     first, second = scans_of(recording_of(events))
     assert (first.stamp_s, second.stamp_s) == (1.0, 2.0)
     np.testing.assert_array_equal(first.points, [[1, 2, 3, 4]])

@@ -81,16 +81,16 @@ def test_many_moments_at_once_are_as_one_by_one():
 
 @pytest.mark.parametrize("stamps", [[0, 1, 1], [0, 2, 1]])
 def test_time_that_does_not_rise_is_refused_naming_the_pose(stamps):
-    with pytest.raises(DatasetError, match="turning, pose 3: .*sort the poses"):
+    with pytest.raises(DatasetError, match=r"turning, pose 3: .*sort the poses"):
         turning(stamps, [0, 0, 0], [0, 1, 2])
 
 
 def test_no_poses_and_poses_that_are_no_numbers_are_refused():
     with pytest.raises(DatasetError, match="no pose in it"):
         Trajectory(np.zeros(0), np.zeros((0, 4, 4)), "empty")
-    with pytest.raises(DatasetError, match="turning, pose 2: .*finite"):
+    with pytest.raises(DatasetError, match=r"turning, pose 2: .*finite"):
         turning([0, 1], [0, 0], [0, np.nan])
-    with pytest.raises(DatasetError, match="turning, pose 2: .*finite"):
+    with pytest.raises(DatasetError, match=r"turning, pose 2: .*finite"):
         turning([0, np.nan], [0, 0], [0, 1])
 
 

@@ -55,6 +55,7 @@ class HallDrive:
         return np.stack([inverse(pose_at(0.0)) @ pose_at(0.1 * k) for k in range(self.count_of_scans)])
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
+        del pictures  # there are none
         rng = np.random.default_rng(0)
         for k in range(self.count_of_scans):
             points_map, stamp_s = hall(rng), 0.1 * k

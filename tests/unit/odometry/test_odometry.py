@@ -59,7 +59,7 @@ def test_poses_are_of_the_vehicle_where_the_lidars_place_is_known(hall_drive):
 
 def test_loops_are_looked_for_and_none_is_made_up_on_a_short_way(hall_drive):
     stages = set()
-    found = find_trajectory(hall_drive(), report=lambda stage, done, of: stages.add(stage))
+    found = find_trajectory(hall_drive(), report=lambda stage, *_: stages.add(stage))
     assert (found.loops, found.before is found.trajectory) == (0, True)
     assert stages == {"odometry", "loops"}
 
