@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import Report, bars
-from model_training.importing.extrinsics import Extrinsics, read_camera, read_extrinsics
+from model_training.importing.extrinsics import read_camera, read_extrinsics
 from model_training.importing.kinds import KINDS, DepthFrom, OpenSettings, open_recording
 from model_training.importing.kitti_object import import_kitti_object
 from model_training.importing.pose_file import read_pose_file
@@ -97,14 +97,14 @@ def command(
     told = OpenSettings(
         depth=cast(DepthFrom, depth or "recorded"), topics=_topics(topic or []), rectified=rectified,
         camera=None if camera is None else read_camera(camera),
-        extrinsics=Extrinsics() if extrinsics is None else read_extrinsics(extrinsics),
+        extrinsics=None if extrinsics is None else read_extrinsics(extrinsics), poses=poses, pictures=pictures,
     )  # fmt: skip
+    if odometry and poses is not None:
+        raise DatasetError("poses: --odometry finds them; give one of the two", field="poses")
     recording = open_recording(kind, source, told)
     console = Console()
     for line in recording.notes.lines:
         console.print(line, soft_wrap=True)
-    if odometry and poses is not None:
-        raise DatasetError("poses: --odometry finds them; give one of the two", field="poses")
     if not odometry:
         trajectory = _trajectory(recording, source, poses)
     with bars() as report:

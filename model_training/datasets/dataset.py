@@ -262,7 +262,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], Transforms]:
     if not path.is_file():
         raise DatasetError(f"{path} is missing", field=path.name)
     stamps, transforms = [], []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
         try:

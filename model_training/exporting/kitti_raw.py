@@ -4,10 +4,10 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from model_training.datasets.dataset import CameraSensor, Dataset, write_tum
+from model_training.datasets.png import write_png
 from model_training.datasets.whole_folder import whole_or_not_at_all
 from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, the_camera
 from service.geometry.rigid import Transform, inverse
@@ -61,8 +61,8 @@ def _write(drive: Path, number: int, moment: Moment) -> None:
     if moment.frame is not None:
         steps = np.rint(moment.frame.depth_m() * _STEPS_PER_M)
         depth = np.where(steps <= np.iinfo(np.uint16).max, steps, 0).astype(np.uint16)
-        cv2.imwrite(str(drive / "image_02" / "data" / f"{name}.png"), moment.frame.rgb()[:, :, ::-1])
-        cv2.imwrite(str(drive / "proj_depth" / "groundtruth" / "image_02" / f"{name}.png"), depth)
+        write_png(drive / "image_02" / "data" / f"{name}.png", np.ascontiguousarray(moment.frame.rgb()[:, :, ::-1]))
+        write_png(drive / "proj_depth" / "groundtruth" / "image_02" / f"{name}.png", depth)
 
 
 def _write_calibration(day: Path, T_vehicle_scan: Transform, camera: CameraSensor | None) -> None:

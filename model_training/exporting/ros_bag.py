@@ -87,21 +87,18 @@ def _writing(out: Path, kind: BagFormat) -> Iterator[tuple[dict[str, Any], Send]
 
 @contextmanager
 def _whole(out: Path) -> Iterator[Path]:
-    """A name beside ``out`` that becomes it when all is written."""
+    """A name in a folder beside ``out`` that becomes it when all is written; the folder goes in any case."""
     import shutil
 
-    part = out.with_name(f".{out.stem}.part{out.suffix}")
-    if part.is_dir():
+    part = out.with_name(f".{out.name}.part")
+    if part.exists():
         shutil.rmtree(part)
-    part.unlink(missing_ok=True)
+    part.mkdir(parents=True)
     try:
-        yield part
-    except BaseException:
-        if part.is_dir():
-            shutil.rmtree(part, ignore_errors=True)
-        part.unlink(missing_ok=True)
-        raise
-    part.rename(out)
+        yield part / out.name  # under its own name, which a ROS 2 bag's files bear too
+        (part / out.name).rename(out)
+    finally:
+        shutil.rmtree(part)
 
 
 class _Messages:

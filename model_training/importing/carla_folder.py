@@ -119,13 +119,12 @@ class CarlaFolder:
         """Frame by frame."""
         for name, stamp_s in zip(self.frames, self.poses.stamps_s, strict=True):
             scan = self.path / "lidar" / f"{name}.ply"
-            if scan.is_file():
-                points = read_cloud(scan)
-                if isinstance(points, str):
-                    yield Unusable("scan", scan.name, points)
-                else:
-                    yield RecordedScan(scan.name, float(stamp_s), points_from_carla(points))
-            if pictures and self.told.camera is not None and (self.path / "rgb" / f"{name}.png").is_file():
+            points = read_cloud(scan) if scan.is_file() else "the file is missing"
+            if isinstance(points, str):
+                yield Unusable("scan", scan.name, points)
+            else:
+                yield RecordedScan(scan.name, float(stamp_s), points_from_carla(points))
+            if pictures and self.told.camera is not None:
                 yield self._picture(name, float(stamp_s), self.told.camera)
 
     def _picture(self, name: str, stamp_s: float, camera: CarlaCamera) -> RecordedPicture | Unusable:
@@ -181,7 +180,7 @@ def _poses(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
             f"{path} is missing: {', '.join(POSE_COLUMNS)} of the vehicle, a line a frame", field=path.name
         )
     names, stamps, poses = [], [], []
-    with path.open(newline="") as file:
+    with path.open(newline="", errors="replace") as file:
         for number, row in enumerate(csv.DictReader(file), 2):
             try:
                 values = [float(row[column]) for column in POSE_COLUMNS[1:]]

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from model_training.datasets.png import write_png
 from model_training.importing.carla_folder import (
     POSE_COLUMNS,
     CarlaCamera,
@@ -88,7 +88,7 @@ class MomentWriter:
         _write_ply(self._out / "lidar" / f"{name}.ply", points)
         for kind, image in (("rgb", rgb), ("depth", depth)):
             bgra = np.frombuffer(image.raw_data, np.uint8).reshape(image.height, image.width, 4)
-            cv2.imwrite(str(self._out / kind / f"{name}.png"), bgra[:, :, :3])
+            write_png(self._out / kind / f"{name}.png", np.ascontiguousarray(bgra[:, :, :3]))
         at, turned = transform.location, transform.rotation
         with (self._out / "poses.csv").open("a", newline="") as file:
             csv.writer(file).writerow([name, f"{stamp_s:.6f}", at.x, at.y, at.z, turned.roll, turned.pitch, turned.yaw])
@@ -110,18 +110,29 @@ def record(host: str, port: int, out: Path, settings: RecordSettings, *, report:
         Frames recorded.
 
     Raises:
-        DatasetError: the server does not answer, or a name is not known to it.
+        DatasetError: the server does not answer, or stops to, or a name is not known to it; or ``out`` is not empty.
     """
     import carla
+
+    done = 0
+
+    def told(frames: int, of: int) -> None:
+        nonlocal done
+        done = frames
+        report(frames, of)
 
     client = carla.Client(host, port)
     client.set_timeout(settings.timeout_s)
     try:
-        world = client.load_world(settings.town) if settings.town else client.get_world()
-    except RuntimeError as error:
-        raise DatasetError(
-            f"no CARLA at {host}:{port} ({error}); start it, or name another --host", field="host"
-        ) from error
+        return _recorded(carla, client, out, settings, told)
+    except RuntimeError as error:  # whatever the client meets, a time-out among it
+        told_by = f"CARLA at {host}:{port} does not do its part ({error})"
+        remedy = f"{done} frames are in {out}; start it again" if done else "start it, or name another --host or --town"
+        raise DatasetError(f"{told_by}; {remedy}", field="host") from error
+
+
+def _recorded(carla: Any, client: Any, out: Path, settings: RecordSettings, report: Callable[[int, int], None]) -> int:
+    world = client.load_world(settings.town) if settings.town else client.get_world()
     if settings.weather:
         if not hasattr(carla.WeatherParameters, settings.weather):
             raise DatasetError(
@@ -129,19 +140,17 @@ def record(host: str, port: int, out: Path, settings: RecordSettings, *, report:
             )
         world.set_weather(getattr(carla.WeatherParameters, settings.weather))
     town = world.get_map().name.rsplit("/", 1)[-1]
-    writer = MomentWriter(out, CarlaRecording(town=town, lidar=settings.lidar, camera=settings.camera))
     with _synchronous(world, client, settings), ExitStack() as actors:
         vehicle = _vehicle(world, settings, actors)
         sensors = {kind: _sensor(carla, world, vehicle, kind, settings, actors) for kind in ("lidar", "rgb", "depth")}
-        done = 0
-        while done < settings.frames:
+        writer = MomentWriter(out, CarlaRecording(town=town, lidar=settings.lidar, camera=settings.camera))
+        for done in range(1, settings.frames + 1):
             frame = world.tick()
             data = {kind: _of_frame(waiting, frame, settings.timeout_s) for kind, waiting in sensors.items()}
             snapshot = world.get_snapshot()
             writer.write(frame, snapshot.timestamp.elapsed_seconds, vehicle.get_transform(), **data)
-            done += 1
             report(done, settings.frames)
-    return done
+    return settings.frames
 
 
 @contextmanager
@@ -149,14 +158,13 @@ def _synchronous(world: Any, client: Any, settings: RecordSettings) -> Iterator[
     before, wanted = world.get_settings(), world.get_settings()
     wanted.synchronous_mode, wanted.fixed_delta_seconds = True, settings.step_s
     traffic = client.get_trafficmanager()
-    traffic.set_synchronous_mode(True)
-    traffic.set_random_device_seed(settings.seed)
-    world.apply_settings(wanted)
-    try:
+    with ExitStack() as put_back:
+        put_back.callback(world.apply_settings, before)
+        put_back.callback(traffic.set_synchronous_mode, False)
+        traffic.set_synchronous_mode(True)
+        traffic.set_random_device_seed(settings.seed)
+        world.apply_settings(wanted)
         yield
-    finally:
-        traffic.set_synchronous_mode(False)
-        world.apply_settings(before)
 
 
 def _vehicle(world: Any, settings: RecordSettings, actors: ExitStack) -> Any:
@@ -215,8 +223,13 @@ def _of_frame(waiting: "queue.Queue[Any]", frame: int, timeout_s: float) -> Any:
             raise DatasetError(
                 f"a sensor gave nothing for {timeout_s:g} s; is the server alive?", field="host"
             ) from error
-        if data.frame >= frame:
+        if data.frame == frame:
             return data
+        if data.frame > frame:
+            raise DatasetError(
+                f"a sensor skipped frame {frame}; is another client ticking this server? Let this be the only one",
+                field="host",
+            )
 
 
 def _write_ply(path: Path, points: np.ndarray) -> None:

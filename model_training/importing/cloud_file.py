@@ -12,6 +12,8 @@ from model_training.importing.scan_file import read_scan
 
 Points = Float32[NDArray[np.float32], "N 4"]
 _INTENSITY = ("intensity", "Intensity", "I", "i", "reflectivity", "scalar_Intensity", "scalar_intensity")
+#: No return comes from further away: such points are a map's, whose coordinates float32 does not hold.
+_FARTHEST_M = 20_000.0
 #: Bytes of a file that are read at all.
 MAX_BYTES = 1 << 30
 
@@ -28,7 +30,7 @@ def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
     if path.stat().st_size > MAX_BYTES:
         return f"more than {MAX_BYTES >> 20} MiB"
     try:
-        columns = _READERS[path.suffix.lower()](path)
+        columns = _READERS[path.suffix.lower()](path, max_points)
     except ModuleNotFoundError:
         raise
     except Exception as error:  # three packages, each with errors of its own, and whatever damage makes NumPy raise
@@ -37,27 +39,36 @@ def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
         return columns
     if len(columns) > max_points:
         return f"more than {max_points} points"
-    return columns if len(columns) else "no points"
+    if not len(columns):
+        return "no points"
+    away = np.abs(columns[:, :3])
+    if away.max(initial=0.0, where=np.isfinite(away)) > _FARTHEST_M:
+        return f"its points lie more than {_FARTHEST_M / 1000:g} km away: a scan is wanted in its LiDAR's frame, not in a map's"
+    return columns
 
 
-def _pcd(path: Path) -> Points | str:
+def _pcd(path: Path, max_points: int) -> Points | str:
     from pypcd4.pypcd4 import PointCloud
 
+    del max_points  # its bytes, which were counted, are nearly those in memory
     cloud = PointCloud.from_path(path)
     return _columns(cloud.fields, lambda name: cloud.numpy((name,))[:, 0])
 
 
-def _ply(path: Path) -> Points | str:
+def _ply(path: Path, max_points: int) -> Points | str:
     from plyfile import PlyData
 
+    del max_points
     vertices = PlyData.read(str(path))["vertex"].data
     return _columns(vertices.dtype.names, lambda name: vertices[name])
 
 
-def _las(path: Path) -> Points | str:
+def _las(path: Path, max_points: int) -> Points | str:
     import laspy
 
     with laspy.open(path) as file:
+        if file.header.point_count > max_points:  # LAZ is packed: its bytes say little
+            return f"more than {max_points} points"
         cloud = file.read()
     xyz = np.asarray(cloud.xyz)
     return np.asarray(np.c_[xyz, np.asarray(cloud.intensity)], np.float32)
@@ -73,5 +84,5 @@ def _columns(names: Sequence[str], column: Callable[[str], Any]) -> Points | str
     return np.stack(chosen, axis=1)
 
 
-_READERS: dict[str, Callable[[Path], Points | str]] = {".pcd": _pcd, ".ply": _ply, ".las": _las, ".laz": _las}
+_READERS: dict[str, Callable[[Path, int], Points | str]] = {".pcd": _pcd, ".ply": _ply, ".las": _las, ".laz": _las}
 SUFFIXES = (".bin", *_READERS)

@@ -60,8 +60,12 @@ class Clouds:
             yield Unusable("scan", path.name, points) if isinstance(points, str) else RecordedScan(path.name, stamp_s, points)  # fmt: skip
 
 
-def open_clouds(source: Path) -> Clouds:
+def open_clouds(source: Path, poses: Path | None = None) -> Clouds:
     """Open a folder.
+
+    Args:
+        source: the folder.
+        poses: TUM file, a line a scan; by default one of ``POSES`` beside the scans.
 
     Raises:
         DatasetError: there is no scan in it, or poses and scans do not go together.
@@ -71,7 +75,7 @@ def open_clouds(source: Path) -> Clouds:
         raise DatasetError(
             f"{source}: a folder of scans is wanted ({', '.join(SUFFIXES)}); here is none", field="source"
         )
-    named = next((source / name for name in POSES if (source / name).is_file()), None)
+    named = poses or next((source / name for name in POSES if (source / name).is_file()), None)
     if named is None:
         return Clouds(source, files, tuple(k * STEP_S for k in range(len(files))), None)
     stamps, T = read_tum(named)

@@ -10,6 +10,13 @@ from service.geometry.rigid import Transform, inverse
 
 #: Points this close in time share a pose: at 20 m/s and 90 deg/s that is 2 cm and 0.1 degrees.
 STEP_S = 0.001
+#: No turn takes longer: times further from the scan's stamp are those of another clock.
+MOST_OFFSET_S = 1.0
+
+
+def times_fit(scan: RecordedScan) -> bool:
+    """Whether the times of a scan's points are of the clock of its stamp, so that they can be used; True where there are none."""
+    return scan.offsets_s is None or bool((np.abs(scan.offsets_s) <= MOST_OFFSET_S).all())  # False for NaN too
 
 
 def deskewed(

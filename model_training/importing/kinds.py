@@ -23,13 +23,30 @@ class OpenSettings:
         extrinsics: mountings that the recording does not tell.
         camera: intrinsics that the recording does not tell.
         rectified: whether a bag's pictures are rectified already; None believes the topic's name.
+        poses: TUM file of the poses, which scans in files of their own have their times from.
+        pictures: whether they will be asked for.
     """
 
     depth: DepthFrom = "recorded"
     topics: Mapping[str, str] = field(default_factory=dict)
-    extrinsics: Extrinsics = field(default_factory=Extrinsics)
+    extrinsics: Extrinsics | None = None
     camera: PinholeCamera | None = None
     rectified: bool | None = None
+    poses: Path | None = None
+    pictures: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A format: its reader, the depths that it can give, and which of the settings concern it beside these."""
+
+    open: Callable[[Path, OpenSettings], Recording]
+    depths: tuple[DepthFrom, ...]
+    takes: frozenset[str] = frozenset()
+
+
+#: Settings that concern some formats only, and what the command line calls them.
+_OPTIONS = {"topics": "topic", "extrinsics": "extrinsics", "camera": "camera", "rectified": "rectified"}
 
 
 def open_recording(kind: str, source: Path, settings: OpenSettings) -> Recording:
@@ -47,7 +64,19 @@ def open_recording(kind: str, source: Path, settings: OpenSettings) -> Recording
         raise DatasetError(f"kind: {kind!r} is not known; there is: {', '.join(sorted(KINDS))}", field="kind")
     if not source.exists():
         raise DatasetError(f"{source}: there is nothing of that name", field="source")
-    return KINDS[kind](source, settings)
+    _refuse_what_does_not_apply(kind, settings)
+    return KINDS[kind].open(source, settings)
+
+
+def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
+    known, unasked = KINDS[kind], OpenSettings()
+    if settings.depth not in known.depths:
+        raise DatasetError(
+            f"depth: {kind} has no {settings.depth!r} depth; there is: {', '.join(known.depths)}", field="depth"
+        )
+    for field_name, option in _OPTIONS.items():
+        if field_name not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
+            raise DatasetError(f"{option}: {kind} has no use for it; leave it out", field=option)
 
 
 def _kitti_raw(source: Path, settings: OpenSettings) -> Recording:
@@ -65,8 +94,7 @@ def _kitti_odometry(source: Path, settings: OpenSettings) -> Recording:
 def _clouds(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.clouds import open_clouds
 
-    del settings  # nothing of them concerns scans in files
-    return open_clouds(source)
+    return open_clouds(source, settings.poses)
 
 
 def _carla(source: Path, settings: OpenSettings) -> Recording:
@@ -89,12 +117,12 @@ def _open3d(source: Path, settings: OpenSettings) -> Recording:
 
 
 def _rosbag(source: Path, settings: OpenSettings) -> Recording:
-    from model_training.importing.ros_bag import BagSettings, RosBag
+    from model_training.importing.ros_bag import RosBag
+    from model_training.importing.ros_content import BagSettings
 
-    if settings.depth not in ("recorded", "lidar"):
-        raise DatasetError(f"depth: a bag has no {settings.depth!r} depth; give recorded or lidar", field="depth")
     bag = BagSettings(
-        settings.topics, extrinsics=settings.extrinsics, rectified=settings.rectified, want_depth=settings.depth == "recorded"
+        settings.topics, extrinsics=settings.extrinsics or Extrinsics(), camera=settings.camera, rectified=settings.rectified,
+        want_pictures=settings.pictures, want_depth=settings.depth == "recorded",
     )  # fmt: skip
     return RosBag(source, bag)
 
@@ -103,12 +131,13 @@ def _kitti_depth(depth: DepthFrom) -> Literal["none", "stored", "sgbm"]:
     return "none" if depth == "lidar" else "stored" if depth in ("stored", "recorded") else "sgbm"
 
 
-KINDS: dict[str, Callable[[Path, OpenSettings], Recording]] = {
-    "kitti-raw": _kitti_raw,
-    "kitti-odometry": _kitti_odometry,
-    "rosbag": _rosbag,
-    "carla": _carla,
-    "clouds": _clouds,
-    "open3d": _open3d,
-    "tum-rgbd": _tum_rgbd,
+_KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
+KINDS: dict[str, Kind] = {
+    "kitti-raw": Kind(_kitti_raw, _KITTI),
+    "kitti-odometry": Kind(_kitti_odometry, _KITTI),
+    "rosbag": Kind(_rosbag, ("recorded", "lidar"), frozenset({"topics", "extrinsics", "camera", "rectified"})),
+    "carla": Kind(_carla, ("recorded", "lidar")),
+    "clouds": Kind(_clouds, ("recorded",)),
+    "open3d": Kind(_open3d, ("recorded",), frozenset({"camera"})),
+    "tum-rgbd": Kind(_tum_rgbd, ("recorded",), frozenset({"camera"})),
 }

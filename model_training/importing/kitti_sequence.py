@@ -85,7 +85,17 @@ class KittiSequence:
         return self.poses
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """Frame by frame."""
+        """Frame by frame.
+
+        Raises:
+            DatasetError: stereo is wanted and the right camera is not calibrated.
+        """
+        if pictures and self.depth == "sgbm" and self.calibration.focal_baseline_px_m is None:
+            raise DatasetError(
+                f"{self.path}: the calibration does not name the right camera (P3), so stereo has no baseline; "
+                "add it, or take --depth lidar",
+                field="P3",
+            )
         for frame in self.frames:
             if frame.scan is not None:
                 points = read_scan(frame.scan)
@@ -112,21 +122,24 @@ class KittiSequence:
                 return self._matched(picture, read_rgb(frame.right))
             return picture
         except DatasetError as error:
-            return Unusable("picture", name, error.message.removeprefix(f"{left}: "))
+            return Unusable("picture", name, _without_names(error.message, (left, frame.right, frame.stored)))
 
     def _matched(self, picture: RecordedPicture, right: NDArray[np.uint8]) -> RecordedPicture | Unusable:
         if right.shape != picture.rgb.shape:
             return Unusable("picture", picture.name, "its right picture has another size")
-        if self.calibration.focal_baseline_px_m is None:
-            raise DatasetError(
-                f"{self.path}: the calibration does not name the right camera (P3), so stereo has no baseline; "
-                "add it, or take --depth lidar",
-                field="P3",
-            )
+        assert self.calibration.focal_baseline_px_m is not None  # noqa: S101  # or ``events`` had said so
         depth_m: Float32[NDArray[np.float32], "H W"] = depth_from_stereo(
             picture.rgb, right, focal_baseline_px_m=self.calibration.focal_baseline_px_m
         )
         return replace(picture, depth=depth_m)
+
+
+def _without_names(message: str, files: tuple[Path | None, ...]) -> str:
+    """A message about a file in words that are the same for all files like it, so that they are counted as one."""
+    for path in files:
+        if path is not None:
+            message = message.replace(f"{path}: ", f"{path.parent.name}: ")
+    return message
 
 
 def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:

@@ -7,7 +7,7 @@ plane, so walls and ground come out exactly. Triangles across an edge of depth, 
 import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay
+from scipy.spatial import Delaunay, QhullError
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform, transform_points
@@ -40,7 +40,10 @@ def depth_from_scan(
     uv, z_m = _visible(points, T_camera_lidar, camera)
     if len(z_m) < 4:
         return depth_m
-    triangulation = Delaunay(uv)
+    try:
+        triangulation = Delaunay(uv)
+    except QhullError:  # all on one line of the picture: there is no surface between them
+        return depth_m
     corners = triangulation.simplices
     z = z_m[corners]
     sides = np.linalg.norm(uv[corners] - uv[np.roll(corners, 1, axis=1)], axis=2).max(axis=1)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model_training.datasets.dataset import LidarSensor, read_tum
 from model_training.importing.depth_scan import scan_from_depth
@@ -81,11 +82,14 @@ class RgbdFolder:
                 yield picture
 
     def _picture(self, frame: RgbdFrame) -> RecordedPicture | Unusable:
+        rgb: NDArray[np.uint8] | None = None
         try:
             rgb = read_rgb(frame.rgb)
             values = read_depth_values(frame.depth.read_bytes(), encoding=None, limits=_LIMITS)
         except (StreetfixError, OSError) as error:
-            return Unusable("picture", frame.rgb.name, f"cannot be read: {error}".replace(f"{frame.rgb}: ", ""))
+            file = "its depth" if rgb is not None else "it"
+            why = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read ({type(error).__name__})"
+            return Unusable("picture", frame.rgb.name, f"{file} {why}")
         depth = np.asarray(values, np.uint16) if values.dtype == np.uint16 else np.asarray(values, np.float32)
         size = (self.camera.height, self.camera.width)
         if rgb.shape[:2] != size or depth.shape != size:
@@ -205,5 +209,8 @@ def _open3d_poses(path: Path) -> Trajectory:
             stamps.append(int(lines[start].split()[0]) / RATE_HZ)
         except (ValueError, IndexError) as error:
             raise DatasetError(f"{path}, line {start + 1}: not a frame of five lines", field=path.name) from error
+        R = T[:3, :3]
+        if not (np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3)):
+            raise DatasetError(f"{path}, line {start + 1}: the frame's matrix is no pose", field=path.name)
         poses.append(T)
     return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4), str(path))

@@ -1,5 +1,6 @@
 """``sensor_msgs/PointCloud2`` of any field layout."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,35 +33,36 @@ def points_of_cloud(
     missing = [name for name in "xyz" if name not in fields]
     if missing:
         return f"its fields have no {', '.join(missing)} (they are: {', '.join(fields) or 'none'})"
-    unknown = [field.name for field in message.fields if field.datatype not in _TYPES]
+    intensity = next((name for name in _INTENSITY if name in fields), None)
+    time = next((name for name in _TIME if name in fields), None)
+    used = [fields[name] for name in ("x", "y", "z", intensity, time) if name is not None]
+    unknown = [field.name for field in used if field.datatype not in _TYPES]
     if unknown:
         return f"unknown datatype of field {unknown[0]}"
-    rows = _rows(message)
+    rows = _rows(message, used)
     if isinstance(rows, str):
         return rows
-    intensity = next((name for name in _INTENSITY if name in fields), None)
     points = np.zeros((count, 4), np.float32)
     for column, name in enumerate(("x", "y", "z", intensity)):
         if name is not None:
             points[:, column] = rows[name].reshape(-1)
-    time = next((name for name in _TIME if name in fields), None)
     return points, None if time is None else _offsets(rows[time].reshape(-1), stamp_s)
 
 
-def _rows(message: Any) -> NDArray[Any] | str:
-    """The message's bytes as records, (height, width), without padding copied."""
+def _rows(message: Any, used: Sequence[Any]) -> NDArray[Any] | str:
+    """The message's bytes as records of the fields that are used, (height, width), without padding copied."""
     order = ">" if message.is_bigendian else "<"
     step, row_step = int(message.point_step), int(message.row_step)
-    ends = [field.offset + int(_TYPES[field.datatype][1]) * max(1, field.count) for field in message.fields]
+    ends = [field.offset + int(_TYPES[field.datatype][1]) * max(1, field.count) for field in used]
     if step < max(ends) or row_step < step * message.width:
         return f"its point_step of {step} bytes does not hold its fields, or its row_step not its points"
     if len(message.data) < row_step * message.height:
-        return f"its data are {len(message.data)} of {row_step * message.height} bytes: truncated"
+        return "its data are fewer bytes than its row_step and height say: truncated"
     dtype = np.dtype(
         {
-            "names": [field.name for field in message.fields],
-            "formats": [order + _TYPES[field.datatype] for field in message.fields],
-            "offsets": [field.offset for field in message.fields],
+            "names": [field.name for field in used],
+            "formats": [order + _TYPES[field.datatype] for field in used],
+            "offsets": [field.offset for field in used],
             "itemsize": step,
         }
     )

@@ -9,18 +9,17 @@ from model_training.importing.trajectory import Trajectory
 from service.geometry.rigid import Transform, inverse, rotation_from_quaternion_xyzw, transform_from
 
 
-def transform_of(message: Any) -> Transform:
+def transform_of(message: Any) -> Transform | None:
     """A geometry_msgs Transform (translation, rotation) or Pose (position, orientation) as a matrix.
 
-    Raises:
-        ValueError: a number is none, or the quaternion is zero.
+    None where a number is none or the quaternion is zero, as localisers send it before they know anything.
     """
     at = message.translation if hasattr(message, "translation") else message.position
     turned = message.rotation if hasattr(message, "rotation") else message.orientation
     quaternion = np.array([turned.x, turned.y, turned.z, turned.w], np.float64)
     translation = np.array([at.x, at.y, at.z], np.float64)
     if not np.isfinite(translation).all() or not np.isfinite(quaternion).all() or np.linalg.norm(quaternion) < 1e-6:
-        raise ValueError("a pose of numbers and a unit quaternion are wanted")
+        return None
     return transform_from(rotation_from_quaternion_xyzw(quaternion), translation)
 
 
@@ -39,19 +38,22 @@ class FrameTree:
     _parent: dict[str, str] = field(default_factory=dict)
     _static: set[str] = field(default_factory=set)
 
-    def add(self, message: Any, *, static: bool) -> None:
-        """Take one TransformStamped; of a moving edge times must rise, and what does not is left out."""
+    def add(self, message: Any, *, static: bool) -> bool:
+        """Take one TransformStamped, and say whether: of a moving edge times must rise, and poses are to be numbers."""
         child, parent = _name(message.child_frame_id), _name(message.header.frame_id)
-        stamp_s = 0.0 if static else stamp_of(message.header)
+        stamp_s, T = 0.0 if static else stamp_of(message.header), transform_of(message.transform)
+        if T is None:
+            return False
         if static:
             self._static.add(child)
             self._stamps[child], self._poses[child] = [], []
         stamps = self._stamps.setdefault(child, [])
         if stamps and stamp_s <= stamps[-1]:
-            return
+            return False
         self._parent[child] = parent
         stamps.append(stamp_s)
-        self._poses.setdefault(child, []).append(transform_of(message.transform))
+        self._poses.setdefault(child, []).append(T)
+        return True
 
     def chain(self, frame: str) -> list[str]:
         """The frame and all above it, to the root."""
@@ -87,6 +89,11 @@ class FrameTree:
                 Trajectory(np.array(self._stamps[edge]), poses, edge).between(stamps) if edge in edges else poses[0]
             ) @ T
         return chain[-1], Trajectory(stamps, T, name)
+
+    def lowest_that_moves(self) -> str | None:
+        """The moving frame with the most edges above it: of map, odom and base_link the last; None where nothing moves."""
+        moving = [name for name in self._stamps if name not in self._static and len(self._stamps[name]) > 1]
+        return max(moving, key=lambda name: len(self.chain(name)), default=None)
 
     def _down(self, top: str, chain: list[str]) -> Transform:
         T = np.eye(4)

@@ -20,6 +20,10 @@ _COLOUR = {
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _PINHOLE_MODELS = ("", "plumb_bob", "rational_polynomial")
 _FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt4")
+#: How many coefficients OpenCV knows, by lens.
+_COEFFICIENTS: dict[Lens, tuple[int, ...]] = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
+#: What image_transport puts behind the name of a picture's topic.
+_TRANSPORTS = ("compressed", "compressedDepth")
 _LIMITS = ImageLimits()
 
 
@@ -55,6 +59,12 @@ def depth_of(message: Any) -> Depth | str:
     return _as_depth(np.ascontiguousarray(pixels[:, :, 0]))
 
 
+def is_rectified_by_name(topic: str) -> bool:
+    """Whether a topic's name says that its pictures are rectified (``image_rect_color``, ``image_rect/compressed``)."""
+    parts = [part for part in topic.split("/") if part not in _TRANSPORTS]
+    return "rect" in parts[-1] if parts else False
+
+
 def _as_depth(values: NDArray[Any]) -> Depth:
     return np.asarray(values, np.uint16) if values.dtype == np.uint16 else np.asarray(values, np.float32)
 
@@ -77,6 +87,9 @@ def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens]
         return f"unknown distortion_model {model[:40]!r} (known: {', '.join((*_PINHOLE_MODELS[1:], *_FISHEYE_MODELS))})"
     distortion = () if is_rectified or not D.any() else tuple(float(x) for x in D)
     lens: Lens = "fisheye" if model in _FISHEYE_MODELS else "pinhole"
+    if distortion and (len(distortion) not in _COEFFICIENTS[lens] or not np.isfinite(distortion).all()):
+        wanted = " or ".join(str(n) for n in _COEFFICIENTS[lens])
+        return f"distortion_model {model!r} has {len(distortion)} coefficients; {wanted} finite ones are wanted"
     camera = PinholeCamera(
         int(message.width), int(message.height), float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]),
         distortion,
@@ -91,7 +104,7 @@ def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any] | str:
     if height < 1 or width < 1 or height * width > _LIMITS.max_pixels:
         return f"its size of {width}x{height} pixels is none, or over the limit"
     if step < width * channels * size or len(message.data) < step * height:
-        return f"its data are {len(message.data)} bytes, too few for {width}x{height} {message.encoding}: truncated"
+        return f"its data are too few bytes for {width}x{height} {message.encoding}: truncated"
     order = ">" if message.is_bigendian else "<"
     rows: NDArray[Any] = np.ndarray(
         (height, width, channels), np.dtype(order + dtype), np.ascontiguousarray(message.data).data,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import DatasetDescription, Sensors, write_description
 from model_training.datasets.whole_folder import whole_or_not_at_all
-from model_training.importing.deskew import deskewed
+from model_training.importing.deskew import MOST_OFFSET_S, deskewed, times_fit
 from model_training.importing.dropped import Dropped
 from model_training.importing.lidar_depth import depth_from_scan
 from model_training.importing.recording import RecordedPicture, RecordedScan, Recording, Unusable
@@ -29,6 +29,8 @@ Report = Callable[[str, int, int], None]
 
 #: Scans that are kept while pictures wait for the one nearest to them.
 _RECENT_SCANS = 3
+#: Decoded pictures that wait for a scan after them; then the oldest makes do with the scans before it.
+_MOST_WAITING = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class TakeSettings:
         tolerance_s: how far a pose, or the scan of a depth, may be from a frame.
         deskew: take the vehicle's motion out of scans that tell their points' times.
         hold_out: each how many scans one is left out of the survey; 0 leaves none out. Pictures are then queries only if the
-            scan nearest to them was left out, so that no query's own moment is in the map.
+            scan nearest to them was left out, so that no query's own moment is in the map; the others are counted.
         hold_out_first: the first scan that is left out, counted from 0.
         max_points: of a scan; more is refused before it is kept.
     """
@@ -140,6 +142,11 @@ class _Taking:
             self.dropped.add("scan", scan.name, T_map_vehicle)
             return
         clean = scan if finite.all() else _only(scan, finite)
+        if self._settings.deskew and not times_fit(clean):
+            self.dropped.add(
+                "de-skew", scan.name, f"its points' times are more than {MOST_OFFSET_S:g} s from its stamp"
+            )
+            clean = replace(clean, offsets_s=None)
         points = deskewed(clean, self._trajectory, self._T_vehicle_lidar) if self._settings.deskew else clean.points
         self._last_scan_s = scan.stamp_s
         is_held = (
@@ -156,6 +163,8 @@ class _Taking:
     def picture(self, picture: RecordedPicture) -> None:
         if self._needs_scans():
             self._waiting.append(picture)
+            if len(self._waiting) > _MOST_WAITING:
+                self._answer(self._waiting.popleft())
         else:
             self._query(picture, None)
 
@@ -192,7 +201,7 @@ class _Taking:
             return "no finite points"
         if len(scan.points) > self._settings.max_points:
             return f"more than {self._settings.max_points} points"
-        if scan.stamp_s <= self._last_scan_s:
+        if not scan.stamp_s > self._last_scan_s:  # nor is NaN
             return "its time is not after the scan's before it"
         return None
 
@@ -202,16 +211,19 @@ class _Taking:
     def _answer_waiting(self, *, until_s: float) -> None:
         """Pictures wait until a scan after them came, so that the nearest of all is known."""
         while self._waiting and self._waiting[0].stamp_s <= until_s:
-            picture = self._waiting.popleft()
-            if not self._recent:
-                self.dropped.add("picture", picture.name, "no scan near it in time")
-                continue
-            stamp_s, is_held, points = min(self._recent, key=lambda scan: abs(scan[0] - picture.stamp_s))
-            if self._settings.hold_out and not is_held:
-                continue
-            if self._settings.depth == "lidar" and abs(stamp_s - picture.stamp_s) > self._settings.tolerance_s:
-                self.dropped.add("picture", picture.name, f"no scan within {self._settings.tolerance_s:g} s")
-                continue
+            self._answer(self._waiting.popleft())
+
+    def _answer(self, picture: RecordedPicture) -> None:
+        """Take a picture with the scan nearest to it, or count why not."""
+        if not self._recent:
+            self.dropped.add("picture", picture.name, "no scan near it in time")
+            return
+        stamp_s, is_held, points = min(self._recent, key=lambda scan: abs(scan[0] - picture.stamp_s))
+        if self._settings.depth == "lidar" and abs(stamp_s - picture.stamp_s) > self._settings.tolerance_s:
+            self.dropped.add("picture", picture.name, f"no scan within {self._settings.tolerance_s:g} s")
+        elif self._settings.hold_out and not is_held:
+            self.dropped.add("picture", picture.name, "the scan nearest to it is in the survey (--hold-out)")
+        else:
             self._query(picture, (stamp_s, points))
 
     def _query(self, picture: RecordedPicture, scan: tuple[float, NDArray[np.float32]] | None) -> None:
@@ -250,11 +262,12 @@ def finite_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def scans_of(recording: Recording) -> Iterator[RecordedScan]:
-    """The usable scans of a recording alone, NaN points dropped: what odometry reads."""
+    """The usable scans of a recording alone, without NaN points and without times of another clock: what odometry reads."""
     last_s = -np.inf
     for event in recording.events(pictures=False):
         if isinstance(event, RecordedScan) and event.stamp_s > last_s:
             finite = finite_points(event.points)
             if finite.any():
                 last_s = event.stamp_s
-                yield event if finite.all() else _only(event, finite)
+                clean = event if finite.all() else _only(event, finite)
+                yield clean if times_fit(clean) else replace(clean, offsets_s=None)

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from service.errors import DatasetError
 
 Sync = Literal["interpolate", "nearest"]
+#: Times are doubles since 1970, which are whole steps of a quarter of a microsecond.
+_SLACK_S = 1e-6
 Transforms = Float64[NDArray[np.float64], "N 4 4"]
 
 
@@ -24,7 +26,7 @@ class Trajectory:
         name: the file or topic, for messages.
 
     Raises:
-        DatasetError: there are no poses, or time does not rise, naming the first pose where it does not.
+        DatasetError: there are no poses, one is no numbers, or time does not rise, naming the first such pose.
     """
 
     stamps_s: Float64[NDArray[np.float64], " N"]
@@ -35,6 +37,12 @@ class Trajectory:
         """Refuse what cannot be asked."""
         if not len(self.stamps_s):
             raise DatasetError(f"{self.name}: there is no pose in it; name another source of poses", field="poses")
+        finite = np.isfinite(self.stamps_s) & np.isfinite(self.T_map_vehicle).all(axis=(1, 2))
+        if not finite.all():
+            raise DatasetError(
+                f"{self.name}, pose {int(np.argmin(finite)) + 1}: a number in it is not finite; leave it out",
+                field="poses",
+            )
         late = np.flatnonzero(np.diff(self.stamps_s) <= 0)
         if len(late):
             k = int(late[0]) + 1
@@ -49,18 +57,20 @@ class Trajectory:
 
         Args:
             stamp_s: the moment.
-            sync: ``interpolate`` between the poses before and after (position linearly, rotation by slerp); ``nearest`` takes one.
+            sync: ``interpolate`` between the poses before and after (position linearly, rotation by slerp), and never beyond the
+                first and last; ``nearest`` takes one, as is done with a single pose.
             tolerance_s: how far the poses that are used may be from the moment.
         """
         after = int(np.searchsorted(self.stamps_s, stamp_s))
         around = [k for k in (after - 1, after) if 0 <= k < len(self.stamps_s)]
         away = np.abs(self.stamps_s[around] - stamp_s)
-        if away.min() <= 1e-9 or sync == "nearest" or len(around) == 1:
-            nearest = around[int(np.argmin(away))]
-            if abs(self.stamps_s[nearest] - stamp_s) > tolerance_s + 1e-9:
+        if away.min() <= _SLACK_S or sync == "nearest" or len(self.stamps_s) == 1:
+            if away.min() > tolerance_s + _SLACK_S:
                 return f"no pose within {tolerance_s:g} s"
-            return np.asarray(self.T_map_vehicle[nearest])
-        if away.max() > tolerance_s + 1e-9:
+            return np.asarray(self.T_map_vehicle[around[int(np.argmin(away))]])
+        if len(around) == 1:
+            return "it lies before the first pose" if after == 0 else "it lies after the last pose"
+        if away.max() > tolerance_s + _SLACK_S:
             return f"no poses within {tolerance_s:g} s before and after"
         return np.asarray(self.between(np.array([stamp_s]))[0])
 

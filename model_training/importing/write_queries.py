@@ -3,7 +3,6 @@
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +13,7 @@ from model_training.datasets.dataset import (
     query_folder,
     write_tum,
 )
+from model_training.datasets.png import write_png
 from model_training.importing.recording import Depth, RecordedPicture
 from service.geometry.rigid import Transform
 
@@ -52,7 +52,7 @@ class QueryWriter:
             return "its depth is empty"
         number = f"{self.count:06d}"
         self._write_rgb(picture, number)
-        _write_png(self._folder / "depth" / f"{number}.png", values)
+        write_png(self._folder / "depth" / f"{number}.png", values)
         self._stamps.append(picture.stamp_s)
         self._poses.append(T_map_camera)
         self._camera_names.append(self._camera_name(picture, scale_m))
@@ -72,7 +72,7 @@ class QueryWriter:
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(picture.file, target)
         else:
-            _write_png(self._folder / "rgb" / f"{number}.png", np.ascontiguousarray(picture.rgb[:, :, ::-1]))
+            write_png(self._folder / "rgb" / f"{number}.png", np.ascontiguousarray(picture.rgb[:, :, ::-1]))
 
     def _camera_name(self, picture: RecordedPicture, scale_m: float) -> str:
         pinhole = picture.camera
@@ -94,8 +94,3 @@ def whole_steps(depth: Depth, scale_m: float) -> tuple[NDArray[np.uint16], float
     metres = np.nan_to_num(np.asarray(depth, np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     steps = np.rint(metres / METRES_SCALE_M)
     return np.where((steps > 0) & (steps <= np.iinfo(np.uint16).max), steps, 0).astype(np.uint16), METRES_SCALE_M
-
-
-def _write_png(path: Path, values: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 2])[1].tobytes())

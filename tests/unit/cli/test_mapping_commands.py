@@ -232,7 +232,7 @@ def test_build_map_of_no_dataset_says_what_makes_one(
     ("arguments", "message"),
     [
         (("ros", "x"), "kind: 'ros' is not known"),
-        (("kitti-object", "x", "--depth", "radar"), "depth: 'radar' is neither"),
+        (("kitti-object", "x", "--depth", "radar"), "depth: 'radar' is none of"),
     ],
 )
 def test_import_says_what_there_is(

@@ -1,0 +1,198 @@
+"""What is in a ROS bag: its topics, the poses, and where LiDAR and camera stand. Scans and pictures are left for later."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from model_training.importing.extrinsics import Extrinsics
+from model_training.importing.recording import Lens
+from model_training.importing.ros_frames import FrameTree, stamp_of, transform_of
+from model_training.importing.ros_picture import camera_of, is_rectified_by_name
+from model_training.importing.ros_reader import BagReader, Damage
+from model_training.importing.ros_topics import POSE_TYPES, Topics, topics_of
+from model_training.importing.trajectory import Trajectory
+from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import Transform
+
+_TF = POSE_TYPES[-1]
+
+
+@dataclass(frozen=True, slots=True)
+class BagSettings:
+    """What is told of a bag.
+
+    Attributes:
+        topics: by role: scan, color, depth, info, poses.
+        extrinsics: mountings that the bag does not tell.
+        camera: intrinsics, where the bag has no CameraInfo.
+        rectified: whether pictures are rectified already; None believes the topic's name.
+        want_pictures: False asks neither for intrinsics nor for the camera's mounting.
+        want_depth: False pairs no depth with colour.
+        max_points: of a scan.
+    """
+
+    topics: Mapping[str, str] = field(default_factory=dict)
+    extrinsics: Extrinsics = field(default_factory=Extrinsics)
+    camera: PinholeCamera | None = None
+    rectified: bool | None = None
+    want_pictures: bool = True
+    want_depth: bool = True
+    max_points: int = 5_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class BagCamera:
+    """The camera of the colour topic."""
+
+    pinhole: PinholeCamera
+    lens: Lens
+    T_vehicle_camera: Transform
+
+
+@dataclass(frozen=True, slots=True)
+class BagContent:
+    """A bag's content.
+
+    Attributes:
+        topics: of each role.
+        scan_frame: of the LiDAR.
+        vehicle: what the poses are of, for people.
+        poses: T_map_vehicle; None where the bag has none.
+        T_vehicle_lidar: takes the scan's frame to the vehicle's.
+        camera: None where there are no pictures, or none are wanted.
+        remarks: what was assumed and left out, a line each.
+    """
+
+    topics: Topics
+    scan_frame: str
+    vehicle: str
+    poses: Trajectory | None
+    T_vehicle_lidar: Transform
+    camera: BagCamera | None
+    remarks: tuple[str, ...]
+
+
+def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
+    """Look through a bag.
+
+    Raises:
+        DatasetError: there is no scan in it, a topic that was told does not fit, or intrinsics or a mounting are missing.
+    """
+    topics = topics_of(bag.topics(), settings.topics, source=bag.name)
+    scan_frame = bag.first(topics.scan.name).header.frame_id.lstrip("/")
+    remarks: list[str] = []
+    tree, poses, vehicle = _poses(bag, topics, remarks)
+    told = settings.extrinsics.T_vehicle_lidar
+    if topics.poses is not None and topics.poses.msgtype == _TF:
+        poses, vehicle = _poses_by_tf(bag.name, tree, scan_frame, told)
+    if told is not None:
+        T_vehicle_lidar = told
+    elif vehicle:
+        T_vehicle_lidar = _mounting(bag.name, tree, vehicle, scan_frame, "T_vehicle_lidar")
+    else:
+        T_vehicle_lidar = np.eye(4)
+    camera = (
+        _camera(bag, topics, settings, tree, vehicle, scan_frame, T_vehicle_lidar) if settings.want_pictures else None
+    )
+    of = vehicle or ("the vehicle of --extrinsics" if told is not None else "the LiDAR")
+    assumed = "" if vehicle or poses is None else " (assumed: the topic does not say)"
+    remarks.insert(0, f"poses are of: {of}{assumed}")
+    return BagContent(topics, scan_frame, of, poses, T_vehicle_lidar, camera, tuple(remarks))
+
+
+def _poses(bag: BagReader, topics: Topics, remarks: list[str]) -> tuple[FrameTree, Trajectory | None, str]:
+    """All of ``/tf``, and the poses of a topic with the frame that they are of; '' where it does not say."""
+    tree, topic = FrameTree(), topics.poses
+    stamps: list[float] = []
+    poses: list[Transform] = []
+    vehicle, left_out = "", 0
+    wanted = {t.name for t in bag.topics() if t.msgtype == _TF} | ({topic.name} if topic else set())
+    for found in bag.messages(wanted):
+        if isinstance(found, Damage):
+            left_out += not found.is_end
+            remarks += [f"poses: {found.why}"] if found.is_end else []
+        elif found.msgtype == _TF:
+            is_static = found.topic.rstrip("/").endswith("tf_static")
+            left_out += sum(not tree.add(edge, static=is_static) for edge in found.content.transforms)
+        else:
+            vehicle = getattr(found.content, "child_frame_id", "").lstrip("/") or vehicle
+            stamp_s, T = stamp_of(found.content.header), _pose(found.content)
+            if T is None or (stamps and stamp_s <= stamps[-1]):
+                left_out += 1
+            else:
+                stamps.append(stamp_s)
+                poses.append(T)
+    if left_out:
+        remarks.append(f"poses: {left_out} left out, which are no numbers or not later than the one before")
+    if topic is None or topic.msgtype == _TF:
+        return tree, None, ""
+    return (
+        tree,
+        Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4), f"{bag.name}, topic {topic.name}"),
+        vehicle,
+    )
+
+
+def _pose(message: Any) -> Transform | None:
+    """Of an Odometry, PoseStamped or PoseWithCovarianceStamped; None where it is no pose."""
+    return transform_of(message.pose.pose if hasattr(message.pose, "pose") else message.pose)
+
+
+def _poses_by_tf(
+    name: str, tree: FrameTree, scan_frame: str, T_vehicle_lidar: Transform | None
+) -> tuple[Trajectory | None, str]:
+    """Poses by ``/tf``, and what they are of: the LiDAR, or where it is not in the tree but told, the frame that moves."""
+    found = tree.moving(scan_frame, name=f"{name}, /tf")
+    if found is not None and T_vehicle_lidar is None:
+        return found[1], scan_frame
+    if found is not None and T_vehicle_lidar is not None:
+        return found[1].moved_by(T_vehicle_lidar), ""
+    vehicle = tree.lowest_that_moves() if T_vehicle_lidar is not None else None
+    found = None if vehicle is None else tree.moving(vehicle, name=f"{name}, /tf")
+    return (None, "") if vehicle is None or found is None else (found[1], vehicle)
+
+
+def _camera(
+    bag: BagReader, topics: Topics, settings: BagSettings, tree: FrameTree, vehicle: str, scan_frame: str, T_vehicle_lidar: Transform
+) -> BagCamera | None:  # fmt: skip
+    """The camera of the colour topic, where there is one."""
+    if topics.color is None:
+        return None
+    if topics.info is None and settings.camera is None:
+        raise DatasetError(
+            f"{bag.name}: {topics.color.name} has no sensor_msgs/CameraInfo, so its pictures cannot be used; give the camera with "
+            "--camera FILE, name its topic with --topic info=..., or take --no-pictures",
+            field="info",
+        )
+    lens: Lens = "pinhole"
+    if settings.camera is not None:
+        pinhole, frame = settings.camera, bag.first(topics.color.name).header.frame_id
+    else:
+        assert topics.info is not None  # noqa: S101  # or the error above
+        message = bag.first(topics.info.name)
+        is_rectified = is_rectified_by_name(topics.color.name) if settings.rectified is None else settings.rectified
+        found = camera_of(message, is_rectified=is_rectified)
+        if isinstance(found, str):
+            raise DatasetError(
+                f"{bag.name}, topic {topics.info.name}: {found}; give the camera with --camera FILE", field="info"
+            )
+        (pinhole, lens), frame = found, message.header.frame_id
+    T = settings.extrinsics.T_vehicle_camera
+    if T is None and vehicle and (known := tree.fixed(vehicle, frame)) is not None:
+        T = known
+    if T is None:  # by way of the LiDAR, whose own mounting may have been told
+        T = T_vehicle_lidar @ _mounting(bag.name, tree, scan_frame, frame, "T_vehicle_camera")
+    return BagCamera(pinhole, lens, T)
+
+
+def _mounting(name: str, tree: FrameTree, target: str, source: str, key: str) -> Transform:
+    found = tree.fixed(target, source)
+    if found is None:
+        raise DatasetError(
+            f"{name}: /tf_static has no way from {target!r} to {source!r}; give {key} in a JSON file with --extrinsics FILE",
+            field=key,
+        )
+    return found

@@ -1,0 +1,109 @@
+"""A ROS bag opened by the package ``rosbags``, read message by message up to where it is damaged."""
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from model_training.importing.ros_topics import Topic
+from service.errors import DatasetError
+
+_MEND = (
+    "if it was cut off, mend it with `rosbag reindex` (.bag), `mcap recover` (.mcap) or `sqlite3 FILE .recover` (.db3), "
+    "then `ros2 bag reindex` its folder"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message, and the topic that it came by."""
+
+    topic: str
+    msgtype: str
+    content: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """What could not be read: a single message, or (``is_end``) all from there on."""
+
+    topic: str
+    why: str
+    is_end: bool
+
+
+@dataclass(frozen=True, slots=True)
+class BagReader:
+    """An open bag; ``reader`` is the package's own."""
+
+    name: str
+    reader: Any
+
+    def topics(self) -> list[Topic]:
+        """All that have one type."""
+        told = self.reader.topics.items()
+        return [Topic(name, info.msgtype, info.msgcount) for name, info in told if info.msgtype is not None]
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message | Damage]:
+        """Messages of some topics in the bag's order; what is damaged comes as such, and ends the reading where it must."""
+        connections = [c for c in self.reader.connections if c.topic in topics]
+        if not connections:
+            return
+        raw = self.reader.messages(connections=connections)
+        while True:
+            # Damage makes the package, its codecs and SQLite raise errors that have no root in common.
+            try:
+                connection, _, data = next(raw)
+            except StopIteration:
+                return
+            except Exception as error:
+                yield Damage("", f"it cannot be read on from here ({_told(error)}); {_MEND}", is_end=True)
+                return
+            try:
+                content = self.reader.deserialize(data, connection.msgtype)
+            except Exception as error:
+                yield Damage(connection.topic, f"its bytes are no {connection.msgtype} ({type(error).__name__})", is_end=False)  # fmt: skip
+                continue
+            yield Message(connection.topic, connection.msgtype, content)
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic that can be read.
+
+        Raises:
+            DatasetError: there is none.
+        """
+        why = "has no message"
+        for found in self.messages([topic]):
+            if isinstance(found, Message):
+                return found.content
+            why = f"has no message that can be read: {found.why}"
+        raise DatasetError(f"{self.name}: topic {topic} {why}", field="topic")
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BagReader]:
+    """Open a ``.bag`` file, a ROS 2 bag's folder, or one of its files.
+
+    Raises:
+        DatasetError: it cannot be opened.
+    """
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    try:
+        reader = AnyReader([path], default_typestore=store)
+        reader.open()
+    except Exception as error:  # as above
+        raise DatasetError(
+            f"{path}: it cannot be opened as a ROS bag ({_told(error)}); {_MEND}", field="source"
+        ) from error
+    try:
+        yield BagReader(path.name, reader)
+    finally:
+        reader.close()
+
+
+def _told(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,78 @@
+import json
+
+import numpy as np
+import pytest
+
+from model_training.importing.extrinsics import Extrinsics, read_camera, read_extrinsics
+from model_training.importing.kinds import KINDS, OpenSettings, open_recording
+from service.errors import DatasetError
+from service.geometry.camera import PinholeCamera
+
+
+def test_an_unknown_format_is_refused_with_those_there_are(tmp_path):
+    with pytest.raises(DatasetError, match="'ros3' is not known; there is: carla, clouds, kitti-odometry"):
+        open_recording("ros3", tmp_path, OpenSettings())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_at_the_name_is_refused(tmp_path, kind):
+    with pytest.raises(DatasetError, match="there is nothing of that name"):
+        open_recording(kind, tmp_path / "nowhere", OpenSettings())
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "why"),
+    [
+        ("clouds", OpenSettings(depth="sgbm"), "clouds has no 'sgbm' depth; there is: recorded"),
+        ("rosbag", OpenSettings(depth="stored"), "rosbag has no 'stored' depth; there is: recorded, lidar"),
+        ("kitti-raw", OpenSettings(topics={"scan": "/x"}), "topic: kitti-raw has no use for it"),
+        ("carla", OpenSettings(camera=PinholeCamera(8, 6, 8.0, 8.0, 3.5, 2.5)), "camera: carla has no use for it"),
+        ("tum-rgbd", OpenSettings(rectified=False), "rectified: tum-rgbd has no use"),
+        ("clouds", OpenSettings(extrinsics=Extrinsics(T_vehicle_lidar=np.eye(4))), "extrinsics: clouds has no use"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(tmp_path, kind, settings, why):
+    with pytest.raises(DatasetError, match=why):
+        open_recording(kind, tmp_path, settings)
+
+
+def test_mountings_are_read(tmp_path):
+    T = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    (tmp_path / "rig.json").write_text(json.dumps({"T_vehicle_lidar": T}))
+    found = read_extrinsics(tmp_path / "rig.json")
+    np.testing.assert_array_equal(found.T_vehicle_lidar, T)
+    assert found.T_vehicle_camera is None
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("{", "no JSON that can be read"),
+        ("[]", "an object with T_vehicle_lidar and T_vehicle_camera"),
+        ('{"T_lidar": 1}', "an object with"),
+        ('{"T_vehicle_lidar": "here"}', "T_vehicle_lidar is no matrix of numbers"),
+        ('{"T_vehicle_lidar": [[1, 0], [0, 1]]}', "is not 4 rows of 4 numbers"),
+        ('{"T_vehicle_lidar": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "turns by no rotation"),
+        ('{"T_vehicle_lidar": [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]}', "turns by no rotation"),
+    ],
+)
+def test_mountings_that_are_none_are_refused_with_the_file(tmp_path, text, why):
+    (tmp_path / "rig.json").write_text(text)
+    with pytest.raises(DatasetError, match=f"rig.json: .*{why}"):
+        read_extrinsics(tmp_path / "rig.json")
+
+
+def test_a_camera_is_read_alone_or_out_of_a_request(tmp_path):
+    told = {"width": 8, "height": 6, "fx": 9, "fy": 10, "cx": 3.5, "cy": 2.5, "distortion": [0.1, 0, 0, 0]}
+    for document in (told, {"map": "x", "camera": told}):
+        (tmp_path / "camera.json").write_text(json.dumps(document))
+        assert read_camera(tmp_path / "camera.json") == PinholeCamera(8, 6, 9.0, 10.0, 3.5, 2.5, (0.1, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"width": 8, "height": 6, "fx": 0, "fy": 1, "cx": 0, "cy": 0}', '{"width": "wide"}']
+)
+def test_a_camera_that_is_none_is_refused_with_the_file(tmp_path, text):
+    (tmp_path / "camera.json").write_text(text)
+    with pytest.raises(DatasetError, match=r"camera\.json"):
+        read_camera(tmp_path / "camera.json")

@@ -1,0 +1,248 @@
+"""KITTI's raw and odometry layouts: scans, pairs, calibration, times and poses, and what is said of what is broken."""
+
+import cv2
+import numpy as np
+import pytest
+
+from model_training.importing.kinds import OpenSettings, open_recording
+from model_training.importing.oxts import read_oxts
+from model_training.importing.recording import RecordedPicture, RecordedScan, Unusable
+from service.errors import DatasetError
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z
+
+K = np.array([[200.0, 0, 110], [0, 200.0, 30], [0, 0, 1]])
+BASELINE_M = 0.5
+T_CAM_VELO = np.c_[R_BODY_OPTICAL.T, [0.01, -0.08, -0.27]]
+
+
+def line(key, matrix):
+    return f"{key}: " + " ".join(f"{x:.12e}" for x in np.asarray(matrix).reshape(-1)) + "\n"
+
+
+def projection(x):
+    return np.c_[K, K @ [x, 0, 0]]
+
+
+def write_pictures(left, right, stored, name, seed):
+    """A wall 5 m ahead."""
+    dots = cv2.GaussianBlur(np.random.default_rng(seed).integers(0, 256, (60, 240, 3), np.uint8), (3, 3), 0)
+    for folder, picture in (
+        (left, dots[:, :220]),
+        (right, dots[:, 20:]),
+        (stored, np.full((60, 220), 5 * 256, np.uint16)),
+    ):
+        folder.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / f"{name}.png"), picture)
+
+
+def scan_of(k):
+    return np.array([[5, k, 0, 0.5], [6, 1, 1, 0.25]], np.float32)
+
+
+OXTS = [
+    (49.0, 8.4, 110.0, 0.01, 0.02, 0.5),
+    (49.0001, 8.4002, 110.5, 0.0, 0.0, 0.6),
+    (49.0002, 8.4003, 111.0, 0.0, 0.0, 0.7),
+]
+
+
+@pytest.fixture
+def raw(tmp_path):
+    """Three frames of a drive, each at a tenth of a second after the hour."""
+    day = tmp_path / "2011_09_26"
+    drive = day / "2011_09_26_drive_0005_sync"
+    (drive / "velodyne_points" / "data").mkdir(parents=True)
+    (drive / "oxts" / "data").mkdir(parents=True)
+    for k in range(3):
+        name = f"{k:010d}"
+        scan_of(k).tofile(drive / "velodyne_points" / "data" / f"{name}.bin")
+        stored = drive / "proj_depth" / "groundtruth" / "image_02"
+        write_pictures(drive / "image_02" / "data", drive / "image_03" / "data", stored, name, k)
+        (drive / "oxts" / "data" / f"{name}.txt").write_text(" ".join(map(str, (*OXTS[k], *[0.0] * 24))))
+    for sensor in ("velodyne_points", "oxts"):
+        times = "".join(f"2011-09-26 13:00:00.{k}00000000\n" for k in range(3))
+        (drive / sensor / "timestamps.txt").write_text(times)
+    (day / "calib_velo_to_cam.txt").write_text(
+        "calib_time: 15-Mar-2012\n" + line("R", T_CAM_VELO[:, :3]) + line("T", T_CAM_VELO[:, 3])
+    )
+    (day / "calib_cam_to_cam.txt").write_text(
+        line("R_rect_00", np.eye(3))
+        + line("P_rect_02", projection(0.06))
+        + line("P_rect_03", projection(0.06 - BASELINE_M))
+    )
+    (day / "calib_imu_to_velo.txt").write_text(line("R", np.eye(3)) + line("T", [-0.8, 0.3, -0.8]))
+    return drive
+
+
+@pytest.fixture
+def odometry(tmp_path):
+    sequence = tmp_path / "dataset" / "sequences" / "07"
+    (sequence / "velodyne").mkdir(parents=True)
+    for k in range(3):
+        scan_of(k).tofile(sequence / "velodyne" / f"{k:06d}.bin")
+        write_pictures(sequence / "image_2", sequence / "image_3", sequence / "depth_2", f"{k:06d}", k)
+    calibration = line("P2", projection(0.06)) + line("P3", projection(0.06 - BASELINE_M)) + line("Tr", T_CAM_VELO)
+    (sequence / "calib.txt").write_text(calibration)
+    (sequence / "times.txt").write_text("0.0\n1.036e-01\n2.073e-01\n")
+    (tmp_path / "dataset" / "poses").mkdir()
+    ahead = "".join(" ".join(map(str, np.c_[np.eye(3), [0, 0, 2.0 * k]].reshape(-1))) + "\n" for k in range(3))
+    (tmp_path / "dataset" / "poses" / "07.txt").write_text(ahead)
+    return sequence
+
+
+def opened(path, depth="recorded"):
+    return open_recording("kitti-raw" if "sync" in path.name else "kitti-odometry", path, OpenSettings(depth=depth))
+
+
+@pytest.fixture(params=["raw", "odometry"])
+def drive(request):
+    return request.getfixturevalue(request.param)
+
+
+def events_of(path, kind, depth="recorded"):
+    return [event for event in opened(path, depth).events() if isinstance(event, kind)]
+
+
+def test_scans_and_pictures_come_with_the_mounting_of_the_calibration(drive):
+    scans, pictures = events_of(drive, RecordedScan), events_of(drive, RecordedPicture)
+    np.testing.assert_array_equal(scans[2].points, scan_of(2))
+    assert [p.stamp_s for p in pictures] == [s.stamp_s for s in scans]
+    assert opened(drive).count() == 6
+    picture = pictures[0]
+    points = np.c_[scan_of(1)[:, :3], [1, 1]]
+    expected = projection(0.06) @ np.vstack([T_CAM_VELO @ points.T, [1, 1]])
+    seen = (np.linalg.inv(picture.T_vehicle_camera) @ points.T)[:3]
+    np.testing.assert_allclose(picture.camera.matrix @ seen, expected, atol=1e-9)
+    np.testing.assert_allclose(picture.depth * picture.depth_scale_m, 5.0)
+    assert picture.file.name.startswith("0000")
+
+
+def test_matched_depth_is_that_of_the_wall(drive):
+    depth = events_of(drive, RecordedPicture, "sgbm")[0].depth[:, 140:]
+    assert abs(np.median(depth[depth > 0]) - 5.0) < 0.02
+
+
+def test_depth_of_the_scans_is_left_to_who_takes_them(drive):
+    assert events_of(drive, RecordedPicture, "lidar")[0].depth is None
+
+
+def test_frames_that_lack_a_picture_or_a_whole_scan_are_counted(drive):
+    for folder in ("image_3", "image_03/data"):
+        for path in (drive / folder).glob("*1.png"):
+            path.unlink()
+    (scan,) = drive.glob("velodyne*/**/*2.bin")
+    scan.write_bytes(scan.read_bytes()[:-1])
+    bad = events_of(drive, Unusable, "sgbm")
+    assert [(b.kind, b.why) for b in bad] == [
+        ("picture", "no right picture beside it"), ("scan", "its bytes are no rows of four float32: truncated")
+    ]  # fmt: skip
+    assert bad[1].name.startswith("velodyne 0000")
+
+
+def test_pictures_that_are_broken_alike_are_counted_as_one(drive):
+    for path in [*drive.glob("depth_2/*"), *drive.glob("proj_depth/groundtruth/image_02/*")]:
+        path.write_bytes(path.read_bytes()[:60])
+    bad = events_of(drive, Unusable, "stored")
+    assert len(bad) == 3
+    assert len({b.why for b in bad}) == 1
+
+
+def test_stereo_without_the_right_cameras_calibration_is_refused(drive):
+    for path in (drive / "calib.txt", drive.parent / "calib_cam_to_cam.txt"):
+        if path.is_file():
+            kept = [text for text in path.read_text().splitlines() if not text.startswith(("P3", "P_rect_03"))]
+            path.write_text("\n".join(kept))
+    assert len(events_of(drive, RecordedPicture, "stored")) == 3
+    with pytest.raises(DatasetError, match=r"does not name the right camera .*--depth lidar"):
+        events_of(drive, RecordedPicture, "sgbm")
+
+
+def test_a_missing_calibration_is_named(drive):
+    path = drive / "calib.txt" if (drive / "calib.txt").is_file() else drive.parent / "calib_velo_to_cam.txt"
+    path.unlink()
+    with pytest.raises(DatasetError, match=rf"{path.name} cannot be read"):
+        opened(drive)
+
+
+def test_times_that_end_early_or_are_none_are_named(drive):
+    path = next(p for p in (drive / "times.txt", drive / "velodyne_points" / "timestamps.txt") if p.is_file())
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:2]) + "\n")
+    with pytest.raises(DatasetError, match=rf"{path.name} has 2 lines, and there is a frame 0+2"):
+        opened(drive)
+    path.write_text("\n".join([lines[0], "noon", lines[2]]))
+    with pytest.raises(DatasetError, match=path.name):
+        opened(drive)
+
+
+def test_times_are_read_to_the_nanosecond_and_at_ten_hertz_without(raw, odometry):
+    assert np.diff([s.stamp_s for s in events_of(raw, RecordedScan)]) == pytest.approx(0.1, abs=1e-6)
+    assert [s.stamp_s for s in events_of(odometry, RecordedScan)] == [0.0, 0.1036, 0.2073]
+    (raw / "velodyne_points" / "timestamps.txt").unlink()
+    (odometry / "times.txt").unlink()
+    for path in (raw, odometry):
+        assert [s.stamp_s for s in events_of(path, RecordedScan)] == pytest.approx([0.0, 0.1, 0.2])
+
+
+def test_odometrys_poses_are_of_the_lidar_in_a_level_map(odometry):
+    T = opened(odometry).trajectory().T_map_vehicle
+    np.testing.assert_allclose(T[:, :3, 3], [[0, 0, 0], [2, 0, 0], [4, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(T[2, :3, :3], np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["1 2 3\n", "a b c d e f g h i j k l\n", "nan " * 12 + "\n"])
+def test_a_pose_that_is_none_is_named(odometry, text):
+    path = odometry.parent.parent / "poses" / "07.txt"
+    path.write_text(path.read_text().splitlines()[0] + "\n" + text)
+    with pytest.raises(DatasetError, match=r"07\.txt, (line|pose) 2"):
+        opened(odometry)
+
+
+def test_a_recording_without_poses_says_none(raw, odometry):
+    (odometry.parent.parent / "poses" / "07.txt").unlink()
+    for path in (raw / "oxts" / "data").iterdir():
+        path.unlink()
+    assert opened(raw).trajectory() is None
+    assert opened(raw).georeference is None
+    assert opened(odometry).trajectory() is None
+
+
+def test_the_inertial_systems_poses_are_those_of_pyproj(raw):
+    pyproj = pytest.importorskip("pyproj")
+    latitude, longitude, height = OXTS[0][:3]
+    pipeline = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+        f"+lat_0={latitude} +lon_0={longitude} +h_0={height}"
+    )
+    expected = np.array([pipeline.transform(lon, lat, h) for lat, lon, h, *_ in OXTS])
+    T_map_imu, georeference = read_oxts(sorted((raw / "oxts" / "data").iterdir()))
+    np.testing.assert_allclose(T_map_imu[:, :3, 3], expected, atol=1e-4)
+    assert georeference == {"latitude_deg": 49.0, "longitude_deg": 8.4, "height_m": 110.0}
+    np.testing.assert_allclose(T_map_imu[1, :3, :3], rotation_z(0.6), atol=1e-12)
+    assert T_map_imu[0, 2, 0] == pytest.approx(
+        -np.sin(0.02)
+    )  # a positive pitch is nose down, about the axis to the left
+    assert T_map_imu[0, 2, 1] == pytest.approx(np.sin(0.01) * np.cos(0.02))
+    of_lidar = opened(raw).trajectory().T_map_vehicle
+    np.testing.assert_allclose(of_lidar[1] @ [-0.8, 0.3, -0.8, 1.0], T_map_imu[1, :, 3], atol=1e-9)
+    assert opened(raw).georeference == georeference
+
+
+@pytest.mark.parametrize("text", ["49.0 8.4", "", "x y z a b c", "149.0 8.4 110 0 0 0"])
+def test_a_packet_that_is_none_is_named(raw, text):
+    (raw / "oxts" / "data" / "0000000000.txt").write_text(text)
+    with pytest.raises(DatasetError, match=r"0000000000\.txt"):
+        opened(raw)
+
+
+def test_the_days_folder_will_do_where_it_holds_one_drive(raw):
+    assert open_recording("kitti-raw", raw.parent, OpenSettings()).count() == 6
+    (raw.parent / "2011_09_26_drive_0006_sync" / "velodyne_points").mkdir(parents=True)
+    with pytest.raises(DatasetError, match=r"the folder of one drive is wanted.*drive_0005_sync, .*drive_0006_sync"):
+        open_recording("kitti-raw", raw.parent, OpenSettings())
+
+
+@pytest.mark.parametrize(("kind", "why"), [("kitti-raw", "here: none"), ("kitti-odometry", "here is no scan")])
+def test_a_folder_of_something_else_is_refused(tmp_path, kind, why):
+    with pytest.raises(DatasetError, match=why):
+        open_recording(kind, tmp_path, OpenSettings())

@@ -1,0 +1,74 @@
+import pytest
+
+from model_training.importing.ros_topics import Topic, topics_of
+from service.errors import DatasetError
+
+SCAN = Topic("/points", "sensor_msgs/msg/PointCloud2", 10)
+
+
+def image(name, count=10, kind="Image"):
+    return Topic(name, f"sensor_msgs/msg/{kind}", count)
+
+
+def info(name):
+    return Topic(name, "sensor_msgs/msg/CameraInfo", 10)
+
+
+def chosen(available, told=None):
+    topics = topics_of([SCAN, *available], told or {}, source="drive.mcap")
+    return {role: getattr(topics, role) and getattr(topics, role).name for role in ("color", "depth", "info", "poses")}
+
+
+def test_colour_depth_and_camera_of_one_namespace_go_together():
+    available = [
+        info("/rear/color/camera_info"), info("/front/color/camera_info"), image("/front/color/image_raw", 20), image("/rear/depth/image"),
+        image("/front/depth/image"), image("/front/aligned_depth_to_color/image_raw"), image("/front/infra1/image", 99),
+    ]  # fmt: skip
+    expected = {
+        "color": "/front/color/image_raw",
+        "depth": "/front/aligned_depth_to_color/image_raw",
+        "info": "/front/color/camera_info",
+    }
+    assert chosen(available) == expected | {"poses": None}
+
+
+@pytest.mark.parametrize(
+    ("types", "best"),
+    [
+        (["geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"], 1),
+        (["tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"], 1),
+    ],
+)
+def test_odometry_is_taken_before_poses_and_those_before_tf(types, best):
+    available = [Topic(f"/t{k}/tf", msgtype, 5) for k, msgtype in enumerate(types)]
+    assert chosen(available)["poses"] == f"/t{best}/tf"
+
+
+def test_mountings_alone_are_no_poses_and_empty_topics_are_none():
+    available = [Topic("/tf_static", "tf2_msgs/msg/TFMessage", 1), Topic("/odom", "nav_msgs/msg/Odometry", 0)]
+    assert chosen(available)["poses"] is None
+
+
+def test_what_is_told_is_not_guessed_and_lines_say_which():
+    available = [image("/a"), image("/b", 99)]
+    topics = topics_of([SCAN, *available], {"color": "/a"}, source="x")
+    assert topics.lines()[:2] == ("scan: /points, 10 x PointCloud2 (guessed)", "color: /a, 10 x Image")
+    assert topics.lines()[-1] == "poses: none"
+
+
+@pytest.mark.parametrize(
+    ("told", "why"),
+    [
+        ({"colour": "/a"}, "'colour' is no role; there are: scan, color"),
+        ({"scan": "/velodyne"}, "drive.mcap has no topic '/velodyne'; it has: /a, /points"),
+        ({"scan": "/a"}, "topic '/a' is sensor_msgs/msg/Image; for scan one is wanted of: sensor_msgs/msg/PointCloud2"),
+    ],
+)
+def test_a_topic_that_does_not_fit_is_refused_with_those_there_are(told, why):
+    with pytest.raises(DatasetError, match=why):
+        topics_of([SCAN, image("/a")], told, source="drive.mcap")
+
+
+def test_a_bag_without_a_point_cloud_says_what_it_has():
+    with pytest.raises(DatasetError, match=r"no sensor_msgs/PointCloud2.*it has: /a \(sensor_msgs/msg/Image\)"):
+        topics_of([image("/a")], {}, source="drive.mcap")
