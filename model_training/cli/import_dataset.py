@@ -46,7 +46,10 @@ def command(
             help="leave each such scan out of the survey, and take only pictures near those as queries", min=0
         ),
     ] = 0,
-    hold_out_first: Annotated[int, typer.Option(help="with --hold-out: the first scan left out, from 0", min=0)] = 0,
+    hold_out_first: Annotated[
+        int | None,
+        typer.Option(help="with --hold-out: the first scan left out, from 0 [default: the last of each group]", min=0),
+    ] = None,
     sync: Annotated[str, typer.Option(help="how a frame's pose is found: interpolate, or nearest")] = "interpolate",
     tolerance: Annotated[float, typer.Option(help="seconds that a pose or scan may be from a frame", min=0)] = 0.1,
     topic: Annotated[

@@ -45,7 +45,7 @@ class TakeSettings:
         deskew: take the vehicle's motion out of scans that tell their points' times.
         hold_out: each how many scans one is left out of the survey; 0 leaves none out. Pictures are then queries only if the
             scan nearest to them was left out, so that no query's own moment is in the map; the others are counted.
-        hold_out_first: the first scan that is left out, counted from 0.
+        hold_out_first: the first scan that is left out, counted from 0; None for the last of each group.
         max_points: of a scan; more is refused before it is kept.
     """
 
@@ -55,7 +55,7 @@ class TakeSettings:
     tolerance_s: float = 0.1
     deskew: bool = True
     hold_out: int = 0
-    hold_out_first: int = 0
+    hold_out_first: int | None = None
     max_points: int = 5_000_000
 
     def __post_init__(self) -> None:
@@ -66,12 +66,19 @@ class TakeSettings:
         """
         if self.hold_out == 1 or self.hold_out < 0:
             raise DatasetError("hold_out: 1 would leave no survey; give 0, or 2 and more", field="hold_out")
-        if self.hold_out and not 0 <= self.hold_out_first < self.hold_out:
+        if self.hold_out_first is not None and not 0 <= self.hold_out_first < self.hold_out:
             raise DatasetError(
                 f"hold_out_first: {self.hold_out_first} is none of 0 to {self.hold_out - 1}", field="hold_out_first"
             )
         if not 0 <= self.tolerance_s < np.inf:
             raise DatasetError(f"tolerance_s: {self.tolerance_s:g} is no time; give seconds", field="tolerance_s")
+
+    def holds_out(self, number: int) -> bool:
+        """Whether a usable scan, counted from 0, is left out of the survey."""
+        if not self.hold_out:
+            return False
+        first = self.hold_out - 1 if self.hold_out_first is None else self.hold_out_first
+        return number % self.hold_out == first
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +156,7 @@ class _Taking:
             clean = replace(clean, offsets_s=None)
         points = deskewed(clean, self._trajectory, self._T_vehicle_lidar) if self._settings.deskew else clean.points
         self._last_scan_s = scan.stamp_s
-        is_held = (
-            bool(self._settings.hold_out) and self._seen % self._settings.hold_out == self._settings.hold_out_first
-        )
+        is_held = self._settings.holds_out(self._seen)
         self._seen += 1
         self._recent.append((scan.stamp_s, is_held, points))
         if is_held:

@@ -23,7 +23,7 @@ VOXEL_M = 0.5
 #: Points of a scan that are aligned: one in so large a cell; each one's surface is that of so many neighbours.
 FINE_CELL_M, NEIGHBOURS = 0.3, 12
 #: The map that they are aligned to, and how far a point may be from it.
-MAP_CELL_M, REACH_M = 1.0, 1.0
+MAP_CELL_M, REACH_M = 0.7, 1.0
 #: A scan goes into that map after so much travel; what has not been met for so many scans is forgotten.
 INSERT_M, FORGET_AFTER = 0.5, 100
 #: The alignment may not move a scan further than that from where KISS-ICP has it: it would be another street.
