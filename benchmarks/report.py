@@ -34,6 +34,7 @@ class Report:
     command: str
     rows: list[dict[str, Any]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
+    _keep: bool = False
     _began: float = field(default_factory=time.monotonic)
     # What is measured is the code as it was loaded, not as it is when the report is written.
     _commit: str = field(default_factory=lambda: _git("rev-parse", "HEAD"))
@@ -74,12 +75,21 @@ class Report:
         self.row(row_id, float(right.mean()), "share", bar=bar, better=better, n=len(right), ci95=interval)
 
     def keep_others(self) -> None:
-        """Start from the rows of the last run, each with the commit that it was measured at; new ones replace them."""
+        """Keep the rows of earlier runs, each with the commit that it was measured at; this run's replace them.
+
+        What is kept is read when the report is written, so that two parts may be measured at once.
+        """
+        self._keep = True
+
+    def _with_others(self) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+        """Rows and notes of the file as it is now, this run's in their places."""
         path = REPORTS / f"{self.name}.json"
-        if path.exists():
-            last = json.loads(path.read_text())
-            self.rows = [{"commit": last["made"]["commit"]} | row for row in last["rows"]]
-            self.notes = last.get("notes", {})
+        if not self._keep or not path.exists():
+            return self.rows, self.notes
+        last = json.loads(path.read_text())
+        rows = {row["id"]: {"commit": last["made"]["commit"]} | row for row in last["rows"]}
+        rows.update({row["id"]: row for row in self.rows})
+        return list(rows.values()), last.get("notes", {}) | self.notes
 
     def write(self) -> Path:
         """Write the file and say where."""
@@ -89,10 +99,11 @@ class Report:
             "minutes": round((time.monotonic() - self._began) / 60, 2),
         }  # fmt: skip
         REPORTS.mkdir(exist_ok=True)
+        rows, notes = self._with_others()
         path = REPORTS / f"{self.name}.json"
         part = path.with_suffix(".part")
         part.write_text(
-            json.dumps({"made": made, "rows": self.rows} | ({"notes": self.notes} if self.notes else {}), indent=1)
+            json.dumps({"made": made, "rows": rows} | ({"notes": notes} if notes else {}), indent=1)
             + "\n"
         )
         part.rename(path)

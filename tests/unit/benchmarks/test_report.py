@@ -108,3 +108,20 @@ def test_without_keeping_them_the_rows_of_the_last_run_are_gone(report):
     report.write()
     Report("mine", "make mine").write()
     assert written()["rows"] == []
+
+
+def test_parts_that_are_measured_at_once_keep_each_others_rows(report):
+    """The second one began before the first one wrote, and ends after it."""
+    report.row("old", 1.0, "m")
+    report.write()
+    first, second = Report("mine", "make mine --only a"), Report("mine", "make mine --only b")
+    for part, row_id in ((first, "a"), (second, "b")):
+        part.keep_others()
+        part.row(row_id, 2.0, "m")
+    first.row("old", 3.0, "m")
+    first.write()
+    path = second.write()
+    rows = {row["id"]: row for row in json.loads(path.read_text())["rows"]}
+    assert {row_id: row["value"] for row_id, row in rows.items()} == {"old": 3.0, "a": 2.0, "b": 2.0}
+    assert "commit" in rows["a"]
+    assert "commit" not in rows["b"]
