@@ -102,10 +102,7 @@ class Report:
         rows, notes = self._with_others()
         path = REPORTS / f"{self.name}.json"
         part = path.with_suffix(".part")
-        part.write_text(
-            json.dumps({"made": made, "rows": rows} | ({"notes": notes} if notes else {}), indent=1)
-            + "\n"
-        )
+        part.write_text(json.dumps({"made": made, "rows": rows} | ({"notes": notes} if notes else {}), indent=1) + "\n")
         part.rename(path)
         return path
 

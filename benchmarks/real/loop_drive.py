@@ -20,7 +20,8 @@ from model_training.simulation.sensor_parameters import LidarParameters
 from model_training.simulation.traversal import Station, lidar_pose
 
 SPEED_M_S = 10.0
-CORNER_M = 6.0
+#: Ways are averaged over so much, twice: a vehicle turns in circles of 5 m and more.
+CORNER_M = 12.0
 
 
 class LoopDrive:
@@ -40,7 +41,7 @@ class LoopDrive:
     def __init__(self, seed: int, *, length_m: float, step_m: float = 1.0) -> None:
         self._city = City(seed=seed)
         rng = np.random.default_rng([seed, 51])
-        line = _rounded(_walk(self._city, length_m, rng), step_m)
+        line = _rounded(_rounded(_walk(self._city, length_m, rng), step_m), step_m)
         ahead = np.gradient(line, axis=0)
         headings = np.arctan2(ahead[:, 1], ahead[:, 0])
         stations = [

@@ -44,7 +44,7 @@ def import_rows(report: Report, work: Path) -> None:
     original = simulated(work)
     peaks, rates = {}, {}
     for scans in (SHORT, LONG):
-        bag, out = work / f"many_{scans}.bag", work / f"many_{scans}"
+        bag, out = work / f"many_{scans}_bag", work / f"many_{scans}"
         for path in (bag, out):
             shutil.rmtree(path, ignore_errors=True)
         _repeated(original, scans, bag)
@@ -67,7 +67,8 @@ def simulated(work: Path) -> Dataset:
 
 
 def _there_and_back(original: Dataset, kind: str, work: Path) -> Dataset:
-    there, back = work / f"round_trip_{kind}.bag", work / f"round_trip_{kind}"
+    suffix = ".bag" if kind == "bag" else "_there"
+    there, back = work / f"round_trip_{kind}{suffix}", work / f"round_trip_{kind}"
     for path in (there, back):
         if path.is_file():
             path.unlink()

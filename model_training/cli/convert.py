@@ -25,8 +25,8 @@ def command(
 
     \b
     Example:
-      streetfix convert data/small --to mcap --out small.bag    # look at it in Foxglove or RViz
-      streetfix import rosbag small.bag --out data/again
+      streetfix convert data/small --to mcap --out small_mcap    # look at it in Foxglove or RViz
+      streetfix import rosbag small_mcap --out data/again
     """
     if to not in FORMATS:
         raise DatasetError(f"to: {to!r} is not known; there is: {', '.join(FORMATS)}", field="to")

@@ -44,6 +44,11 @@ def write_bag(
     """
     if out.exists():
         raise DatasetError(f"{out} is there already; name another", field="out")
+    if kind != "bag" and out.suffix == ".bag":
+        raise DatasetError(
+            f"{out}: .bag is what ROS 1 calls its files, and readers take it for one; name the folder otherwise",
+            field="out",
+        )
     camera = None if queries is None else the_camera(dataset, queries)
     total = len(dataset.survey_poses()) + (0 if queries is None else sum(1 for _ in dataset.queries(queries)))
     done = 0

@@ -1,4 +1,4 @@
-"""Keyframes of a drive: every metre a scan, thinned, described from all sides, and kept on disk."""
+"""Keyframes of a drive: every other metre a scan, thinned, described from all sides, and kept on disk."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from service.imaging.pca import Level, level_scan, principal_heading
 from service.imaging.view_grid import ViewGrid, panorama_from_points, survey_planes, view_from_panorama
 from service.localization.encoder import Encoder
 
-SPACING_M = 1.0
+SPACING_M = 2.0
 HEADINGS = 24
 #: Edge of the cells that keep one point each, and how far points are kept.
 CELL_M, REACH_M = 0.25, 40.0

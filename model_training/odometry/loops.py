@@ -33,11 +33,11 @@ class LoopSettings:
     """
 
     apart_m: float = 40.0
-    every: int = 4
+    every: int = 2
     drift: float = 0.03
     slack_m: float = 8.0
     similarity: float = 0.6
-    around: int = 10
+    around: int = 6
     voxel_m: float = 0.3
     points: int = 2500
     sigma_m: float = 0.05

@@ -96,7 +96,11 @@ def test_the_rows_of_the_last_run_are_kept_with_the_commit_that_they_were_measur
     third = Report("mine", "make mine", _commit="third")
     third.keep_others()
     third.write()
-    assert {row["id"]: row["commit"] for row in written()["rows"]} == {"old": "first", "both": "second", "new": "second"}
+    assert {row["id"]: row["commit"] for row in written()["rows"]} == {
+        "old": "first",
+        "both": "second",
+        "new": "second",
+    }
 
 
 def test_without_a_last_run_there_is_nothing_to_keep(report):
