@@ -57,10 +57,10 @@ def import_rows(report: Report, work: Path) -> None:
     report.row("import.peak_mib", peaks[LONG], "MiB", n=LONG)
 
 
-def simulated(work: Path) -> Dataset:
+def simulated(work: Path, street: str = "1") -> Dataset:
     """A street of the paper's city and one query drive, kept in ``work``."""
     asked = QueryPlan(name="drive1", traversal=1, count=40, depths=("precise",))
-    plan = SimulationPlan(name="round-trip", city="paper", seed=9090, streets=("1",), queries=(asked,))
+    plan = SimulationPlan(name=f"street-{street}", city="paper", seed=9090, streets=(street,), queries=(asked,))
     folder = work / plan.name
     simulate(plan, folder)
     return Dataset(folder)
