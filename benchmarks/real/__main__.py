@@ -19,7 +19,7 @@ BUILDS, FRAMES = 20, 100
 def resume_rows(report: Report, work: Path) -> None:
     """Builds that are killed and started again."""
     same = identical_bundles(simulated(work, street="8").folder, work / "resume", builds=BUILDS)
-    report.row("resume.identical_bundles", float(same), "bundles", bar=BUILDS, n=BUILDS)
+    report.row("resume.identical_bundles", float(sum(same)), "bundles", bar=BUILDS, n=BUILDS)
 
 
 def ros2_rows(report: Report, work: Path) -> None:
