@@ -72,37 +72,46 @@ class Plan:
                 else f'<circle class="{kind}" cx="{x:.1f}" cy="{-y:.1f}" r="{unit:.2f}"/>'
             )
             dots.append(f"<g>{mark}<title>{told}</title></g>")
-        content = f'<image id="{_GROUND_ID}" href="{self.picture}" {_box(self.view)}/>' + "".join(lines) + "".join(dots)
+        content = self._image() + "".join(lines) + "".join(dots)
         told = "; ".join(f"{number} {name}" for name, number in counted(errors).items())
         return drawing("The map from above with all queries", told, content, view=self.view, kind="plan")
 
-    def around(self, true_xy: NDArray[np.float64], answer_xy: NDArray[np.float64], others: NDArray[np.float64]) -> str:
-        """A query's truth (circle), its answer (cross) and the other poses that were looked at (dots); needs ``whole`` on the page.
+    def around(
+        self,
+        true_xy: NDArray[np.float64],
+        answers_xy: NDArray[np.float64],
+        others: NDArray[np.float64],
+        *,
+        with_picture: bool = False,
+    ) -> str:
+        """A query's truth (circle), one answer or two (crosses) and the other poses that were looked at (dots).
 
         Args:
             true_xy: map frame, metres.
-            answer_xy: NaN for no answer.
+            answers_xy: (m, 2), NaN for no answer.
             others: (n, 2), NaN for none.
+            with_picture: bring the map along; the others on the page, ``whole`` among them, refer to it.
         """
-        seen = np.stack([true_xy, answer_xy if np.isfinite(answer_xy).all() else true_xy])
+        answered = np.isfinite(answers_xy).all(axis=1)
+        seen = np.concatenate([true_xy[None], answers_xy[answered]])
         middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
         side = max(30.0, 1.4 * float(np.ptp(seen, axis=0).max()))
         view = (middle[0] - side * 2 / 3, -middle[1] - side / 2, side * 4 / 3, side)
         inside = others[np.isfinite(others).all(axis=1)]
         inside = inside[(np.abs(inside - middle) <= [side * 2 / 3, side / 2]).all(axis=1)]
-        parts = [f'<use href="#{_GROUND_ID}"/>']
+        parts = [self._image() if with_picture else f'<use href="#{_GROUND_ID}"/>']
         parts += [f'<circle class="other" cx="{x:.1f}" cy="{-y:.1f}" r="{side / 70:.2f}"/>' for x, y in inside]
-        if np.isfinite(answer_xy).all():
-            parts.append(_line(true_xy, answer_xy, "off"))
-            parts.append(_cross(answer_xy[0], -answer_xy[1], side / 28, "answer"))
+        for k in np.flatnonzero(answered):
+            parts.append(_line(true_xy, answers_xy[k], "off"))
+            parts.append(_cross(answers_xy[k, 0], -answers_xy[k, 1], side / 28, f"answer{k}"))
         parts.append(f'<circle class="truth" cx="{true_xy[0]:.2f}" cy="{-true_xy[1]:.2f}" r="{side / 28:.2f}"/>')
+        told = f"{side * 4 / 3:.0f} m across"
         return drawing(
-            "Where the query was taken and where it was put",
-            f"a square of {side:.0f} m",
-            "".join(parts),
-            view=view,
-            kind="small-plan",
+            "Where the query was taken and where it was put", told, "".join(parts), view=view, kind="small-plan"
         )
+
+    def _image(self) -> str:
+        return f'<image id="{_GROUND_ID}" href="{self.picture}" {_box(self.view)}/>'
 
 
 def class_of(error_m: float) -> str:

@@ -1,6 +1,6 @@
 """Single queries on a page: both pictures, truth and answer on the map, and what became of it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -50,37 +50,42 @@ def said_of(p: Predictions, row: int, stage: Stage, error_m: float) -> str:
     )
 
 
-def gallery(shown: Sequence[Shown], p: Predictions, dataset: Dataset | None, plan: Plan | None) -> str:
-    """Queries one below the other; without the dataset no pictures, without the map no plan."""
+def gallery(
+    shown: Sequence[Shown], p: Predictions, dataset: Dataset | None, plan: Plan | None, *,
+    other: Predictions | None = None, has_plan: bool = False,
+) -> str:  # fmt: skip
+    """Queries one below the other; without the dataset no pictures, without the map no plans.
+
+    Args:
+        shown: what and in which order.
+        p: answers of all sets, joined.
+        dataset: for the pictures.
+        plan: for the little maps.
+        other: another run's answers to the same queries, drawn as well.
+        has_plan: whether the page shows the map's picture already.
+    """
     frames: dict[str, list[QueryFrame]] = {}
-    return "".join(_query(each, p, dataset, plan, frames) for each in shown)
+    articles = []
+    for each in shown:
+        name = escape(f"{each.query_set}, query {each.number}")
+        pictures = "" if dataset is None else _pictures(each, dataset, frames, name)
+        drawn = ""
+        if plan is not None:
+            answers = [p.T_answer[each.row, :2, 3]] + ([] if other is None else [other.T_answer[each.row, :2, 3]])
+            looked_at = np.concatenate([p.ranked_xy[each.row], p.candidates[each.row, :, :2]])
+            drawn = plan.around(p.T_true[each.row, :2, 3], np.stack(answers), looked_at, with_picture=not has_plan)
+            has_plan = True
+        articles.append(
+            f'<article class="query"><h3>{name}</h3>{each.said}<div class="pictures">{pictures}{drawn}</div></article>'
+        )
+    return "".join(articles)
 
 
-def _query(
-    each: Shown, p: Predictions, dataset: Dataset | None, plan: Plan | None, frames: dict[str, list[QueryFrame]]
-) -> str:
-    name = f"{each.query_set}, query {each.number}"
+def _pictures(each: Shown, dataset: Dataset, frames: dict[str, list[QueryFrame]], name: str) -> str:
+    if each.query_set not in frames:
+        frames[each.query_set] = list(dataset.queries(each.query_set))
+    frame = frames[each.query_set][each.number]
     return (
-        f'<article class="query"><h3>{escape(name)}</h3>{each.said}'
-        f'<div class="pictures">{"".join(_pictures(each, p, dataset, plan, frames, name))}</div></article>'
+        f'<img src="{colour_uri(frame.rgb())}" alt="Colour picture of {name}"><img src="{depth_uri(frame.depth_m())}" '
+        f'alt="Depth picture of {name}: near is yellow, far is dark, grey is not measured">'
     )
-
-
-def _pictures(
-    each: Shown,
-    p: Predictions,
-    dataset: Dataset | None,
-    plan: Plan | None,
-    frames: dict[str, list[QueryFrame]],
-    name: str,
-) -> Iterator[str]:
-    if dataset is not None:
-        if each.query_set not in frames:
-            frames[each.query_set] = list(dataset.queries(each.query_set))
-        frame = frames[each.query_set][each.number]
-        yield f'<img src="{colour_uri(frame.rgb())}" alt="Colour picture of {escape(name)}">'
-        yield f'<img src="{depth_uri(frame.depth_m())}" '
-        yield f'alt="Depth picture of {escape(name)}: near is yellow, far is dark, grey is not measured">'
-    if plan is not None:
-        others = np.concatenate([p.ranked_xy[each.row], p.candidates[each.row, :, :2]])
-        yield plan.around(p.T_true[each.row, :2, 3], p.T_answer[each.row, :2, 3], others)

@@ -212,4 +212,4 @@ def _worst(runs: dict[str, Predictions], everything: Predictions, dataset: Datas
         "<p>Wrong answers that were accepted come first, since they do harm; then the others by distance. "
         "On the little maps the circle is the truth, the cross the answer, dots are places and poses that were looked at.</p>"
     )
-    return words + gallery(shown, everything, dataset, plan)
+    return words + gallery(shown, everything, dataset, plan, has_plan=True)
