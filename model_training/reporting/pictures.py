@@ -31,7 +31,7 @@ def depth_bgr(depth_m: NDArray[np.float32], *, width: int) -> NDArray[np.uint8]:
     )
     measured = np.isfinite(small) & (small > 0)
     near = 1 - np.log(np.clip(np.where(measured, small, 1.0), 1.0, FARTHEST_M)) / np.log(FARTHEST_M)
-    picture = np.asarray(cv2.applyColorMap((30 + 225 * near).astype(np.uint8), cv2.COLORMAP_CIVIDIS), np.uint8)
+    picture = np.asarray(cv2.applyColorMap((30 + 225 * near).astype(np.uint8), cv2.COLORMAP_VIRIDIS), np.uint8)
     picture[~measured] = (128, 128, 128)
     return picture
 
