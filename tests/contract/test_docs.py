@@ -2,7 +2,10 @@
 
 import json
 import re
+import runpy
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -119,3 +122,22 @@ def test_pictures_of_the_pages_are_small() -> None:
     sizes = {path.name: path.stat().st_size for path in (ROOT / "docs" / "pictures").iterdir()}
     assert {"street.png", "map.png", "demo.png"} <= set(sizes)
     assert max(sizes.values()) < 250_000
+
+
+def test_the_site_builds_strictly_and_asks_no_other_host(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="mkdocs-material is in the dependency group `docs` of pyproject.toml")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "repository" / "openapi" / "openapi.json").is_file()
+    for page in tmp_path.glob("*.html"):
+        loaded = re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="(https?://[^"]+)"', page.read_text())
+        assert loaded == [], page.name
+
+
+def test_what_lies_outside_docs_is_linked_as_a_copy_and_a_folder_by_name() -> None:
+    hooks = runpy.run_path(str(ROOT / "mkdocs_hooks.py"))
+    text = "[card](../stock/CARD.md) [api](../openapi/openapi.json#x) [deploy](../deploy/) [here](maps.md)"
+    assert hooks["on_page_markdown"](text) == (
+        "[card](repository/stock/CARD.md.txt) [api](repository/openapi/openapi.json) `deploy/` [here](maps.md)"
+    )
