@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -50,14 +49,14 @@ def command(
 
 
 def _table(found: Comparison) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(box=None, padding=(0, 1, 0, 0))
     for k, name in enumerate(HEAD):
         table.add_column(name, justify="left" if k == 0 else "right", no_wrap=True)
     for name, each in found.shares.items():
         table.add_row(*row_of(LABELS[name], each))
     if len(found.sets) > 1:
         table.add_section()
-        table.add_row("within 1 m, by set:")
+        table.add_row("by set, 1 m:")
         for name, each in found.sets.items():
             table.add_row(*row_of(name, each))
     return table

@@ -70,7 +70,7 @@ class Comparison:
 
 def p_text(p: float) -> str:
     """A probability as one says it."""
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+    return "<0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def compare(first: SavedRun, second: SavedRun) -> Comparison:
