@@ -133,7 +133,11 @@ def _changed(
         )
         shown.append(Shown(name, number, row, f"<p>{told.removeprefix('<br>')}</p>"))
     more = f"<p>The {_SHOWN} that changed most are shown.</p>" if len(rows) > _SHOWN else ""
-    legend = "" if plan is None else "<p>Circle: the truth. Cross: A's answer. Blue cross: B's.</p>"
+    legend = (
+        ""
+        if plan is None
+        else "<p>Circle: the truth. Red cross: A's answer. Blue cross: B's. Dots: places and poses that A looked at.</p>"
+    )
     return more + legend + gallery(shown, found.first, dataset, plan, other=found.second, has_plan=has_plan)
 
 
