@@ -28,7 +28,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check format generate release-proto lock evaluate evaluate-real bench-training bench-serving fuzz sbom audit reports encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test check format generate release-proto lock evaluate evaluate-real bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -93,6 +93,16 @@ audit: .venv/.uv ## known vulnerabilities of the locked packages; what cannot be
 
 reports: .venv/.torch ## all reports as one page with plots
 	$(BIN)/python -m benchmarks.render $(ARGS)
+
+docs: .venv/.torch ## the site of docs/ -> out/site; a link that leads nowhere fails
+	$(INSTALL) 'mkdocs-material>=9.5,<10'
+	NO_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict
+
+docs-blocks: .venv/.torch ## run every code block of README and docs that can run here -> reports/console.json
+	$(BIN)/python -m benchmarks.docs_blocks $(ARGS)
+
+pictures: .venv/.torch ## the pictures of README and docs
+	$(BIN)/python -m benchmarks.pictures $(ARGS)
 
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS)

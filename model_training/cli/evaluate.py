@@ -16,6 +16,8 @@ from model_training.datasets.dataset import Dataset
 from model_training.evaluation.evaluate import evaluate, write_trajectory
 from model_training.evaluation.measures import recall_at
 from model_training.evaluation.predict import Predictions
+from model_training.evaluation.saved_run import save_run
+from model_training.reporting.run_page import write_run_page
 from service.errors import DatasetError
 from service.maps.reader import MapBundle
 
@@ -46,6 +48,10 @@ def command(
     predictions: Annotated[
         Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")
     ] = None,
+    report_folder: Annotated[
+        Path | None,
+        typer.Option("--report", help="folder for a page to read (index.html), the answers and the run's settings"),
+    ] = None,
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="register each query on the cloud, or measure retrieval alone")
     ] = True,
@@ -56,6 +62,7 @@ def command(
     \b
     Example:
       streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
+      streetfix evaluate maps/paper-city data/paper --report reports/paper
     """
     opened, data = MapBundle.open(bundle), Dataset(dataset)
     names = queries or data.query_sets(with_truth=True)
@@ -78,11 +85,15 @@ def command(
         predictions.mkdir(parents=True, exist_ok=True)
         for name, answers in result.predictions.items():
             answers.save(predictions / f"{name}.npz")
+    if report_folder is not None:
+        page = write_run_page(save_run(report_folder, opened, data, result), opened, data, figures)
     if json_file is not None:
         part = json_file.with_name(json_file.name + ".part")
         part.write_text(json.dumps(figures, indent=1) + "\n")
         part.rename(json_file)
     Console().print(_table(figures))
+    if report_folder is not None:
+        Console(soft_wrap=True).print(f"report: {page}")
 
 
 def _add_raw(

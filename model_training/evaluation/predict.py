@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import TypeVar
@@ -20,6 +20,8 @@ from service.localization.localizer import Localizer
 from service.maps.calibration import FEATURES
 
 RANKED = 10
+#: Of an answer's clusters and of its registered poses so many are kept.
+HYPOTHESES, CANDIDATES = 8, 4
 Report = Callable[[str, int, int], None]
 T = TypeVar("T")
 R = TypeVar("R")
@@ -33,7 +35,9 @@ class Predictions:
     ``street_answer`` (n) are features of the map's streets, -1 for none; ``ranked_xy`` (n, RANKED, 2) are the most similar
     distinct places, the best first, NaN where there are fewer; ``status`` (n), empty where nothing was answered; ``confidence`` (n),
     ``evidence`` (n, F) and ``covariance`` (n, 6, 6), NaN where there is none; ``ms`` (n) of decoding and localizing;
-    ``stamp_s`` (n) are the truth's own timestamps, seconds.
+    ``stamp_s`` (n) are the truth's own timestamps, seconds. ``hypotheses`` (n, HYPOTHESES, 4) are x, y, heading (rad) and weight
+    of the clusters that the search found, ``candidates`` (n, CANDIDATES, 4) x, y, heading and support (nats) of the registered
+    poses, the best first; NaN where there are fewer, and in files of releases that did not keep them.
     """
 
     T_true: NDArray[np.float64]
@@ -48,6 +52,13 @@ class Predictions:
     covariance: NDArray[np.float64]
     ms: NDArray[np.float64]
     stamp_s: NDArray[np.float64]
+    hypotheses: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, HYPOTHESES, 4)))
+    candidates: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, CANDIDATES, 4)))
+
+    def __post_init__(self) -> None:
+        for name, kept in (("hypotheses", HYPOTHESES), ("candidates", CANDIDATES)):
+            if len(getattr(self, name)) != len(self.T_true):  # not given
+                object.__setattr__(self, name, np.full((len(self.T_true), kept, 4), np.nan))
 
     @property
     def localized(self) -> NDArray[np.bool_]:
@@ -64,7 +75,17 @@ class Predictions:
     def load(path: Path) -> "Predictions":
         """Read what ``save`` wrote."""
         with np.load(path, allow_pickle=False) as arrays:
-            return Predictions(**{name: arrays[name] for name in Predictions.__dataclass_fields__})
+            return Predictions(
+                **{
+                    name: arrays[name]
+                    for name in Predictions.__dataclass_fields__
+                    if name in arrays or name not in _LATER
+                }
+            )
+
+
+#: Fields that files of earlier releases lack.
+_LATER = ("hypotheses", "candidates")
 
 
 def joined(parts: list[Predictions]) -> Predictions:
@@ -131,6 +152,7 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
     street_answer, status = np.full(count, -1), np.full(count, "", "<U10")
     confidence, evidence = np.full(count, np.nan), np.full((count, len(FEATURES)), np.nan)
     covariance = np.full((count, 6, 6), np.nan)
+    hypotheses, candidates = np.full((count, HYPOTHESES, 4), np.nan), np.full((count, CANDIDATES, 4), np.nan)
     for k, (answer, _) in enumerate(answers):
         if answer is None:
             continue
@@ -144,6 +166,11 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
             covariance[k] = answer.covariance
         for j, neighbour in enumerate(answer.neighbours[:RANKED]):
             ranked[k, j], ranked_place[k, j] = neighbour.position_m[:2], neighbour.place
+        for j, cluster in enumerate(answer.hypotheses[:HYPOTHESES]):
+            hypotheses[k, j] = *cluster.position_m[:2], cluster.heading_rad, cluster.weight
+        for j, candidate in enumerate((answer.candidates or ())[:CANDIDATES]):
+            T = candidate.T_map_camera
+            candidates[k, j] = *T[:2, 3], heading_of_camera(T), candidate.support
         street_answer[k] = answer.street
     street_true = np.full(count, -1)
     if streets is not None:
@@ -161,6 +188,8 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
         covariance,
         np.array([ms for _, ms in answers]),
         np.array([frame.stamp_s for frame in frames], np.float64),
+        hypotheses,
+        candidates,
     )
 
 

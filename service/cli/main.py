@@ -25,6 +25,8 @@ _KNOWN = {
     "map": ("Look after map bundles: info, verify, diff, merge, update.", "mapping"),
     "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
     "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
+    "compare": ("Compare two evaluations over the same queries.", "mapping"),
+    "view": ("Look at a dataset, a map or answers in Rerun, Foxglove or Lichtblick.", "view"),
     "loadtest": ("Load a running service with a dataset's queries.", "mapping"),
     "demo": ("Map streets, serve the map, ask it where pictures were taken.", "mapping"),
     "train": ("Train an encoder on simulated cities.", "training"),
@@ -46,6 +48,8 @@ _EXTRA_OF_PACKAGE = {
     "small_gicp": "odometry",
     "carla": "carla",
     "cyclonedds": "ros2",
+    "rerun": "view",
+    "foxglove": "view",
 }
 
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,45 @@ def bundle_at(
     return bundle
 
 
+def answers_with(true_xy: Any, answer_xy: Any, **changed: Any) -> Any:
+    """Predictions of queries taken and answered at positions on the ground; NaN for no answer; accepted unless told."""
+    from model_training.evaluation.predict import RANKED, Predictions
+
+    true_xy, answer_xy = np.array(true_xy, np.float64), np.array(answer_xy, np.float64)
+    count, none = len(true_xy), np.isnan(answer_xy[:, 0])
+    T_true, T_answer = (
+        np.stack([transform_from(R_BODY_OPTICAL, np.array([*xy, 1.5])) for xy in each]) for each in (true_xy, answer_xy)
+    )
+    T_answer[none] = np.nan
+    ranked = np.full((count, RANKED, 2), np.nan)
+    ranked[:, 0] = answer_xy
+    given = {
+        "T_true": T_true, "T_answer": T_answer, "street_true": np.zeros(count, int), "street_answer": np.where(none, -1, 0),
+        "ranked_xy": ranked, "ranked_place": np.full((count, RANKED), -1), "status": np.where(none, "", "LOCALIZED"),
+        "confidence": np.full(count, np.nan), "evidence": np.full((count, len(FEATURES)), np.nan),
+        "covariance": np.full((count, 6, 6), np.nan), "ms": np.full(count, 20.0), "stamp_s": np.arange(float(count)),
+    }  # fmt: skip
+    return Predictions(**given | {name: np.array(value) for name, value in changed.items()})
+
+
+@pytest.fixture(scope="session")
+def answers_of() -> Callable[..., Any]:
+    return answers_with
+
+
+@pytest.fixture(scope="session")
+def saved_run(small_map: Path, small_dataset: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report folder of ``small_map`` asked the queries of ``small_dataset``, as ``evaluate --report`` leaves it."""
+    from model_training.evaluation.evaluate import evaluate
+    from model_training.evaluation.saved_run import save_run
+    from model_training.reporting.run_page import write_run_page
+
+    folder, bundle = tmp_path_factory.mktemp("runs") / "small", MapBundle.open(small_map)
+    found = evaluate(bundle, small_dataset, workers=1)
+    write_run_page(save_run(folder, bundle, small_dataset, found), bundle, small_dataset, found.figures)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A dozen scans of a LiDAR that looks down (2 to -24.8 degrees) and five picture pairs of another drive."""
@@ -183,3 +223,47 @@ def streets_alike(
 def twin_map(streets_alike: Callable[..., Path]) -> Path:
     """Two streets that nothing tells apart."""
     return streets_alike()
+
+
+#: Elements of HTML that nothing closes.
+_VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Elements with their attributes, and whether all are closed."""
+
+    def __init__(self, document: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self._open: list[str] = []
+        self.feed(document)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in _VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        if self._open and self._open[-1] != "style":
+            self.words.append(data)
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    @property
+    def text(self) -> str:
+        return " ".join("".join(self.words).split())
+
+
+@pytest.fixture(scope="session")
+def page_of() -> Callable[[str], Page]:
+    return Page

@@ -62,3 +62,13 @@ def test_the_raw_range_image_has_its_recall_over_all_and_in_each_set(
     assert figures["sets"]["drive2_precise"]["raw"]["recall_at_1_5m"] == {"cosine": 0.2, "masked_l2": 0.6}
     row = next(line for line in capsys.readouterr().out.splitlines() if "raw range image R@1" in line)
     assert [cell.strip() for cell in row.strip("│").split("│")] == ["raw range image R@1", "40.00%", "60.00%", "60.00%"]
+
+
+def test_a_report_folder_holds_page_answers_and_settings(
+    small_dataset: Dataset, small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("evaluate", small_map, small_dataset.folder, "--report", tmp_path / "runs" / "one") == 0
+    assert {str(path.relative_to(tmp_path / "runs" / "one")) for path in (tmp_path / "runs" / "one").rglob("*") if path.is_file()} == {
+        "index.html", "run.json", "figures.json", "answers/drive1_precise.npz",
+    }  # fmt: skip
+    assert f"report: {tmp_path}/runs/one/index.html" in capsys.readouterr().out.replace("\n", "")

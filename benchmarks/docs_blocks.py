@@ -1,0 +1,217 @@
+"""Run the code blocks of README and docs as a reader would, page after page, in a folder of their own.
+
+A fence says what it holds: ``sh`` and ``python`` run, ``json`` and ``yaml`` must parse, ``text`` is no code. ``<!-- not run: WHY -->``
+above a fence says why it cannot run here; ``<!-- file: NAME -->`` writes the block there first. ``streetfix serve`` goes on
+in the background until its block ends; a block that asks a service without starting one finds one.
+"""
+
+import json
+import os
+import re
+import shlex
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from benchmarks.report import ROOT, Report
+
+#: The README first: it makes the dataset and the map that the other pages ask.
+PAGES = ("README.md", "start", "survey", "recordings", "maps", "robot", "deploy", "serving", "confidence", "measuring", "api", "problems",
+         "formats", "how_it_works", "limits", "faq", "index", "decisions")  # fmt: skip
+KINDS = ("sh", "python", "json", "yaml", "text")
+_MARK = re.compile(r"<!-- (not run|file): (.+) -->")
+#: What the pages say and what is free here.
+_HTTP, _GRPC = "127.0.0.1:8000", "50051"
+_BLOCK_S, _READY_S = 1800.0, 90.0
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A fenced block: where, what kind, its text; ``why_not`` it is not run, ``file`` that it is written to."""
+
+    page: str
+    line: int
+    kind: str
+    text: str
+    why_not: str | None
+    file: str | None
+
+    @property
+    def runs(self) -> bool:
+        """Whether it is code that can run, or parse, here."""
+        return self.kind != "text" and self.why_not is None
+
+
+def pages() -> list[Path]:
+    """README and every page of ``docs``, in the order in which they are run."""
+    return [ROOT / name if name.endswith(".md") else ROOT / "docs" / f"{name}.md" for name in PAGES]
+
+
+def blocks_of(page: Path) -> list[Block]:
+    """All fenced blocks of a page.
+
+    Raises:
+        ValueError: a fence does not say what it holds, or is not closed.
+    """
+    found, lines, number = [], page.read_text().splitlines(), 0
+    while number < len(lines):
+        if not lines[number].startswith("```"):
+            number += 1
+            continue
+        kind, start = lines[number][3:].strip(), number
+        if kind not in KINDS:
+            raise ValueError(f"{page.name}, line {start + 1}: the fence says {kind!r}, not one of {', '.join(KINDS)}")
+        try:
+            number = lines.index("```", start + 1)
+        except ValueError:
+            raise ValueError(f"{page.name}, line {start + 1}: the fence is not closed") from None
+        mark = _MARK.fullmatch(lines[start - 1].strip()) if start else None
+        marked = {} if mark is None else {mark[1]: mark[2]}
+        text = "\n".join(lines[start + 1 : number])
+        found.append(Block(page.name, start + 1, kind, text, marked.get("not run"), marked.get("file")))
+        number += 1
+    return found
+
+
+def commands_of(block: Block) -> list[str]:
+    """A shell block's commands, one each, without comments; continued lines are one."""
+    joined = block.text.replace("\\\n", " ")
+    bare = [re.sub(r"\s+#\s.*$", "", line).strip() for line in joined.splitlines()]
+    return [line for line in bare if line and not line.startswith("#")]
+
+
+def code_blocks_run(only: tuple[str, ...] = PAGES) -> tuple[int, int]:
+    """Run what can run here of these pages; how many ran, of how many. What fails is printed."""
+    blocks = [block for page, name in zip(pages(), PAGES, strict=True) if name in only for block in blocks_of(page)]
+    wanted = [block for block in blocks if block.runs]
+    ran = 0
+    with tempfile.TemporaryDirectory(prefix="docs-blocks-") as folder:
+        work = Path(folder)
+        environment = _environment(work)
+        for block in wanted:
+            began = time.monotonic()
+            failure = _failure(block, work, environment)
+            ran += failure is None
+            print(
+                f"{block.page}:{block.line} {block.kind}: {failure or 'ran'} ({time.monotonic() - began:.0f} s)",
+                flush=True,
+            )
+    return ran, len(wanted)
+
+
+def _environment(work: Path) -> dict[str, str]:
+    """With the command ``streetfix`` of this interpreter on the path, and ports that are free."""
+    program = work / ".bin" / "streetfix"
+    program.parent.mkdir()
+    program.write_text(
+        f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -c "from service.cli.main import main; main()" "$@"\n'
+    )
+    program.chmod(0o755)
+    return os.environ | {
+        "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT),
+        "STREETFIX_PORT": str(_free_port()), "ORT_DISABLE_TELEMETRY": "1",
+    }  # fmt: skip
+
+
+def _free_port() -> int:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+def _failure(block: Block, work: Path, environment: dict[str, str]) -> str | None:
+    """Run or parse a block; what went wrong, or None."""
+    if block.file is not None:
+        (work / block.file).write_text(block.text + "\n")
+    try:
+        if block.kind == "json":
+            json.loads(block.text)
+        elif block.kind == "yaml":
+            yaml.safe_load(block.text)
+        else:
+            _run(block, work, environment)
+    except (ValueError, yaml.YAMLError, subprocess.SubprocessError, TimeoutError) as error:
+        output = getattr(error, "output", None) or ""
+        return f"FAILED: {error}\n{output[-2000:]}"
+    return None
+
+
+def _run(block: Block, work: Path, environment: dict[str, str]) -> None:
+    address = f"127.0.0.1:{environment['STREETFIX_PORT']}"
+    commands = [block.text] if block.kind == "python" else commands_of(block)
+    commands = [command.replace(_HTTP, address).replace(_GRPC, str(_free_port())) for command in commands]
+    serves = [command for command in commands if _serves(command)]
+    asks = any(address in command for command in commands) and not serves
+    with _in_background("streetfix serve maps/small" if asks else None, work, environment):
+        if block.kind == "python":
+            _call([sys.executable, "-c", commands[0]], work, environment)
+            return
+        with _in_background(serves[0] if serves else None, work, environment):
+            for command in commands:
+                if command not in serves:
+                    _call(["bash", "-euo", "pipefail", "-c", command], work, environment)
+
+
+def _serves(command: str) -> bool:
+    return "streetfix serve" in command and "--check" not in command
+
+
+def _call(arguments: list[str], work: Path, environment: dict[str, str]) -> None:
+    subprocess.run(
+        arguments, cwd=work, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        check=True, timeout=_BLOCK_S,
+    )  # fmt: skip
+
+
+@contextmanager
+def _in_background(command: str | None, work: Path, environment: dict[str, str]) -> Iterator[None]:
+    """A service that is ready, for as long as a block lasts; nothing for None."""
+    if command is None:
+        yield
+        return
+    process = subprocess.Popen(
+        shlex.split(command), cwd=work, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        _wait_until_ready(f"http://127.0.0.1:{environment['STREETFIX_PORT']}/readyz", process)
+        yield
+    finally:
+        process.terminate()
+        process.wait(timeout=60)
+
+
+def _wait_until_ready(url: str, process: "subprocess.Popen[bytes]") -> None:
+    until = time.monotonic() + _READY_S
+    while time.monotonic() < until:
+        if process.poll() is not None:
+            raise subprocess.CalledProcessError(process.returncode, process.args)
+        try:
+            urllib.request.urlopen(url, timeout=2).close()  # noqa: S310  # of our own making
+        except OSError:  # not yet
+            time.sleep(0.2)
+        else:
+            return
+    raise TimeoutError(f"{url} is not ready after {_READY_S:g} s")
+
+
+def main() -> None:
+    """Add ``docs.code_blocks_run`` to ``reports/console.json``."""
+    report = Report("console", "python -m benchmarks.docs_blocks")
+    report.keep_others()
+    ran, total = code_blocks_run()
+    why = None if ran == total else f"{total - ran} of {total} failed"
+    report.row("docs.code_blocks_run", ran / total, "share", bar=1.0, n=total, why=why)
+    print(report.write())
+
+
+if __name__ == "__main__":
+    main()

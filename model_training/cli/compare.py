@@ -1,0 +1,84 @@
+"""``streetfix compare``."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.compare import Comparison, compare
+from model_training.evaluation.saved_run import SavedRun
+from model_training.reporting.comparison_page import HEAD, LABELS, row_of, write_comparison_page
+from model_training.reporting.plan import Plan
+from service.errors import BundleError, DatasetError
+from service.maps.reader import MapBundle
+
+
+def command(
+    first: Annotated[Path, typer.Argument(metavar="A", help="folder of `evaluate --report`: what is compared with")],
+    second: Annotated[Path, typer.Argument(metavar="B", help="folder of `evaluate --report` over the same queries")],
+    out: Annotated[
+        Path | None, typer.Option(help="folder for a page to read, with the pictures of what changed")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="write all figures here")] = None,
+    dataset: Annotated[Path | None, typer.Option(help="the queries' pictures [default: where A found them]")] = None,
+) -> None:
+    """Compare two runs over the same queries: paired differences with intervals, and which queries changed sides.
+
+    \b
+    Example:
+      streetfix compare reports/before reports/after --out reports/difference
+    """
+    a, b = SavedRun.open(first), SavedRun.open(second)
+    found, console = compare(a, b), Console(soft_wrap=True)
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        part = json_file.with_name(json_file.name + ".part")
+        part.write_text(json.dumps(found.as_json(), indent=1) + "\n")
+        part.rename(json_file)
+    Console().print(_table(found))
+    console.print(found.verdict, highlight=False)
+    if out is not None:
+        page = write_comparison_page(
+            out, a, b, found, dataset=_dataset(a, dataset, console), plan=_plan((b, a), console)
+        )
+        console.print(f"report: {page}")
+
+
+def _table(found: Comparison) -> Table:
+    table = Table(box=None, padding=(0, 1, 0, 0))
+    for k, name in enumerate(HEAD):
+        table.add_column(name, justify="left" if k == 0 else "right", no_wrap=True)
+    for name, each in found.shares.items():
+        table.add_row(*row_of(LABELS[name], each))
+    if len(found.sets) > 1:
+        table.add_section()
+        table.add_row("by set, 1 m:")
+        for name, each in found.sets.items():
+            table.add_row(*row_of(name, each))
+    return table
+
+
+def _dataset(run: SavedRun, given: Path | None, console: Console) -> Dataset | None:
+    """The pictures, where they still lie; a folder that was named must be one."""
+    if given is not None:
+        return Dataset(given)
+    try:
+        return Dataset(Path(run.settings.dataset.path))
+    except DatasetError as error:
+        console.print(f"the page has no pictures: {error.message}", highlight=False)
+        return None
+
+
+def _plan(runs: tuple[SavedRun, ...], console: Console) -> Plan | None:
+    """The map of either run, where it still lies."""
+    for run in runs:
+        try:
+            return Plan.of(MapBundle.open(Path(run.settings.map.path), verify=False))
+        except BundleError as error:
+            why = error.message
+    console.print(f"the page has no map: {why}", highlight=False)
+    return None

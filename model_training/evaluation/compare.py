@@ -1,0 +1,124 @@
+"""Compare two saved runs over the same queries."""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.evaluation.failures import RIGHT_M, position_errors
+from model_training.evaluation.measures import recall_at
+from model_training.evaluation.paired import PairedErrors, PairedShares, paired_errors, paired_shares
+from model_training.evaluation.predict import RANKED, Predictions, joined
+from model_training.evaluation.saved_run import SavedRun
+from service.errors import DatasetError
+
+#: Below it, chance alone is called an unlikely reason.
+_P = 0.05
+#: Truths nearer than this are the same pose; files keep nine digits.
+_SAME_M = 1e-6
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What differs between two runs A and B.
+
+    Attributes:
+        shares: by measure, over all queries.
+        sets: within 1 m and accepted, by query set.
+        errors: distances of answers, accepted or not, that both have.
+        gained: rows (of the joined sets) that only B has within 1 m and accepted.
+        lost: rows that only A has.
+        first: answers of A, all sets joined.
+        second: answers of B.
+    """
+
+    shares: dict[str, PairedShares]
+    sets: dict[str, PairedShares]
+    errors: PairedErrors | None
+    gained: list[int]
+    lost: list[int]
+    first: Predictions
+    second: Predictions
+
+    @property
+    def verdict(self) -> str:
+        """One line that says no more than the queries do."""
+        right = self.shares["within_1_m"]
+        low, high = (f"{100 * side:+.1f}" for side in right.interval)
+        told = (
+            f"{right.only_second} of {right.count} queries are won and {right.only_first} lost: {100 * right.difference:+.1f} points "
+            f"within 1 m (95 % interval {low} to {high}; McNemar's p {p_text(right.p)})"
+        )
+        if right.only_first + right.only_second == 0:
+            return f"No difference: A and B are right about the same queries ({right.count}, {right.second:.1%} within 1 m)."
+        if right.p < _P:
+            return f"B is {'better' if right.difference > 0 else 'worse'} than A by more than chance explains: {told}."
+        return f"No difference can be told from chance: {told}."
+
+    def as_json(self) -> dict[str, Any]:
+        """All figures as plain values."""
+        return {
+            "verdict": self.verdict,
+            "shares": {name: asdict(each) | {"difference": each.difference} for name, each in self.shares.items()},
+            "sets": {name: asdict(each) | {"difference": each.difference} for name, each in self.sets.items()},
+            "errors": None if self.errors is None else asdict(self.errors),
+            "gained": self.gained, "lost": self.lost,
+        }  # fmt: skip
+
+
+def p_text(p: float) -> str:
+    """A probability as one says it."""
+    return "<0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def compare(first: SavedRun, second: SavedRun) -> Comparison:
+    """Compare B (``second``) with A (``first``).
+
+    Raises:
+        DatasetError: they did not ask the same queries; says which set and what differs.
+    """
+    _require_same_queries(first, second)
+    names = list(first.predictions)
+    a, b = joined([first.predictions[name] for name in names]), joined([second.predictions[name] for name in names])
+    right_a, right_b = _right(a), _right(b)
+    return Comparison(
+        shares={name: paired_shares(one, other) for name, one, other in _flags(a, b)},
+        sets={name: paired_shares(_right(first.predictions[name]), _right(second.predictions[name])) for name in names},
+        errors=paired_errors(position_errors(a), position_errors(b)),
+        gained=[int(k) for k in np.flatnonzero(right_b & ~right_a)], lost=[int(k) for k in np.flatnonzero(right_a & ~right_b)],
+        first=a, second=b,
+    )  # fmt: skip
+
+
+def _right(p: Predictions) -> NDArray[np.bool_]:
+    return np.asarray(p.localized & (position_errors(p) <= RIGHT_M))
+
+
+def _flags(a: Predictions, b: Predictions) -> Iterator[tuple[str, NDArray[np.bool_], NDArray[np.bool_]]]:
+    true_xy = a.T_true[:, :2, 3]
+    for name, reach in (("within_0_5_m", 0.5), ("within_1_m", RIGHT_M), ("within_5_m", 5.0)):
+        yield name, a.localized & (position_errors(a) <= reach), b.localized & (position_errors(b) <= reach)
+    for k in (1, 5, RANKED):
+        yield f"recall_at_{k}_5m", recall_at(a.ranked_xy, true_xy, k), recall_at(b.ranked_xy, true_xy, k)
+    yield "localized", a.localized, b.localized
+    yield "accepted_but_wrong", a.localized & ~_right(a), b.localized & ~_right(b)
+
+
+def _require_same_queries(first: SavedRun, second: SavedRun) -> None:
+    names, others = set(first.predictions), set(second.predictions)
+    if names != others:
+        alone = ", ".join(sorted(names ^ others))
+        raise DatasetError(
+            f"{first.folder} and {second.folder} did not ask the same query sets: only one has {alone}; "
+            "evaluate both with the same --queries", field="queries",
+        )  # fmt: skip
+    for name in sorted(names):
+        one, other = first.predictions[name].T_true, second.predictions[name].T_true
+        if len(one) != len(other) or not np.allclose(one, other, rtol=0, atol=_SAME_M):
+            raise DatasetError(
+                f"query set {name!r}: {first.folder} ({first.settings.dataset.name}, {len(one)} queries) and {second.folder} "
+                f"({second.settings.dataset.name}, {len(other)} queries) asked other queries; evaluate both on the same dataset",
+                field="queries",
+            )  # fmt: skip

@@ -1,0 +1,215 @@
+"""The page of one run: how far off, how sure, where, and what was lost by which stage."""
+
+from collections import Counter
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.failures import WHY, Stage, position_errors, stages, worst
+from model_training.evaluation.predict import Predictions, joined
+from model_training.evaluation.saved_run import SavedRun
+from model_training.reporting.charts import (
+    error_curve,
+    error_histogram,
+    recall_curves,
+    reliability,
+    series_of,
+    side_by_side,
+)
+from model_training.reporting.page import Section, figure, page, table, write_page
+from model_training.reporting.plan import ERRORS, Plan
+from model_training.reporting.queries import Shown, gallery, locate, said_of
+from service.maps.reader import MapBundle
+
+PAGE = "index.html"
+WORST = 20
+_SHARES = (
+    ("localized", "answered"), ("within_0_5_m", "within 0.5 m"), ("within_1_m", "within 1 m"), ("within_5_m", "within 5 m"),
+    ("street_accuracy", "street right"), ("recall_at_1_5m", "R@1 at 5 m"), ("recall_at_5_5m", "R@5 at 5 m"),
+    ("recall_at_10_5m", "R@10 at 5 m"),
+)  # fmt: skip
+_NUMBERS = (
+    ("median_distance_error_m", "median error", "{:.2f} m"), ("mean_distance_error_m", "mean error", "{:.2f} m"),
+    ("p95_distance_error_m", "95th percentile", "{:.2f} m"), ("median_heading_error_deg", "median heading error", "{:.2f}°"),
+    ("ms_per_query", "time per query", "{:.0f} ms"),
+)  # fmt: skip
+
+
+def write_run_page(run: SavedRun, bundle: MapBundle, dataset: Dataset, figures: dict[str, Any]) -> Path:
+    """Write ``index.html`` beside the saved answers and say where.
+
+    Args:
+        run: saved.
+        bundle: the map that answered.
+        dataset: whose queries were asked.
+        figures: of the evaluation.
+    """
+    everything = joined(list(run.predictions.values()))
+    plan = Plan.of(bundle)
+    sections = [
+        Section("figures", "Figures", _figures(figures)),
+        Section("errors", "How far off", _errors(run.predictions, everything)),
+        Section("search", "Search and confidence", _search(run.predictions, everything)),
+        Section("map", "The map, coloured by error", _map(plan, everything)),
+        Section("lost", "What was lost where", _lost(everything)),
+    ]
+    if len(run.predictions) > 1:
+        sections.insert(1, Section("conditions", "Conditions side by side", _conditions(run, figures)))
+    if figures.get("confusion"):
+        sections.append(Section("streets", "Streets", _confusion(figures["confusion"])))
+    sections.append(Section("worst", "The worst queries", _worst(run.predictions, everything, dataset, plan)))
+    path = run.folder / PAGE
+    write_page(path, page(f"{run.settings.dataset.name} on map {run.settings.map.name}", _lead(run, figures), sections))
+    return path
+
+
+def _lead(run: SavedRun, figures: dict[str, Any]) -> str:
+    settings = run.settings
+    low, high = figures["ci95"]["within_1_m"]
+    made = f"streetfix {settings.streetfix}" + (f", commit {settings.commit[:10]}" if settings.commit else "")
+    return (
+        f'<p class="verdict">{figures["queries"]} queries: {figures["within_1_m"]:.1%} were accepted and lie within 1 m of the truth '
+        f"(95 % interval {low:.1%} to {high:.1%}); {figures['localized']:.1%} were accepted at all.</p>"
+        f'<p class="soft">Map {escape(settings.map.name)}, version {escape(settings.map.version)}; dataset '
+        f"{escape(settings.dataset.name)}; "
+        f"{'registered on the cloud' if settings.registered else 'retrieval alone'}; {escape(made)}; "
+        f"{settings.made_at:%Y-%m-%d %H:%M} UTC.</p>"
+    )
+
+
+def _figures(figures: dict[str, Any]) -> str:
+    columns = _columns(figures)
+    rows = [
+        [escape(label), *(_share(values, key) for values in columns.values())]
+        for key, label in _SHARES
+        if figures.get(key) is not None
+    ]
+    rows += [
+        [escape(label), *("-" if values.get(key) is None else form.format(values[key]) for values in columns.values())]
+        for key, label, form in _NUMBERS
+    ]
+    head = ["", *(f'{escape(name)}<span class="ci">{values["queries"]} queries, {escape(values["split"].replace("_", " "))}</span>'
+                  for name, values in columns.items())]  # fmt: skip
+    caption = "Shares are over all queries, an unanswered one being wrong, with 95 % intervals; distances are over accepted answers."
+    return table(caption, head, rows)
+
+
+def _columns(figures: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return figures["sets"] if len(figures["sets"]) == 1 else {"all": figures, **figures["sets"]}
+
+
+def _share(values: dict[str, Any], key: str) -> str:
+    if values.get(key) is None:
+        return "-"
+    low, high = values["ci95"][key]
+    return f'{values[key]:.1%}<span class="ci">{low:.1%} to {high:.1%}</span>'
+
+
+def _conditions(run: SavedRun, figures: dict[str, Any]) -> str:
+    sets = figures["sets"]
+    rows = [
+        [f"{k}. {escape(each.name)}", escape(each.condition or "not known"), escape(each.split.replace("_", " ")),
+         *(_share(sets[each.name], key) for key in ("localized", "within_1_m", "recall_at_1_5m"))]
+        for k, each in enumerate(run.settings.sets, 1)
+    ]  # fmt: skip
+    drawn = [
+        figure(
+            side_by_side({name: (values[key], *values["ci95"][key]) for name, values in sets.items()}, label),
+            f"{label}, with 95 % intervals.",
+        )
+        for key, label in (("within_1_m", "within 1 m"), ("recall_at_1_5m", "R@1 at 5 m"))
+    ]  # fmt: skip
+    return table("Each query set with weather and light, and how its queries relate to the survey.",
+                 ["set", "condition", "split", "answered", "within 1 m", "R@1 at 5 m"], rows) + _pair(drawn)  # fmt: skip
+
+
+def _errors(runs: dict[str, Predictions], everything: Predictions) -> str:
+    curve = figure(
+        error_curve(series_of(runs)), "Share of all queries whose answer, accepted or not, lies within a distance."
+    )
+    bars = figure(
+        error_histogram(everything), "Answers by their distance from the truth; the last bar holds all beyond."
+    )
+    return _pair([curve, bars])
+
+
+def _pair(figures: list[str]) -> str:
+    return f'<div class="pair">{"".join(figures)}</div>'
+
+
+def _search(runs: dict[str, Predictions], everything: Predictions) -> str:
+    parts = [
+        figure(
+            recall_curves(series_of(runs)),
+            "Share of queries with a place within 5 m of the truth among the k most similar, before registration.",
+        )
+    ]
+    drawn = reliability(everything)
+    if drawn is not None:
+        words = (
+            "How often answers of a confidence are within 1 m, with 95 % intervals; on the dashed line it is what it says. "
+            f"Expected calibration error {drawn[1]:.3f}."
+        )
+        parts.append(figure(drawn[0], words))
+    note = (
+        ""
+        if drawn is not None
+        else "<p>Answers of this run carry no confidence: the map is not calibrated, or nothing was registered.</p>"
+    )
+    return _pair(parts) + note
+
+
+def _map(plan: Plan, everything: Predictions) -> str:
+    legend = "".join(f'<li><i class="key {name}"></i>{label}</li>' for _, name, label in ERRORS)
+    words = (
+        "Walls from above, each query where it was taken. Crosses are farther off than 5 m or have no answer; "
+        "dashed lines lead to where they were put."
+    )
+    return figure(plan.whole(everything) + f'<ul class="legend">{legend}</ul>', words)
+
+
+def _lost(everything: Predictions) -> str:
+    counts = Counter(stages(everything))
+    total = len(everything.T_true)
+    rows = [
+        [escape(stage), str(counts[stage]), f"{counts[stage] / total:.1%}", escape(WHY[stage])]
+        for stage in Stage
+        if counts[stage]
+    ]
+    return table(
+        "Every query counts once.", ["what became of it", "queries", "share", "that is"], rows, kind="last-told"
+    )
+
+
+def _confusion(confusion: dict[str, Any]) -> str:
+    names, matrix = confusion["classes"], confusion["matrix"]
+    head = "".join(f'<th scope="col" title="{escape(name)}">{k}</th>' for k, name in enumerate(names, 1))
+    body = []
+    for number, (name, row) in enumerate(zip(names, matrix, strict=True)):
+        if not sum(row):
+            continue
+        cells = "".join(
+            f'<td{"" if column == number else " class=wrong"} style="--share:{count / sum(row):.2f}">{count}</td>' if count else "<td></td>"
+            for column, count in enumerate(row)
+        )  # fmt: skip
+        body.append(f'<tr><th scope="row">{escape(name)} ({number + 1})</th>{cells}</tr>')
+    return (
+        '<div class="scroll"><table class="confusion"><caption>True streets down, answered ones across, by number; the last column is '
+        "no street, or an answer that was not accepted. Streets without queries are left out.</caption>"
+        f'<thead><tr><th class="text">true street</th>{head}<th scope="col">none</th></tr></thead>'
+        f"<tbody>{''.join(body)}</tbody></table></div>"
+    )
+
+
+def _worst(runs: dict[str, Predictions], everything: Predictions, dataset: Dataset, plan: Plan) -> str:
+    became, errors = stages(everything), position_errors(everything)
+    shown = [
+        Shown(name, number, row, said_of(everything, row, became[row], errors[row]))
+        for name, number, row in locate(worst(everything, WORST), runs)
+    ]
+    words = (
+        "<p>Wrong answers that were accepted come first, since they do harm; then the others by distance. "
+        "On the little maps the circle is the truth, the cross the answer, dots are places and poses that were looked at.</p>"
+    )
+    return words + gallery(shown, everything, dataset, plan, has_plan=True)

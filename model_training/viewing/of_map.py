@@ -1,0 +1,30 @@
+"""A map bundle as events: cloud, places, streets."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from model_training.viewing.events import Cloud, Event, Outlines, Track
+from service.maps.reader import MapBundle
+from service.maps.streets import Streets
+
+
+def events_of_map(bundle: MapBundle, *, most_points: int) -> Iterator[Event]:
+    """Everything is there all the time; of a larger cloud each n-th surfel is shown."""
+    if bundle.cloud is not None:
+        surfels = bundle.cloud.surfels[:: max(1, -(-len(bundle.cloud.surfels) // most_points))]
+        upright = 1 - np.abs(surfels["normal"][:, 2])
+        yield Cloud(
+            "map/cloud", None, bundle.cloud.origin_m, surfels["xyz"].astype(np.float32), (90 + 150 * upright).astype(np.uint8)
+        )  # fmt: skip
+    yield Track("map/places", None, bundle.T_map_place[:, :3, 3])
+    if bundle.streets is not None and bundle.earth is None:
+        ground_m = float(np.median(bundle.T_map_place[:, 2, 3])) - bundle.manifest.lidar_height_m
+        yield outlines_of(bundle.streets, ground_m)
+
+
+def outlines_of(streets: Streets, ground_m: float) -> Outlines:
+    """The outer rings of streets that are given in map metres, at a height."""
+    named = [(street.name, rings[0]) for street in streets.features for rings in street.polygons]
+    flat = tuple(np.column_stack([ring, np.full(len(ring), ground_m)]) for _, ring in named)
+    return Outlines("map/streets", None, tuple(name for name, _ in named), flat)
