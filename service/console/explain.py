@@ -23,7 +23,7 @@ from service.registration.rendered import REACH_M, SURFEL_M
 from service.registration.surfel_map import TILE_M, SurfelMap
 from service.runtime.engine import EncodedQuery, Engine, Located
 
-_WIDTH = 320  # of depth pictures
+_WIDTH, _MAP_WIDTH = 320, 160  # of depth pictures; in a larger one the gaps between surfels show
 _POINTS_ACROSS = 160  # of the query's points in the map
 _CELL_PIXELS = 4
 _POINT = np.dtype([("xyz", "<f4", (3,)), ("rgb", "u1", (3,)), ("pad", "u1")])
@@ -64,7 +64,9 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
     if bundle.cloud is not None:
         best = answer.neighbours[0]
         drawn["view"] = _map_view(bundle, bundle.cloud, best.position_m, best.heading_rad)
-        drawn["map_depth"] = depth_picture(_drawn_map(bundle.cloud, T_map_camera, _scaled(frame.query)))
+        drawn["map_depth"] = enlarged(
+            depth_picture(_drawn_map(bundle.cloud, T_map_camera, _scaled(frame.query))), _WIDTH // _MAP_WIDTH
+        )
     origin_m = np.round(T_map_camera[:3, 3])
     return Explanation(
         located, {name: png_of(each) for name, each in drawn.items()}, _points(frame.query, depth_m, T_map_camera, origin_m), origin_m
@@ -123,7 +125,7 @@ def _drawn_map(cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera)
 
 def _scaled(query: Query) -> PinholeCamera:
     camera = query.camera
-    return camera.scaled_to(_WIDTH, max(1, round(_WIDTH * camera.height / camera.width)))
+    return camera.scaled_to(_MAP_WIDTH, max(1, round(_MAP_WIDTH * camera.height / camera.width)))
 
 
 def _small(depth_m: Float32[NDArray[np.float32], "H W"], width: int = _WIDTH) -> Float32[NDArray[np.float32], "h w"]:
