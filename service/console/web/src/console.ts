@@ -32,6 +32,7 @@ export class ConsolePage {
   readonly #state = element('p', { class: 'state', role: 'status' });
   readonly #loading = element('p', { class: 'loading', role: 'status' });
   readonly #turn: HTMLButtonElement;
+  readonly #all: HTMLButtonElement;
   #entries: MapEntry[] = [];
   #shown: MapEntry | null = null;
   #asking = 0;
@@ -63,6 +64,11 @@ export class ConsolePage {
       else this.#live.stop();
     });
     this.#turn = button('3D', () => { this.#turnMap(); }, { 'aria-pressed': 'false', title: 'From above or around (3)' });
+    this.#all = button('⁙', () => {
+      const draws = this.#all.getAttribute('aria-pressed') !== 'true';
+      this.#all.setAttribute('aria-pressed', String(draws));
+      this.#map.drawsAll = draws;
+    }, { 'aria-pressed': 'false', 'aria-label': 'Draw every point, also while the map moves', title: 'Draw every point, also while the map moves' });
     this.#map.element.addEventListener('turn', () => { this.#turnMap(); });
     this.#choice.addEventListener('change', () => { void this.#showMap(this.#choice.value); });
     this.#theme = new Theme((shade) => { this.#map.shade = shade; this.#legend.shade = shade; });
@@ -115,6 +121,7 @@ export class ConsolePage {
             this.#turn,
             zoom('+', 'Zoom in', 1.5),
             zoom('−', 'Zoom out', 1 / 1.5),
+            this.#all,
             button('⤢', () => { this.#map.showAll(); }, { 'aria-label': 'Show the whole map', title: 'Show the whole map (0)' }),
           ),
           this.#legend.element,

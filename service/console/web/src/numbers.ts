@@ -9,5 +9,6 @@ export const count = (value: number): string => value.toLocaleString('en');
 export function percent(share: number): string {
   const value = 100 * share;
   if (value > 99.9 && value < 100) return '> 99.9 %';
+  if (value > 0 && value < 0.1) return '< 0.1 %';
   return `${value.toFixed(value > 99 || value < 1 ? 1 : 0)} %`;
 }

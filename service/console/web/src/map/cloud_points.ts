@@ -82,9 +82,9 @@ export class CloudPoints {
   /** How many pixels a metre is: at a distance of one metre, or everywhere where there is no perspective. */
   scale(metrePx: number, pixelRatio: number): void {
     const uniforms = this.#material.uniforms;
-    if (uniforms['metrePx']) uniforms['metrePx'].value = 0.3 * metrePx;
+    if (uniforms['metrePx']) uniforms['metrePx'].value = 0.4 * metrePx;
     if (uniforms['smallestPx']) uniforms['smallestPx'].value = pixelRatio;
-    if (uniforms['largestPx']) uniforms['largestPx'].value = 5 * pixelRatio;
+    if (uniforms['largestPx']) uniforms['largestPx'].value = 7 * pixelRatio;
   }
 
   dispose(): void {

@@ -1,13 +1,19 @@
-// How many points are drawn while the map moves, so that it follows the hand on any machine; all of them when it rests.
+// How many points are drawn while the map moves, so that it follows the hand on any machine; more when it rests.
 
 const TARGET_MS = 40;
-const FEWEST = 60_000;
+/** A map at rest may take longer, but not so long that the next click waits for it. */
+const REST_TARGETS = 10;
+const FEWEST = 30_000;
 
 export class FrameBudget {
-  #points = 2_000_000;
+  #points = 200_000;
 
   get points(): number {
     return Math.round(this.#points);
+  }
+
+  get pointsAtRest(): number {
+    return REST_TARGETS * this.points;
   }
 
   /** What the last frame took, with so many points drawn. */

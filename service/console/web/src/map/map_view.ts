@@ -41,6 +41,7 @@ export class MapView {
   #moving = false;
   #rest = 0;
   #drawsPrior = false;
+  #drawsAll = false;
 
   constructor() {
     this.#surface = element('canvas', { class: 'cloud', 'aria-hidden': 'true' });
@@ -99,6 +100,12 @@ export class MapView {
     if (draws) this.mode = 'above';
     this.#cameras.movable = !draws;
     this.element.classList.toggle('draws', draws);
+  }
+
+  /** Whether every point is drawn, however long that takes. */
+  set drawsAll(draws: boolean) {
+    this.#drawsAll = draws;
+    this.changed();
   }
 
   get pointCount(): number {
@@ -195,7 +202,8 @@ export class MapView {
     const palette = PALETTES[this.#shade];
     const began = performance.now();
     if (this.#cloud) {
-      this.#cloud.limit(this.#moving ? this.#budget.points : Infinity);
+      const affordable = this.#moving ? this.#budget.points : this.#budget.pointsAtRest;
+      this.#cloud.limit(this.#drawsAll ? Infinity : affordable);
       this.#cloud.scale(cameras.metrePx * ratio, ratio);
     }
     this.#renderer.render(this.#scene, cameras.active);
@@ -207,7 +215,8 @@ export class MapView {
     this.#answer.draw(this.#overlay, palette, metrePx);
     this.#answer.drawNames(this.#overlay, palette);
     this.#ground?.drawNames(this.#overlay, palette);
-    if (this.#moving && this.#cloud) this.#measure(began, Math.min(this.#budget.points, this.#cloud.count));
+    this.element.dataset['frames'] = String(Number(this.element.dataset['frames'] ?? 0) + 1);
+    if (this.#moving && this.#cloud && !this.#drawsAll) this.#measure(began, Math.min(this.#budget.points, this.#cloud.count));
   }
 
   /** The graphics card works on after the call: the next frame's beginning tells how long. */
