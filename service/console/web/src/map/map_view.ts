@@ -84,7 +84,7 @@ export class MapView {
 
   set shade(shade: Shade) {
     this.#shade = shade;
-    this.#scene.background = new Color().setHex(PALETTES[shade].paper, '');
+    this.#scene.background = new Color(PALETTES[shade].paper);
     this.#cloud?.shade(shade);
     this.changed();
   }

@@ -21,7 +21,7 @@ export interface Palette {
 
 export const PALETTES: Record<Shade, Palette> = {
   light: {
-    paper: 0xf4f2ec,
+    paper: 0xf7f5f0,
     halo: 'rgba(255,255,255,0.92)',
     name: '#26343b',
     street: 'rgba(70,86,94,0.55)',
