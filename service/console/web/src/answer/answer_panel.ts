@@ -17,6 +17,8 @@ const STATUS_MEANING = {
   AMBIGUOUS: 'In the map, but not sure where: look at the hypotheses. A prior or more frames decide.',
   OUT_OF_MAP: 'The map does not show what the pictures do.',
 } as const;
+/** What confidence promises: a position within this of the true one. */
+const WRONG_M = 1;
 const STAGES = ['decode', 'fuse', 'encode', 'search', 'register'] as const;
 
 export class AnswerPanel {
@@ -75,7 +77,7 @@ export class AnswerPanel {
         'div',
         { class: 'figures' },
         figure(answer.confidence === null ? 'not calibrated' : percent(answer.confidence), 'within 1 m'),
-        error === null ? null : figure(metres(error.metres), error.degrees === null ? 'from the truth' : `and ${degrees(error.degrees)} from the truth`),
+        error === null ? null : figure(metres(error.metres), error.degrees === null ? 'from the truth' : `and ${degrees(error.degrees)} from the truth`, error.metres > WRONG_M),
       ),
     );
   }
@@ -150,8 +152,8 @@ export class AnswerPanel {
   }
 }
 
-function figure(value: string, name: string): HTMLElement {
-  return element('div', {}, element('b', {}, value), element('span', {}, name));
+function figure(value: string, name: string, wrong = false): HTMLElement {
+  return element('div', wrong ? { class: 'wrong' } : {}, element('b', {}, value), element('span', {}, name));
 }
 
 function table(heads: string[], rows: string[][]): HTMLElement {
