@@ -89,7 +89,6 @@ export class ConsolePage {
     key.value = this.#service.key;
     key.addEventListener('change', () => {
       this.#service.key = key.value.trim();
-      this.#shown = null;
       void this.#look();
       void this.#showSamples();
     });
@@ -178,6 +177,7 @@ export class ConsolePage {
       this.#loading.textContent = '';
       this.element.dataset['ready'] = version;
     } catch (error) {
+      if (this.#isStillShown(entry)) this.#shown = null; // the next look tries again
       this.#loading.textContent = `The map cannot be drawn: ${error instanceof Error ? error.message : String(error)}`;
     }
   }

@@ -29,7 +29,8 @@ export class PriorLayer {
     const at = overlay.at(position.x, position.y, groundZ);
     if (at === null) return;
     overlay.dot(at, 4, { line: palette.halo, fill: palette.prior, width: 2 });
-    overlay.label(`prior ±${position.std_m} m`, [at[0], at[1] - 14], palette.prior, palette.halo, true);
+    const top = overlay.at(position.x, position.y + position.std_m, groundZ) ?? at;
+    overlay.label(`prior ±${position.std_m} m`, [top[0], top[1] - 12], palette.prior, palette.halo, true);
   }
 }
 

@@ -92,19 +92,24 @@ export class LivePanel {
       element(
         'tr',
         {},
-        element('td', {}, new Date(answer.at).toLocaleTimeString()),
-        element('td', {}, element('span', { class: `dot ${answer.status.toLowerCase()}`, title: answer.status }), answer.street ?? '–'),
+        element('td', {}, new Date(answer.at).toLocaleTimeString([], { hour12: false })),
+        element('td', {}, element('span', { class: `dot ${answer.status.toLowerCase()}`, title: answer.status }), this.#street(answer)),
         element('td', {}, answer.confidence === null ? '–' : percent(answer.confidence)),
         element('td', {}, milliseconds(answer.total_ms)),
-        element('td', {}, button('show', () => { this.chosen(answer); }, { class: 'small quiet', 'aria-label': `Show answer ${answer.number} on the map` })),
       ),
     );
-    const heads = ['at', 'street', 'sure', 'took', ''];
+    const heads = ['at', 'street', 'sure', 'took'];
     return element(
       'table',
       {},
-      element('thead', {}, element('tr', {}, ...heads.map((each) => element(each === '' ? 'td' : 'th', each === '' ? {} : { scope: 'col' }, each)))),
+      element('thead', {}, element('tr', {}, ...heads.map((each) => element('th', { scope: 'col' }, each)))),
       element('tbody', {}, ...rows),
     );
+  }
+
+  /** Pressed, the map shows the place. */
+  #street(answer: LastAnswer): HTMLButtonElement {
+    const street = answer.street ?? 'no street';
+    return button(street, () => { this.chosen(answer); }, { class: 'link', 'aria-label': `Show answer ${answer.number}, ${street}, on the map` });
   }
 }
