@@ -70,6 +70,7 @@ def main() -> int:
         for name, rows in in_browser.items():
             if name in only:
                 rows(report, browser, url)
+                report.write()  # what was measured stays, whatever comes after
     report.write()
     return 0
 

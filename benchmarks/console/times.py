@@ -50,7 +50,7 @@ def answer_rows(report: Report, browser: Any, url: str) -> None:
     taken = []
     for k in range(CLICKS):
         page.click(f"[data-sample='{samples[k % len(samples)]}']")
-        page.wait_for_function("window.timed.seconds !== undefined", timeout=ANSWER_MS)
+        page.wait_for_function("() => window.timed.seconds !== undefined", timeout=ANSWER_MS)
         taken.append(float(page.evaluate("window.timed.seconds")))
         page.wait_for_timeout(_WARM_MS / 2)
     page.context.close()
@@ -76,7 +76,7 @@ def frame_rows(report: Report, browser: Any, url: str) -> None:
         _serve_cloud(page, cloud)
         page.route("**/bare/**", lambda route: route.fulfill(path=_bare_file(route.request.url)))
         page.goto(f"{url}/bare/?size={width}x{height}&half={_HALF_M:g}")
-        page.wait_for_function("window.framesDrawn?.() > 0", timeout=READY_MS)
+        page.wait_for_function("() => window.framesDrawn?.() > 0", timeout=READY_MS)
         return _rate(page, "window.framesDrawn()")
 
     width, height = _map_size(browser, url)

@@ -89,12 +89,12 @@ def test_a_question_is_copied_as_curl_and_as_python(url: str, page_of: Pages) ->
     open_console(page, url)
     click_sample(page, "01")
     page.click("button:text-is('Copy as curl')")
-    page.wait_for_function("document.body.innerText.includes('Copied.')")
+    page.wait_for_function("() => document.body.innerText.includes('Copied.')")
     curl = page.evaluate("navigator.clipboard.readText()")
     assert curl.startswith("curl -F 'rgb=@rgb.jpg'")
     assert curl.endswith(f"'{url}/v1/localize'")
     page.click("button:text-is('as Python')")
-    page.wait_for_function("navigator.clipboard.readText().then(text => text.includes('import httpx'))")
+    page.wait_for_function("() => navigator.clipboard.readText().then(text => text.includes('import httpx'))")
     compile(page.evaluate("navigator.clipboard.readText()"), "copied.py", "exec")
 
 
