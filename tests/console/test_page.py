@@ -77,7 +77,7 @@ def test_a_prior_is_drawn_with_the_mouse_and_asked(url: str, page_of: Pages, sho
     assert float(page.input_value("#prior-std")) > 5
     assert page.get_attribute("button:text-is('Draw on the map')", "aria-pressed") == "false"
     page.click("button:text-is('Copy as curl')")
-    page.wait_for_function('navigator.clipboard.readText().then(text => text.includes(\'"prior":{"position"\'))')
+    page.wait_for_function('() => navigator.clipboard.readText().then(text => text.includes(\'"prior":{"position"\'))')
     page.evaluate("document.querySelector('.verdict').remove()")
     page.click("button.primary")
     page.wait_for_selector(".verdict", timeout=ANSWER_MS)
