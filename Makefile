@@ -15,6 +15,10 @@ DATA ?= ../shared/data/kitti_stereo
 # Compiled when the package is installed.
 KERNEL := hatch_build.py service/registration/kernel.c service/imaging/gather.c service/imaging/depth16.c
 
+# The console's page, and the browser's driver in its tests.
+WEB := service/console/web
+PLAYWRIGHT ?= 1.65.2
+
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 UV := $(BIN)/uv
@@ -28,7 +32,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check format generate release-proto lock evaluate evaluate-real bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test check console check-console test-console format generate release-proto lock evaluate evaluate-real bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -48,8 +52,31 @@ check: .venv/.torch ## lint, types, layers, and the contracts as the code says t
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m service.http.openapi --check
+	$(BIN)/python -m service.console.built --check
+	$(MAKE) --no-print-directory check-console
 	cd proto && ../$(BIN)/buf lint
 	cd proto && ../$(BIN)/buf breaking --against released.binpb
+
+# The page's sources change with Node alone; who has none takes the build that lies in the repository, whose hashes `check` compares.
+check-console: ## lint and types of the console's page, where there is Node
+	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory $(WEB)/node_modules/.installed && cd $(WEB) && npm run --silent check; \
+	else echo "there is no npm: the console's TypeScript is not checked"; fi
+
+console: .venv/.uv $(WEB)/node_modules/.installed ## build the console's page from service/console/web (needs Node 20)
+	cd $(WEB) && npm run --silent build
+	$(BIN)/python -m service.console.built
+
+test-console: .venv/.torch ## the console in a real browser -> reports/console.json; needs Chromium; ARGS="--only answer frames" for parts
+	@command -v chromium > /dev/null || command -v chromium-browser > /dev/null || { echo "there is no chromium: apt-get install chromium"; exit 1; }
+	$(INSTALL) 'playwright==$(PLAYWRIGHT)'
+	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory $(WEB)/node_modules/.installed; \
+	else echo "there is no npm: axe and the bare library are left out"; fi
+	$(BIN)/python -m pytest tests/console --ignore tests/console/test_flows.py
+	$(BIN)/python -m benchmarks.console $(ARGS)
+
+$(WEB)/node_modules/.installed: $(WEB)/package-lock.json
+	cd $(WEB) && npm ci --ignore-scripts --no-audit --no-fund --silent
+	@touch $@
 
 format: .venv/.torch ## put the code in shape
 	$(BIN)/ruff check --fix

@@ -9,6 +9,7 @@ StreetfixError                     code            kind
 ├── UnsupportedFormatError         format          unsupported  a format that we do not read
 ├── TooLargeError                  too-large       too_large    a part is beyond a limit
 ├── UnknownMapError                unknown-map     not_found    no map of that name is mounted
+├── UnknownSampleError              unknown-sample  not_found    no sample pair of that name lies beside the maps
 ├── NoPoseError                    no-pose         not_found    no sure pose, asked for in a format that has no word for doubt
 ├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
 ├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
@@ -103,6 +104,13 @@ class UnknownMapError(StreetfixError):
     """No map of that name is mounted."""
 
     code = "unknown-map"
+    kind = "not_found"
+
+
+class UnknownSampleError(StreetfixError):
+    """No sample pair of that name lies beside the maps."""
+
+    code = "unknown-sample"
     kind = "not_found"
 
 

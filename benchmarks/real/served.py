@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from service.client import Client
 
 from model_training.cli.demo_service import serving
 from model_training.datasets.dataset import Dataset
+from service.client import Client
 from service.geometry.rigid import rotation_from_quaternion_xyzw, transform_from
 
 

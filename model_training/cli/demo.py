@@ -9,6 +9,7 @@ from rich.console import Console
 
 from model_training.cli.demo_answers import ask, print_answers, print_next
 from model_training.cli.demo_map import CityDemo, DemoMap, city_demo, recorded_demo
+from model_training.cli.demo_samples import write_samples
 from model_training.cli.demo_service import serving
 from model_training.cli.progress import bars
 from model_training.stock import ENCODER
@@ -36,7 +37,8 @@ def command(
             demo = city_demo(plan, out or Path("out/demo"), encoder, report)
         else:
             demo = recorded_demo(real, out or Path("out/demo-real"), encoder, report)
-    with serving(demo.bundle, port) as service:
+    samples = write_samples(demo.questions, demo.folder / "samples")
+    with serving(demo.bundle, port, samples) as service:
         try:
             _show(demo, service.url, console, began, goes_on=not once)
             if not once:

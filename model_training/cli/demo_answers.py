@@ -102,6 +102,7 @@ def print_next(outcomes: list[Outcome], bundle: Path, url: str, console: Console
         return
     console.print("ask yourself, in another terminal:", style="bold")
     console.print(f"  {_shell('localize', '--url', url, *files)}\n", soft_wrap=True)
+    console.print(f"or in a browser: {url}/console/\n", soft_wrap=True)
     console.print(f"serving at {url} (what it can do: {url}/openapi.json; stop: Ctrl-C)", soft_wrap=True)
 
 

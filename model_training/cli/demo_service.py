@@ -38,19 +38,21 @@ class RunningService:
 
 
 @contextmanager
-def serving(bundle: Path, port: int) -> Iterator[RunningService]:
+def serving(bundle: Path, port: int, samples: Path | None = None) -> Iterator[RunningService]:
     """Serve a map on loopback, and end the service with the block, whatever ends it: Ctrl-C, a kill, a closed terminal.
 
     Args:
         bundle: the map.
         port: 0 lets the system choose.
+        samples: pairs for the console, if there are any.
 
     Raises:
         UnreachableError: the service did not start; it has said why on stderr.
     """
+    given = [] if samples is None else ["--samples", str(samples)]
     # A group of its own: Ctrl-C in a terminal reaches this process alone, which then ends the service in good order.
     process = subprocess.Popen(  # noqa: S603  # this interpreter, our own command
-        [*_COMMAND, str(bundle), "--host", "127.0.0.1", "--port", str(port)],
+        [*_COMMAND, str(bundle), "--host", "127.0.0.1", "--port", str(port), *given],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0,
     )  # fmt: skip
     try:

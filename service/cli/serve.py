@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from service.runtime.choices import Choices
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
-    from service.runtime.map_registry import MapRegistry
     from service.runtime.settings import Settings
 
 _BACKLOG = 128
@@ -46,6 +45,10 @@ def command(
     config: Annotated[
         Path | None,
         typer.Option(help="Settings file, TOML; the environment and flags go above it.", show_default=False),
+    ] = None,
+    samples: Annotated[
+        Path | None,
+        typer.Option(help="Folder of sample pairs for the console.", show_default=False),
     ] = None,
     check: Annotated[
         bool,
@@ -73,7 +76,7 @@ def command(
     (check_only if check else serve)(
         load_settings(
             config, maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
-            workers=workers, false_accept_rate=false_accept_rate,
+            workers=workers, false_accept_rate=false_accept_rate, samples=samples,
         )
     )  # fmt: skip
 
@@ -85,11 +88,14 @@ def check_only(settings: "Settings") -> None:
         StreetfixError: what would keep it from serving.
     """
     from service.cli.certificates import Certificates
+    from service.console.samples import Samples
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
 
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
+    if settings.console and settings.samples is not None:
+        Samples.open(settings.samples)
     callers = 0 if settings.api_keys is None else len(KeyRing.open(settings.api_keys).caller_of)
     if settings.tls_certificate is not None:
         Certificates.read(settings)
@@ -208,7 +214,7 @@ def _answer(
                 signal.signal(number, server.handle_exit)
             ready()
             if says_where:
-                _say_where(engine.registry, listener, grpc_port, "http" if tls is None else "https")
+                _say_where(engine, listener, grpc_port, "http" if tls is None else "https")
             server.run(sockets=[listener])
     finally:
         engine.close()
@@ -262,9 +268,9 @@ def _cannot_listen(host: str, port: int, error: OSError) -> AddressError:
     return AddressError(f"cannot listen on {host}:{port} ({error.strerror}); choose another --host or --port")
 
 
-def _say_where(registry: "MapRegistry", listener: socket.socket, grpc_port: int | None, scheme: str) -> None:
+def _say_where(engine: "Engine", listener: socket.socket, grpc_port: int | None, scheme: str) -> None:
     host, port = listener.getsockname()[:2]
-    for localizer in registry:
+    for localizer in engine.registry:
         manifest = localizer.bundle.manifest
         typer.echo(
             f"map {manifest.name} {manifest.version}: {manifest.counts.places} places, {manifest.counts.views} views"
@@ -272,4 +278,6 @@ def _say_where(registry: "MapRegistry", listener: socket.socket, grpc_port: int 
     shown = f"[{host}]" if ":" in host else host
     if grpc_port is not None:
         typer.echo(f"serving gRPC at {shown}:{grpc_port} (what it can do: proto/, or by reflection)")
+    if engine.settings.console:
+        typer.echo(f"console at {scheme}://{shown}:{port}/console/")
     typer.echo(f"serving at {scheme}://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")

@@ -26,6 +26,7 @@ from service.localization.prior import Prior
 from service.localization.search import Neighbour
 from service.maps.reader import MapBundle
 from service.runtime.engine import EncodedQuery, Located
+from service.runtime.last_answers import LastAnswer
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -182,6 +183,27 @@ def geopose_of(T_map_body: NDArray[np.float64], bundle: MapBundle) -> schema.Geo
         position=schema.GeoPosition(lat=latitude_deg, lon=longitude_deg, h=height_m),
         quaternion=schema.Quaternion(x=x, y=y, z=z, w=w),
     )
+
+
+def last_answer_from(answer: LastAnswer) -> schema.LastAnswer:
+    """A kept answer as the contract says it."""
+    return schema.LastAnswer(
+        number=answer.number,
+        at=answer.at.isoformat(timespec="milliseconds"),
+        map=schema.MapVersion(name=answer.map_name, version=answer.map_version),
+        status=answer.status,
+        confidence=answer.confidence,
+        street=answer.street,
+        position=_vector(answer.position_m),
+        heading_deg=_degrees(answer.heading_rad),
+        frames=answer.frames,
+        total_ms=answer.total_ms,
+    )
+
+
+def vector_from(position_m: NDArray[np.float64]) -> schema.Vector:
+    """A position as the contract says it."""
+    return _vector(position_m)
 
 
 def map_entry_from(bundle: MapBundle, versions: Sequence[Localizer]) -> schema.MapEntry:

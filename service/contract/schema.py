@@ -342,3 +342,79 @@ class Health(BaseModel):
     """Whether the service lives, or is ready."""
 
     status: Literal["ok"] = "ok"
+
+
+class Truth(_Strict):
+    """Where a pair of pictures was really taken: for people who compare."""
+
+    position: Position = Field(description="of the camera, map frame")
+    heading_deg: float | None = Field(
+        None, ge=-360, le=360, description="of the optical axis, counter-clockwise from map x"
+    )
+
+
+class SamplePair(BaseModel):
+    """A pair of pictures that lies beside the maps, to try the service with."""
+
+    name: str
+    rgb: str = Field(description="address of the picture, relative to this list's")
+    depth: str = Field(description="address of the picture, relative to this list's")
+    request: LocalizeRequest
+    truth: Truth | None
+
+
+class SampleList(BaseModel):
+    """All sample pairs."""
+
+    samples: list[SamplePair]
+
+
+Base64 = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
+
+
+class QueryPointCloud(BaseModel):
+    """The query's points where the answer puts them."""
+
+    origin: Vector = Field(description="map frame; the points count from it")
+    count: int
+    data: Base64 = Field(
+        description="of each point x, y, z as little-endian float32 (metres), then red, green, blue and an unused byte"
+    )
+
+
+class Explanation(BaseModel):
+    """An answer and what the machine saw on the way to it, as PNG."""
+
+    answer: LocalizeAnswer
+    depth: Base64 = Field(
+        description="the query's depth, its estimated scale error taken out; Turbo colours, near red, far (40 m) blue"
+    )
+    fused: Base64 = Field(description="the query on the view grid: range in the place of intensity, colour kept")
+    view: Base64 | None = Field(
+        description="the map from the most similar place, on the view grid; null without a cloud"
+    )
+    map_depth: Base64 | None = Field(
+        description="the map as this camera would see it from the answered pose, coloured as `depth`; null without a cloud"
+    )
+    points: QueryPointCloud
+
+
+class LastAnswer(BaseModel):
+    """An answer that the service gave; nothing of its pictures."""
+
+    number: int = Field(description="counted since the process started")
+    at: str = Field(description="when, UTC")
+    map: MapVersion
+    status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
+    confidence: float | None
+    street: str | None = Field(description="name of the street")
+    position: Vector
+    heading_deg: HeadingDeg
+    frames: int = Field(description="picture pairs that it rests on")
+    total_ms: float
+
+
+class LastAnswers(BaseModel):
+    """The last answers of the process that was asked, the newest first."""
+
+    answers: list[LastAnswer]

@@ -12,7 +12,7 @@ from service.http import problems
 from service.http.asking import Asking
 from service.http.auth import AuthMiddleware
 from service.http.request_id import RequestIdMiddleware
-from service.http.routes import health, localize, maps, oscp
+from service.http.routes import answers, console, drawing, explain, health, localize, maps, oscp, samples
 from service.runtime.engine import Engine
 from service.runtime.keys import KeyRing
 
@@ -40,6 +40,11 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
     app.include_router(oscp.router_for(asking))
     app.include_router(maps.router_for(engine))
     app.include_router(health.router_for(engine, version))
+    if engine.settings.console:
+        for routes in (console.router_for(), drawing.router_for(asking), explain.router_for(asking)):
+            app.include_router(routes)
+        for routes in (samples.router_for(engine.settings), answers.router_for(engine)):
+            app.include_router(routes)
     if keys is not None:
         app.add_middleware(AuthMiddleware, keys=keys)
     app.add_middleware(

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from typing import TypeVar
 
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
@@ -9,6 +10,8 @@ from starlette.responses import Response
 from service.errors import BusyError, DeadlineError
 from service.http.body import read_body
 from service.runtime.engine import Engine
+
+T = TypeVar("T")
 
 
 class Asking:
@@ -19,6 +22,20 @@ class Asking:
         self._bodies = asyncio.Semaphore(
             engine.admission.capacity
         )  # bounds the memory of bodies that are still coming in
+
+    async def in_time(self, work: Callable[[], T]) -> T:
+        """Work that needs no body, on a worker, in no more time than a request may take.
+
+        Raises:
+            BusyError: as many wait as may.
+            DeadlineError: it took too long.
+        """
+        settings = self.engine.settings
+        try:
+            async with asyncio.timeout(settings.request_timeout_s):
+                return await asyncio.wrap_future(self.engine.admission.submit(work))
+        except TimeoutError as error:
+            raise DeadlineError(f"not done within {settings.request_timeout_s:g} s; try again later") from error
 
     async def __call__(self, request: Request, work: Callable[[bytearray], Awaitable[Response]]) -> Response:
         """Read the body and work on it.

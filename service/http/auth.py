@@ -11,6 +11,13 @@ from service.runtime.settings import Settings, is_loopback
 
 #: What an orchestrator asks, which has no key.
 OPEN = frozenset({"/livez", "/readyz"})
+#: The console's page is the same for everybody and says nothing of a map; what it shows it asks for with a key.
+_PAGE = "/console"
+
+
+def needs_no_key(path: str) -> bool:
+    """Whether anybody may ask for a path."""
+    return path in OPEN or path == _PAGE or path.startswith(f"{_PAGE}/")
 
 
 def require_operator(request: Request, settings: Settings) -> None:
@@ -34,7 +41,7 @@ class AuthMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""
-        if scope["type"] == "http" and scope["path"] not in OPEN:
+        if scope["type"] == "http" and not needs_no_key(scope["path"]):
             headers = Headers(scope=scope)
             try:
                 presented = presented_key(headers.get("authorization"), headers.get("x-api-key"))

@@ -20,6 +20,7 @@ from service.localization.query import Query
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
 from service.runtime.choices import Choices
+from service.runtime.last_answers import LastAnswers
 from service.runtime.map_registry import MapRegistry
 from service.runtime.metrics import Metrics
 from service.runtime.settings import Settings
@@ -82,6 +83,7 @@ class Engine:
         self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.metrics = Metrics(self.admission, registry)
+        self.last_answers = LastAnswers()
         self.tracing = Tracing.open(settings.traces_endpoint, share=settings.traces_share)
         self.is_draining = False
 
@@ -176,6 +178,8 @@ class Engine:
         timings = replace(answer.timings, decode_ms=decode_ms, total_ms=answer.timings.total_ms + decode_ms)
         timed = replace(answer, timings=timings)
         self.metrics.answered(timed, localizer.bundle, frames=len(frames))
+        if self.settings.console:  # nobody else would read them
+            self.last_answers.add(timed, localizer.bundle, frames=len(frames))
         return Located(timed, localizer.bundle)
 
     def look_up(self, localizer: Localizer, encoded: EncodedQuery) -> tuple[Frame, float]:

@@ -98,6 +98,11 @@ class Settings(BaseSettings):
         FALSE_ACCEPT_RATE, gt=0, lt=1,
         description="share of the queries taken outside the map that one can live with being answered LOCALIZED",
     )  # fmt: skip
+    console: bool = Field(True, description="serve the browser console at /console, and what it asks for")
+    samples: Path | None = Field(
+        None,
+        description="folder of sample pairs that the console offers: NAME/rgb.*, depth.*, request.json, truth.json",
+    )
     limits: Limits = Limits()
 
     @model_validator(mode="after")

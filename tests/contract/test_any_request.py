@@ -18,7 +18,7 @@ EXAMPLES = 25
 
 OPERATIONS = (
     "localize", "localizeSequence", "localizeBatch", "postGeoPose", "getGeoPoseStatus", "listMaps", "serveVersion", "getStreets",
-    "getCoverage",
+    "getCoverage", "getCloud", "getPlaces", "explain", "listSamples", "getSample", "listAnswers",
     "getLiveness", "getReadiness", "getMetrics", "getVersion",
 )  # fmt: skip
 

@@ -22,7 +22,7 @@ from service.http.problems import MEDIA_TYPE, problem_of
 from service.runtime.engine import Engine, Located
 from service.runtime.tracing import RequestSpan
 
-_REQUEST_BODY: dict[str, Any] = {
+LOCALIZE_BODY: dict[str, Any] = {
     "required": True,
     "content": {
         "multipart/form-data": {
@@ -85,7 +85,7 @@ def router_for(asking: Asking) -> APIRouter:
         summary="Localize one pair of pictures",
         response_model=schema.LocalizeAnswer,
         responses=problems(404, 413, 415, 422, 503, 504),
-        openapi_extra={"requestBody": _REQUEST_BODY},
+        openapi_extra={"requestBody": LOCALIZE_BODY},
     )
     async def localize(request: Request) -> Response:
         """Street, pose with covariance, and confidence of one RGB and one depth picture.

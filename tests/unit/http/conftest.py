@@ -23,7 +23,8 @@ class AppTransport(httpx.BaseTransport):
 
         async def call() -> httpx.Response:
             response = await self._transport.handle_async_request(asynchronous)
-            return httpx.Response(response.status_code, headers=response.headers, content=await response.aread())
+            raw = b"".join([chunk async for chunk in response.aiter_raw()])  # the outer client decodes it
+            return httpx.Response(response.status_code, headers=response.headers, content=raw)
 
         return asyncio.run(call())
 

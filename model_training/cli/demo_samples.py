@@ -1,0 +1,50 @@
+"""The demo's questions as sample pairs for the browser console."""
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from model_training.cli.demo_map import Question
+from service.geometry.rigid import heading_of_camera
+
+
+def write_samples(questions: Sequence[Question], folder: Path) -> Path:
+    """Put pictures, request and truth of each question into a folder of its own; the folder that holds them all.
+
+    Written anew each time, and renamed into place whole: a service that starts meanwhile sees the old ones or the new ones.
+    """
+    part, old = folder.with_name(f".{folder.name}.part"), folder.with_name(f".{folder.name}.old")
+    for left in (part, old):
+        shutil.rmtree(left, ignore_errors=True)
+    for number, question in enumerate(questions, 1):
+        _write_sample(question, part / f"{number:02d}")
+    part.mkdir(parents=True, exist_ok=True)  # where there are no questions
+    if folder.exists():
+        folder.rename(old)
+    part.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def _write_sample(question: Question, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for source, name in ((question.rgb, "rgb"), (question.depth, "depth")):
+        _link(source, folder / f"{name}{source.suffix}")
+    shutil.copyfile(question.camera, folder / "request.json")
+    T = question.T_map_camera
+    if T is not None and question.place is None:  # single frames have no distance that would mean anything
+        x, y, z = T[:3, 3].tolist()
+        heading_deg = math.degrees(heading_of_camera(T))
+        truth = {"position": {"x": x, "y": y, "z": z}, "heading_deg": heading_deg}
+        (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n")
+
+
+def _link(source: Path, target: Path) -> None:
+    """A second name for the file, which costs nothing; a copy where the file system has no such thing."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)

@@ -1,0 +1,111 @@
+"""A map's cloud and its survey track, small enough for a browser."""
+
+import struct
+import threading
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.maps.reader import MapBundle
+from service.registration.surfel_map import SurfelMap
+
+#: What ``points`` is rounded down to, so that few clouds are made and kept.
+LEVELS = (20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
+_KEPT = 2
+CLOUD_MAGIC, PLACES_MAGIC = b"SFC1", b"SFP1"
+#: x, y, z in steps of the header's, and how upright the surface is: 0 flat ground, 65535 a wall.
+_POINT = np.dtype([("xyz", "<u2", (3,)), ("upright", "<u2")])
+_PLACE = np.dtype([("xyz", "<f4", (3,)), ("heading_rad", "<f4"), ("street", "<i4")])
+_STEPS = 65535
+
+
+class Clouds:
+    """Makes clouds and keeps the last ones: of a large map it takes a second. Safe to call from several threads."""
+
+    def __init__(self) -> None:
+        self._made: OrderedDict[tuple[str, str, int], bytes] = OrderedDict()
+        self._making = threading.Lock()
+
+    def of(self, bundle: MapBundle, points: int) -> bytes:
+        """As ``cloud_bytes``, of the level that ``points`` reaches."""
+        level = max((each for each in LEVELS if each <= points), default=LEVELS[0])
+        name = (str(bundle.path), bundle.manifest.version, level)
+        with self._making:  # two browsers that open at once wait for one cloud, not for two
+            if name not in self._made:
+                self._made[name] = cloud_bytes(bundle.cloud, level)
+            self._made.move_to_end(name)
+            while len(self._made) > _KEPT:
+                self._made.popitem(last=False)
+            return self._made[name]
+
+
+def cloud_bytes(cloud: SurfelMap | None, most: int) -> bytes:
+    """The points, thinned evenly over the ground, in an order that makes any beginning of them a thinner cloud.
+
+    ``SFC1``, count (uint32), origin and step (float64 x 3 each, metres, map frame), then ``_POINT`` for each, all little-endian.
+
+    Args:
+        cloud: of a map; None of one without.
+        most: points at most.
+    """
+    if cloud is None or not len(cloud.surfels):
+        return CLOUD_MAGIC + struct.pack("<I6d", 0, *(0.0,) * 3, *(1.0,) * 3)
+    rows = thinned(cloud.surfels, cloud.tiles, most)
+    rows = rows[np.random.default_rng(0).permutation(len(rows))]
+    chosen = cloud.surfels[rows]
+    low = chosen["xyz"].min(axis=0).astype(np.float64)
+    step = np.maximum((chosen["xyz"].max(axis=0) - low) / _STEPS, 1e-6)
+    packed = np.empty(len(rows), _POINT)
+    packed["xyz"] = np.clip(np.rint((chosen["xyz"] - low) / step), 0, _STEPS)
+    packed["upright"] = np.rint(_STEPS * (1.0 - np.clip(np.abs(chosen["normal"][:, 2]), 0, 1)))
+    return CLOUD_MAGIC + struct.pack("<I6d", len(rows), *(cloud.origin_m + low), *step) + packed.tobytes()
+
+
+def thinned(surfels: NDArray[Any], tiles: NDArray[np.float64], most: int) -> NDArray[np.intp]:
+    """Rows of at most so many surfels, as many to an area everywhere: one of each cell of a lattice.
+
+    Tile by tile, so that a map larger than the memory is read, not held.
+
+    Args:
+        surfels: sorted by tile.
+        tiles: first surfel and count in the last two columns.
+        most: of all rows.
+    """
+    if len(surfels) <= most:
+        return np.arange(len(surfels))
+    # Surfaces fill an area: half as many points stand on a lattice that is wider by the root of two.
+    cell_m = _spacing_m(surfels, tiles) * float(np.sqrt(len(surfels) / most))
+    kept = []
+    for first, count in tiles[:, 2:].astype(np.intp):
+        cell = np.floor(surfels["xyz"][first : first + count] / cell_m).astype(np.int64)
+        cell -= cell.min(axis=0, initial=0)
+        across = cell.max(axis=0, initial=0) + 1
+        key = (cell[:, 0] * across[1] + cell[:, 1]) * across[2] + cell[:, 2]
+        rows = first + np.sort(np.unique(key, return_index=True)[1])
+        share = int(most * count / len(surfels))
+        kept.append(rows if len(rows) <= share else rows[np.linspace(0, len(rows) - 1, share).astype(np.intp)])
+    return np.concatenate(kept)
+
+
+def _spacing_m(surfels: NDArray[Any], tiles: NDArray[np.float64]) -> float:
+    """Between neighbours, in the fullest tile: the edge of a cell that holds one of them."""
+    first, count = tiles[int(np.argmax(tiles[:, 3])), 2:].astype(np.intp)
+    xyz = surfels["xyz"][first : first + count]
+    for cell_m in (0.1, 0.2, 0.3, 0.4, 0.6, 0.8):
+        occupied = len(np.unique(np.floor(xyz / cell_m).astype(np.int32), axis=0))
+        if occupied < 0.8 * count:
+            return cell_m
+    return 1.0
+
+
+def places_bytes(bundle: MapBundle) -> bytes:
+    """The survey's places: ``SFP1``, count (uint32), origin (float64 x 3, metres, map frame), ``_PLACE`` for each, little-endian."""
+    T = bundle.T_map_place
+    origin_m = T[:, :3, 3].mean(axis=0)
+    packed = np.empty(len(T), _PLACE)
+    packed["xyz"] = T[:, :3, 3] - origin_m
+    packed["heading_rad"] = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+    packed["street"] = bundle.place_street
+    return PLACES_MAGIC + struct.pack("<I3d", len(T), *origin_m) + packed.tobytes()

@@ -1,0 +1,151 @@
+"""What the machine saw on the way to an answer: the same functions that answered, and pictures of what they gave."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy.typing import NDArray
+
+from service.console.pictures import depth_picture, enlarged, png_of
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, Transform, rotation_z, transform_from, transform_points
+from service.imaging.fusion import picture_of
+from service.imaging.gather import gather
+from service.imaging.view_grid import ViewGrid
+from service.localization.frames import Frame
+from service.localization.query import Query
+from service.localization.refine import RefineSettings
+from service.maps.reader import MapBundle
+from service.registration.kernel import render
+from service.registration.register import Registered
+from service.registration.rendered import REACH_M, SURFEL_M
+from service.registration.surfel_map import TILE_M, SurfelMap
+from service.runtime.engine import EncodedQuery, Engine, Located
+
+_WIDTH, _MAP_WIDTH = 320, 160  # of depth pictures; in a larger one the gaps between surfels show
+_POINTS_ACROSS = 160  # of the query's points in the map
+_CELL_PIXELS = 4
+_POINT = np.dtype([("xyz", "<f4", (3,)), ("rgb", "u1", (3,)), ("pad", "u1")])
+POINT_BYTES = _POINT.itemsize
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explanation:
+    """An answer and what led to it.
+
+    Attributes:
+        located: the same answer as without explanation.
+        pictures: PNG, by name: what could not be drawn is not among them.
+        points: of the query, where the answer puts them: x, y, z (float32, metres from ``origin_m``), red, green, blue, nothing.
+        origin_m: map frame.
+    """
+
+    located: Located
+    pictures: dict[str, bytes]
+    points: bytes
+    origin_m: Float64[NDArray[np.float64], "3"]
+
+
+def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
+    """Localize, and draw what was seen, in the thread of the caller.
+
+    Raises:
+        StreetfixError: as ``Engine.localize``.
+    """
+    localizer = engine.registry.get(encoded.map_name)
+    frame, decode_ms = engine.look_up(localizer, encoded)
+    located = engine.answer(localizer, (frame,), decode_ms)
+    answer, bundle = located.answer, located.bundle
+    T_map_camera = answer.T_map_camera
+    registered = answer.candidates[0].registered if answer.candidates else None
+    depth_m = mapped_depth(frame, registered, localizer.refining)
+    drawn = {"depth": depth_picture(_small(depth_m)), "fused": _fused(frame, bundle.grid)}
+    if bundle.cloud is not None:
+        best = answer.neighbours[0]
+        drawn["view"] = _map_view(bundle, bundle.cloud, best.position_m, best.heading_rad)
+        drawn["map_depth"] = enlarged(
+            depth_picture(_drawn_map(bundle.cloud, T_map_camera, _scaled(frame.query))), _WIDTH // _MAP_WIDTH
+        )
+    origin_m = np.round(T_map_camera[:3, 3])
+    return Explanation(
+        located, {name: png_of(each) for name, each in drawn.items()}, _points(frame.query, depth_m, T_map_camera, origin_m), origin_m
+    )  # fmt: skip
+
+
+def mapped_depth(
+    frame: Frame, registered: Registered | None, settings: RefineSettings
+) -> Float32[NDArray[np.float32], "H W"]:
+    """The depth picture as registration believes it: its scale and disparity offset taken out."""
+    depth_m = frame.query.depth_m
+    if registered is None:
+        return depth_m
+    baseline_m = frame.query.baseline_m
+    unit = settings.focal_baseline_px_m if baseline_m is None else frame.focal_px * baseline_m
+    return (depth_m * registered.scale / (1.0 + registered.offset * depth_m / unit)).astype(np.float32)
+
+
+def _fused(frame: Frame, grid: ViewGrid) -> NDArray[np.uint8]:
+    """The view of the turn that looks straight ahead."""
+    ahead = int(np.argmin(np.abs(frame.views.turns_rad)))
+    return enlarged(picture_of(frame.views.planes[ahead, :3], grid.max_range_m), _CELL_PIXELS)
+
+
+def _map_view(
+    bundle: MapBundle, cloud: SurfelMap, position_m: Float64[NDArray[np.float64], "3"], heading_rad: float
+) -> NDArray[np.uint8]:
+    """The map from a place along a heading, on the view grid: what the most similar view was made from, without its scan."""
+    T_map_camera = transform_from(rotation_z(heading_rad) @ R_BODY_OPTICAL, position_m)
+    camera = camera_over(bundle.grid)
+    depth_m = _drawn_map(cloud, T_map_camera, camera)
+    grey = np.full((*depth_m.shape, 3), 128, np.uint8)
+    ranges, _, _ = gather(grey, depth_m, camera, np.ascontiguousarray(R_BODY_OPTICAL.T), bundle.grid)
+    ranges = np.where(ranges <= bundle.grid.max_range_m, ranges, 0) * bundle.rows_seen[:, None]
+    colourless = np.zeros((2, *ranges.shape), np.float32)
+    planes = np.concatenate([ranges[None], colourless]).astype(np.float32)
+    return enlarged(picture_of(planes, bundle.grid.max_range_m), _CELL_PIXELS)
+
+
+def camera_over(grid: ViewGrid) -> PinholeCamera:
+    """A camera whose picture holds a whole view, at about twice its columns; views wider than 140 degrees lose their sides."""
+    half = np.deg2rad(min(grid.azimuth_span_deg, 140.0) / 2)
+    width = 2 * grid.columns
+    focal = float((width - 1) / 2 / np.tan(half))
+    steepest = np.deg2rad(max(abs(grid.elevation_top_deg), abs(grid.elevation_bottom_deg)))
+    height = 2 * int(np.ceil(focal * np.tan(steepest) / np.cos(half))) + 2
+    return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def _drawn_map(cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera) -> Float32[NDArray[np.float32], "H W"]:
+    T = transform_from(T_map_camera[:3, :3], T_map_camera[:3, 3] - cloud.origin_m)
+    return render(
+        cloud.surfels, cloud.tiles, tile_m=TILE_M, T_map_camera=T, camera=camera, size_m=SURFEL_M, reach_m=REACH_M
+    )
+
+
+def _scaled(query: Query) -> PinholeCamera:
+    camera = query.camera
+    return camera.scaled_to(_MAP_WIDTH, max(1, round(_MAP_WIDTH * camera.height / camera.width)))
+
+
+def _small(depth_m: Float32[NDArray[np.float32], "H W"], width: int = _WIDTH) -> Float32[NDArray[np.float32], "h w"]:
+    """Thinned, never averaged: a mean over an edge is a depth that nothing has."""
+    height = max(1, round(width * depth_m.shape[0] / depth_m.shape[1]))
+    small: NDArray[np.float32] = cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST).astype(
+        np.float32
+    )
+    return small
+
+
+def _points(
+    query: Query, depth_m: Float32[NDArray[np.float32], "H W"], T_map_camera: Transform, origin_m: Float64[NDArray[np.float64], "3"]
+) -> bytes:  # fmt: skip
+    z = _small(depth_m, _POINTS_ACROSS)
+    camera = query.camera.scaled_to(z.shape[1], z.shape[0])
+    colour = cv2.resize(query.rgb, (z.shape[1], z.shape[0]), interpolation=cv2.INTER_AREA)
+    seen = (z > 0) & (z <= REACH_M)
+    packed = np.zeros(int(seen.sum()), _POINT)
+    points_map = transform_points(T_map_camera, (camera.rays_of_pixels() * z[..., None])[seen])
+    packed["xyz"] = points_map - origin_m
+    packed["rgb"] = colour[seen]
+    return packed.tobytes()

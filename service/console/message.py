@@ -1,0 +1,28 @@
+"""An explanation as the contract says it."""
+
+from base64 import b64encode
+
+from service.console.explain import POINT_BYTES, Explanation
+from service.contract import schema
+from service.contract.convert import answer_from, vector_from
+
+
+def explanation_message(explanation: Explanation) -> schema.Explanation:
+    """Pictures and points in base64: one answer is one JSON document."""
+    pictures = {name: _text(png) for name, png in explanation.pictures.items()}
+    return schema.Explanation(
+        answer=answer_from(explanation.located),
+        depth=pictures["depth"],
+        fused=pictures["fused"],
+        view=pictures.get("view"),
+        map_depth=pictures.get("map_depth"),
+        points=schema.QueryPointCloud(
+            origin=vector_from(explanation.origin_m),
+            count=len(explanation.points) // POINT_BYTES,
+            data=_text(explanation.points),
+        ),
+    )
+
+
+def _text(content: bytes) -> str:
+    return b64encode(content).decode("ascii")

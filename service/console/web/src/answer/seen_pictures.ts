@@ -1,0 +1,58 @@
+// What the machine saw, in pictures; the map's depth over the query's, by a slider.
+import { bytesFrom } from '../binary';
+import type { Explanation } from '../contract';
+import { element } from '../element';
+
+export class SeenPictures {
+  readonly element = element('div', { class: 'seen' });
+  #addresses: string[] = [];
+
+  show(rgb: Blob, explanation: Explanation): void {
+    for (const address of this.#addresses) URL.revokeObjectURL(address);
+    this.#addresses = [];
+    const { depth, fused, view, map_depth: mapDepth } = explanation;
+    this.element.replaceChildren(
+      element(
+        'div',
+        { class: 'pair' },
+        this.#figure('RGB', this.#address(rgb), 'The query’s colour picture'),
+        this.#figure('Depth', this.#png(depth), 'The query’s depth, near red, far blue'),
+      ),
+      this.#figure('Fused 2.5D image: what is encoded', this.#png(fused), 'Range in place of intensity, colour kept', 'cells'),
+      view === null ? '' : this.#figure('LiDAR view it matched (place n1)', this.#png(view), 'The map seen from the most similar place', 'cells'),
+      mapDepth === null ? '' : this.#overlay(depth, mapDepth),
+    );
+  }
+
+  #overlay(depth: string, mapDepth: string): HTMLElement {
+    const over = element('img', { src: this.#png(mapDepth), alt: 'The map’s depth, drawn at the answered pose', class: 'over' });
+    const slider = element('input', { type: 'range', min: '0', max: '100', value: '50', 'aria-label': 'How much of the map’s depth lies over the query’s' });
+    const place = (): void => {
+      over.style.clipPath = `inset(0 0 0 ${slider.value}%)`;
+      line.style.left = `${slider.value}%`;
+    };
+    const line = element('span', { class: 'line', 'aria-hidden': 'true' });
+    slider.addEventListener('input', place);
+    place();
+    return element(
+      'figure',
+      { class: 'compare' },
+      element('div', { class: 'stack' }, element('img', { src: this.#png(depth), alt: 'The query’s depth' }), over, line, slider),
+      element('figcaption', {}, element('span', {}, '◂ query’s depth'), element('span', {}, 'map’s depth at the answer ▸')),
+    );
+  }
+
+  #figure(name: string, address: string, alt: string, kind = ''): HTMLElement {
+    return element('figure', { class: kind }, element('img', { src: address, alt }), element('figcaption', {}, name));
+  }
+
+  #png(base64: string): string {
+    return this.#address(new Blob([bytesFrom(base64)], { type: 'image/png' }));
+  }
+
+  #address(blob: Blob): string {
+    const address = URL.createObjectURL(blob);
+    this.#addresses.push(address);
+    return address;
+  }
+}

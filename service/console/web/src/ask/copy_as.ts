@@ -1,0 +1,35 @@
+// The same request as commands; the key stays out of them.
+import type { LocalizeRequest } from '../contract';
+import type { Question } from './question';
+
+export function asCurl(question: Question, request: LocalizeRequest, base: URL, hasKey: boolean): string {
+  const quoted = (text: string): string => `'${text.replaceAll("'", `'\\''`)}'`;
+  const parts = [
+    `-F ${quoted(`rgb=@${question.rgb?.name ?? 'rgb.jpg'}`)}`,
+    `-F ${quoted(`depth=@${question.depth?.name ?? 'depth.png'}`)}`,
+    `-F ${quoted(`request=${JSON.stringify(request)}`)}`,
+  ];
+  if (hasKey) parts.unshift('-H "X-Api-Key: $STREETFIX_KEY"');
+  return `curl ${parts.join(' \\\n  ')} \\\n  ${quoted(new URL('v1/localize', base).href)}`;
+}
+
+export function asPython(question: Question, request: LocalizeRequest, base: URL, hasKey: boolean): string {
+  const lines = [
+    'import json',
+    ...(hasKey ? ['import os'] : []),
+    '',
+    'import httpx',
+    '',
+    `request = json.loads(${JSON.stringify(JSON.stringify(request))})`,
+    `with open(${JSON.stringify(question.rgb?.name ?? 'rgb.jpg')}, "rb") as rgb, open(${JSON.stringify(question.depth?.name ?? 'depth.png')}, "rb") as depth:`,
+    '    response = httpx.post(',
+    `        ${JSON.stringify(new URL('v1/localize', base).href)},`,
+    '        files={"rgb": rgb, "depth": depth, "request": (None, json.dumps(request))},',
+    ...(hasKey ? ['        headers={"X-Api-Key": os.environ["STREETFIX_KEY"]},'] : []),
+    '    )',
+    'response.raise_for_status()',
+    'answer = response.json()',
+    'print(answer["status"], answer["confidence"], answer["pose"]["position"])',
+  ];
+  return lines.join('\n') + '\n';
+}

@@ -1,0 +1,254 @@
+// The whole page: what stands where, and what one part tells another.
+import { AnswerPanel } from './answer/answer_panel';
+import { AskPanel } from './ask/ask_panel';
+import { bodyFrom, requestFrom, type Question } from './ask/question';
+import { cloudFrom, placesFrom, queryPointsFrom } from './binary';
+import type { MapEntry } from './contract';
+import { button, element } from './element';
+import iconAddress from './icon.svg';
+import { Legend } from './map/legend';
+import { MapView } from './map/map_view';
+import { LivePanel } from './operate/live_panel';
+import { MapsPanel } from './operate/maps_panel';
+import { Service, ServiceError } from './service';
+import { Tabs } from './tabs';
+import { Theme } from './theme';
+
+const CLOUD_POINTS = 2_000_000;
+const LOOK_MS = 10_000;
+
+export class ConsolePage {
+  readonly element: HTMLElement;
+  readonly #service = new Service();
+  readonly #map = new MapView();
+  readonly #legend = new Legend();
+  readonly #answer = new AnswerPanel();
+  readonly #ask: AskPanel;
+  readonly #maps: MapsPanel;
+  readonly #live: LivePanel;
+  readonly #tabs: Tabs;
+  readonly #theme: Theme;
+  readonly #choice = element('select', { 'aria-label': 'Map' });
+  readonly #state = element('p', { class: 'state', role: 'status' });
+  readonly #loading = element('p', { class: 'loading', role: 'status' });
+  readonly #turn: HTMLButtonElement;
+  readonly #all: HTMLButtonElement;
+  #entries: MapEntry[] = [];
+  #shown: MapEntry | null = null;
+  #asking = 0;
+
+  constructor() {
+    this.#ask = new AskPanel(this.#service, {
+      ask: (question) => { void this.#localize(question); },
+      drawsPrior: (draws) => { this.#map.drawsPrior = draws; this.#nameTurn(); },
+      priorChanged: (prior) => { this.#map.prior.prior = prior; this.#map.changed(); },
+      map: () => this.#mapName(),
+      prior: () => this.#map.prior.prior,
+      failed: (error) => { this.#answer.fail(error); },
+    });
+    this.#map.onPriorDrawn = () => {
+      this.#ask.prior.show(this.#map.prior.prior);
+      this.#ask.prior.draw.click(); // one prior drawn, the map moves again
+    };
+    this.#maps = new MapsPanel(this.#service, {
+      served: () => { void this.#look(); },
+      coverage: (shows) => { void this.#showCoverage(shows); },
+    });
+    this.#live = new LivePanel(this.#service, (answer) => { this.#map.showAt(answer.position.x, answer.position.y); });
+    this.#tabs = new Tabs([
+      { name: 'Ask', content: this.#ask.element },
+      { name: 'Maps', content: this.#maps.element },
+      { name: 'Live', content: this.#live.element },
+    ], (name) => {
+      if (name === 'Live') this.#live.start();
+      else this.#live.stop();
+    });
+    this.#turn = button('3D', () => { this.#turnMap(); }, { 'aria-pressed': 'false', title: 'From above or around (3)' });
+    this.#all = button('⁙', () => {
+      const draws = this.#all.getAttribute('aria-pressed') !== 'true';
+      this.#all.setAttribute('aria-pressed', String(draws));
+      this.#map.drawsAll = draws;
+    }, { 'aria-pressed': 'false', 'aria-label': 'Draw every point, also while the map moves', title: 'Draw every point, also while the map moves' });
+    this.#map.element.addEventListener('turn', () => { this.#turnMap(); });
+    this.#choice.addEventListener('change', () => { void this.#showMap(this.#choice.value); });
+    this.#theme = new Theme((shade) => { this.#map.shade = shade; this.#legend.shade = shade; });
+    this.element = this.#arranged();
+    this.#takeDrops();
+  }
+
+  async start(): Promise<void> {
+    this.#theme.start();
+    await Promise.all([this.#look(), this.#showSamples()]);
+    window.setInterval(() => {
+      if (!document.hidden) void this.#look();
+    }, LOOK_MS);
+  }
+
+  #arranged(): HTMLElement {
+    const key = element('input', { type: 'password', id: 'key', autocomplete: 'off', placeholder: 'API key', 'aria-label': 'API key, kept in this tab alone' });
+    key.value = this.#service.key;
+    key.addEventListener('change', () => {
+      this.#service.key = key.value.trim();
+      void this.#look();
+      void this.#showSamples();
+    });
+    const zoom = (label: string, name: string, factor: number): HTMLButtonElement =>
+      button(label, () => { this.#map.zoomBy(factor); }, { 'aria-label': name, title: name });
+    return element(
+      'div',
+      { class: 'page' },
+      element(
+        'header',
+        {},
+        element('img', { src: iconAddress, alt: '', width: '26', height: '26' }),
+        element('h1', {}, 'Streetfix'),
+        this.#choice,
+        this.#state,
+        element('div', { class: 'end' }, key, button('◐', () => { this.#theme.toggle(); }, { 'aria-label': 'Light or dark', title: 'Light or dark', class: 'quiet' })),
+      ),
+      element(
+        'main',
+        {},
+        element('div', { class: 'side left' }, this.#tabs.element),
+        element(
+          'section',
+          { class: 'map', 'aria-label': 'Map' },
+          this.#map.element,
+          element(
+            'div',
+            { class: 'tools', role: 'group', 'aria-label': 'View' },
+            this.#turn,
+            zoom('+', 'Zoom in', 1.5),
+            zoom('−', 'Zoom out', 1 / 1.5),
+            this.#all,
+            button('⤢', () => { this.#map.showAll(); }, { 'aria-label': 'Show the whole map', title: 'Show the whole map (0)' }),
+          ),
+          this.#legend.element,
+          this.#loading,
+        ),
+        element('section', { class: 'side right', 'aria-label': 'Answer' }, this.#answer.element),
+      ),
+    );
+  }
+
+  #turnMap(): void {
+    this.#map.mode = this.#map.mode === 'above' ? 'around' : 'above';
+    this.#nameTurn();
+  }
+
+  #nameTurn(): void {
+    this.#turn.setAttribute('aria-pressed', String(this.#map.mode === 'around'));
+  }
+
+  /** Which maps are there, and whether the one that is shown still serves. */
+  async #look(): Promise<void> {
+    try {
+      this.#entries = await this.#service.maps();
+      this.#tell('good', 'serving');
+    } catch (error) {
+      const ours = error instanceof ServiceError ? error : null;
+      this.#tell('bad', ours?.status === 401 ? 'needs an API key' : ours?.status === 0 ? 'does not answer' : String(ours?.title ?? error));
+      if (this.#shown === null) this.#answer.fail(error);
+      return;
+    }
+    this.#maps.show(this.#entries);
+    const names = this.#entries.map((entry) => entry.name);
+    if ([...this.#choice.options].map((option) => option.value).join('\n') !== names.join('\n')) {
+      this.#choice.replaceChildren(...names.map((name) => element('option', { value: name }, name)));
+    }
+    const name = this.#shown?.name ?? names[0];
+    const entry = this.#entries.find((each) => each.name === name) ?? this.#entries[0];
+    if (entry !== undefined && entry.version !== this.#shown?.version) await this.#showMap(entry.name);
+  }
+
+  async #showMap(name: string): Promise<void> {
+    const entry = this.#entries.find((each) => each.name === name);
+    if (entry === undefined) return;
+    this.#shown = entry;
+    this.#choice.value = name;
+    const version = `${entry.name}@${entry.version}`;
+    try {
+      this.#loading.textContent = 'Loading the map…';
+      const [streets, places] = await Promise.all([this.#service.streets(version), this.#service.places(version)]);
+      if (this.#shown !== entry) return; // another one was chosen meanwhile
+      this.#map.setMap(streets, placesFrom(places));
+      const cloud = cloudFrom(await this.#service.cloud(version, CLOUD_POINTS));
+      if (this.#isStillShown(entry)) this.#map.setCloud(cloud);
+      this.#loading.textContent = '';
+      this.element.dataset['ready'] = version;
+    } catch (error) {
+      if (this.#isStillShown(entry)) this.#shown = null; // the next look tries again
+      this.#loading.textContent = `The map cannot be drawn: ${error instanceof Error ? error.message : String(error)}`;
+    }
+  }
+
+  #isStillShown(entry: MapEntry): boolean {
+    return this.#shown === entry;
+  }
+
+  async #showSamples(): Promise<void> {
+    try {
+      const samples = await this.#service.samples();
+      this.#ask.sampleCount = samples.length;
+      this.#ask.strip.show(samples);
+    } catch (error) {
+      this.#ask.sampleCount = 0;
+      if (!(error instanceof ServiceError)) throw error; // why a service answers nothing is told once, above
+    }
+  }
+
+  async #showCoverage(shows: boolean): Promise<void> {
+    try {
+      this.#map.reachM = shows ? await this.#service.coverageReach() : 0;
+    } catch (error) {
+      this.#answer.fail(error);
+    }
+  }
+
+  async #localize(question: Question): Promise<void> {
+    const turn = ++this.#asking;
+    const began = performance.now();
+    this.#ask.busy = true;
+    try {
+      const request = requestFrom(question, this.#mapName(), this.#map.prior.prior);
+      const explanation = await this.#service.explain(bodyFrom(question, request));
+      if (turn !== this.#asking || question.rgb === null) return; // a later question was asked meanwhile
+      this.#answer.show(explanation, question.rgb.blob, question.truth, performance.now() - began);
+      this.#map.showAnswer({ answer: explanation.answer, camera: request.camera, truth: question.truth }, queryPointsFrom(explanation.points));
+      this.#tell('good', 'serving');
+    } catch (error) {
+      if (turn !== this.#asking) return;
+      this.#map.clearAnswer();
+      this.#answer.fail(error);
+      if (error instanceof ServiceError && error.status === 0) this.#tell('bad', 'does not answer');
+    } finally {
+      if (turn === this.#asking) this.#ask.busy = false;
+    }
+  }
+
+  #mapName(): string | null {
+    return this.#entries.length > 1 ? (this.#shown?.name ?? null) : null;
+  }
+
+  #tell(kind: 'good' | 'bad', text: string): void {
+    this.#state.className = `state ${kind}`;
+    if (this.#state.textContent !== text) this.#state.textContent = text;
+  }
+
+  /** Files may be dropped anywhere: a near miss must not make the browser leave the page. */
+  #takeDrops(): void {
+    this.element.addEventListener('dragover', (event) => {
+      event.preventDefault();
+      this.element.classList.add('dropping');
+    });
+    this.element.addEventListener('dragleave', (event) => {
+      if (event.relatedTarget === null) this.element.classList.remove('dropping');
+    });
+    this.element.addEventListener('drop', (event) => {
+      event.preventDefault();
+      this.element.classList.remove('dropping');
+      this.#tabs.choose('Ask');
+      void this.#ask.takeFiles([...(event.dataTransfer?.files ?? [])]);
+    });
+  }
+}

@@ -1,0 +1,126 @@
+// What the service says, as openapi/openapi.json has it; metres and degrees.
+
+export interface Vector {
+  x: number;
+  y: number;
+  z: number;
+}
+
+export interface Quaternion extends Vector {
+  w: number;
+}
+
+export interface Pose {
+  position: Vector;
+  orientation: Quaternion;
+  heading_deg: number;
+  covariance: number[] | null;
+}
+
+export type Status = 'LOCALIZED' | 'AMBIGUOUS' | 'OUT_OF_MAP';
+
+export interface Hypothesis {
+  pose: Pose;
+  share: number;
+  inliers: number;
+  similarity: number;
+}
+
+export interface Neighbour {
+  place: number;
+  similarity: number;
+  street: string | null;
+  position: Vector;
+  heading_deg: number;
+}
+
+export interface MapVersion {
+  name: string;
+  version: string;
+}
+
+export interface Answer {
+  status: Status;
+  confidence: number | null;
+  street: { id: string; name: string; vote: number } | null;
+  pose: Pose;
+  hypotheses: Hypothesis[];
+  neighbours: Neighbour[];
+  map: MapVersion;
+  timings_ms: { decode: number; fuse: number; encode: number; search: number; register: number; total: number };
+}
+
+export interface Explanation {
+  answer: Answer;
+  depth: string;
+  fused: string;
+  view: string | null;
+  map_depth: string | null;
+  points: { origin: Vector; count: number; data: string };
+}
+
+export interface Camera {
+  width: number;
+  height: number;
+  fx: number;
+  fy: number;
+  cx: number;
+  cy: number;
+}
+
+export interface Prior {
+  position?: { x: number; y: number; std_m: number } | null;
+  heading_deg?: number | null;
+  heading_std_deg?: number;
+}
+
+export interface LocalizeRequest {
+  map?: string | null;
+  camera: Camera;
+  prior?: Prior | null;
+  [other: string]: unknown;
+}
+
+export interface Truth {
+  position: Vector;
+  heading_deg: number | null;
+}
+
+export interface SamplePair {
+  name: string;
+  rgb: string;
+  depth: string;
+  request: LocalizeRequest;
+  truth: Truth | null;
+}
+
+export interface MapEntry {
+  name: string;
+  version: string;
+  made_at: string;
+  places: number;
+  views: number;
+  streets: number;
+  spacing_m: number;
+  georeferenced: boolean;
+  licence: string;
+  versions: string[];
+}
+
+export interface StreetFeature {
+  properties: { id: string; name: string; street: string; section: string | null };
+  geometry: { type: 'Polygon'; coordinates: number[][][] } | { type: 'MultiPolygon'; coordinates: number[][][][] };
+}
+
+export interface LastAnswer {
+  number: number;
+  at: string;
+  map: MapVersion;
+  status: Status;
+  confidence: number | null;
+  street: string | null;
+  position: Vector;
+  heading_deg: number;
+  frames: number;
+  total_ms: number;
+}

@@ -1,0 +1,33 @@
+"""The last answers, for operators who watch."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+from starlette.requests import Request
+
+from service.contract import schema
+from service.contract.convert import last_answer_from
+from service.http.auth import require_operator
+from service.http.routes.localize import problems
+from service.runtime.engine import Engine
+from service.runtime.last_answers import MOST
+
+
+def router_for(engine: Engine) -> APIRouter:
+    """The route, bound to an engine."""
+    router = APIRouter(tags=["console"])
+
+    @router.get(
+        "/v1/answers",
+        operation_id="listAnswers",
+        summary="The last answers of this process",
+        responses=problems(401, 403, 422),
+    )
+    async def list_answers(
+        request: Request, most: Annotated[int, Query(ge=1, le=MOST, description="of them")] = 50
+    ) -> schema.LastAnswers:
+        """Figures alone, nothing of a picture. They say where robots are: for an operator's key, or a service on loopback without keys."""
+        require_operator(request, engine.settings)
+        return schema.LastAnswers(answers=[last_answer_from(each) for each in engine.last_answers.newest(most)])
+
+    return router

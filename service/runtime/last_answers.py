@@ -1,0 +1,58 @@
+"""The last answers of a process, for operators who watch; nothing of a picture is kept."""
+
+from collections import deque
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import count
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.geometry.rigid import heading_of_camera
+from service.localization.answer import Answer, Status
+from service.maps.reader import MapBundle
+
+MOST = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LastAnswer:
+    """What is kept of an answer; ``number`` counts since the process started."""
+
+    number: int
+    at: datetime
+    map_name: str
+    map_version: str
+    status: Status
+    confidence: float | None
+    street: str | None
+    position_m: Float64[NDArray[np.float64], "3"]
+    heading_rad: float
+    frames: int
+    total_ms: float
+
+
+class LastAnswers:
+    """A ring of them. Safe to use from several threads: each step of the deque and of the counter is one."""
+
+    def __init__(self) -> None:
+        self._kept: deque[LastAnswer] = deque(maxlen=MOST)
+        self._numbers = count(1)
+
+    def add(self, answer: Answer, bundle: MapBundle, *, frames: int) -> None:
+        """Keep an answer's figures."""
+        has_street = bundle.streets is not None and answer.street >= 0
+        self._kept.append(
+            LastAnswer(
+                number=next(self._numbers), at=datetime.now(UTC), map_name=bundle.name, map_version=bundle.manifest.version,
+                status=answer.status, confidence=answer.confidence,
+                street=bundle.streets[answer.street].name if has_street and bundle.streets is not None else None,
+                position_m=answer.T_map_camera[:3, 3].copy(), heading_rad=heading_of_camera(answer.T_map_camera), frames=frames,
+                total_ms=answer.timings.total_ms,
+            )
+        )  # fmt: skip
+
+    def newest(self, most: int) -> list[LastAnswer]:
+        """The newest first."""
+        return list(self._kept.copy())[: -most - 1 : -1]

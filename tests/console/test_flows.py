@@ -1,0 +1,118 @@
+"""What people do with the console, in a real browser against a real service; ``console.flows_passed`` counts these."""
+
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from benchmarks.console.browser import ANSWER_MS, click_sample, open_console
+from benchmarks.console.served import Demo, other_version, serving
+
+Pages = Callable[..., Any]
+Shoot = Callable[[Any, str], None]
+
+
+def files_of(demo_map: Demo, name: str) -> list[str]:
+    """The files of a sample, as a user would choose them."""
+    return [str(next((demo_map.samples / name).glob(f"{part}.*"))) for part in ("rgb", "depth", "request", "truth")]
+
+
+def test_a_sample_pair_is_asked_with_one_click(url: str, page_of: Pages, shoot: Shoot) -> None:
+    page = page_of()
+    open_console(page, url)
+    click_sample(page, "01")
+    assert page.inner_text(".verdict .status") == "LOCALIZED"
+    assert "street 5" in page.inner_text(".verdict .street")
+    assert float(page.inner_text(".verdict .figures div:nth-child(2) b").removesuffix(" m")) < 1.0
+    assert page.locator(".seen img").count() == 6
+    widths = page.eval_on_selector_all(".seen img", "images => images.map(image => image.naturalWidth)")
+    assert all(width >= 64 for width in widths)
+    shoot(page, "sample_light")
+    page.click("button:has-text('3D')")
+    shoot(page, "sample_around")
+
+
+def test_ones_own_files_are_sorted_and_asked(url: str, demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
+    page = page_of(dark=True)
+    open_console(page, url)
+    assert page.is_disabled("button.primary")
+    page.set_input_files("#files", files_of(demo_map, "05"))
+    page.wait_for_selector(".chosen li.given >> nth=3")
+    page.click("button.primary")
+    page.wait_for_selector(".verdict", timeout=ANSWER_MS)
+    assert "from the truth" in page.inner_text(".verdict .figures")
+    shoot(page, "upload_dark")
+
+
+def test_a_wrong_file_is_told_with_what_to_do(url: str, demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
+    page = page_of()
+    open_console(page, url)
+    page.set_input_files("#files", [{"name": "notes.pdf", "mimeType": "application/pdf", "buffer": b"%PDF"}])
+    page.wait_for_selector(".problem")
+    assert "notes.pdf: no picture" in page.inner_text(".problem")
+    rgb, _, request, _ = files_of(demo_map, "05")
+    damaged = {"name": "depth.png", "mimeType": "image/png", "buffer": b"\x89PNG\r\n\x1a\nnothing of the kind"}
+    page.set_input_files("#files", [rgb, request])
+    page.set_input_files("#files", [damaged])
+    page.wait_for_selector("button.primary:not([disabled])")
+    page.click("button.primary")
+    page.wait_for_selector(".problem .hint", timeout=ANSWER_MS)
+    assert "field depth" in page.inner_text(".problem")
+    shoot(page, "wrong_file")
+
+
+def test_an_ambiguous_answer_shows_its_hypotheses(url: str, demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
+    page = page_of()
+    open_console(page, url)
+    rgb, depth, request, _ = files_of(demo_map, "07")
+    page.set_input_files("#files", [rgb, depth])
+    # Whoever cannot live with one false answer in a million is not told LOCALIZED where two streets look alike.
+    asked = json.loads(Path(request).read_text()) | {"options": {"false_accept_rate": 1e-6, "neighbours": 8}}
+    page.fill("#request", json.dumps(asked))
+    page.click("button.primary")
+    page.wait_for_selector(".verdict.ambiguous", timeout=ANSWER_MS)
+    assert page.locator("section:has(h2:text('Hypotheses')) tbody tr").count() >= 2
+    shoot(page, "ambiguous")
+
+
+def test_a_service_that_is_down_is_told_and_found_again(demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
+    page = page_of()
+    with serving(demo_map.bundle, "--samples", demo_map.samples) as (url, process):
+        open_console(page, url)
+        click_sample(page, "02")
+        process.send_signal(signal.SIGTERM)
+        process.wait(60)
+        page.click("[data-sample='02']")
+        page.wait_for_selector(".problem", timeout=ANSWER_MS)
+        assert "cannot be reached" in page.inner_text(".problem")
+        assert page.inner_text(".state") == "does not answer"
+        shoot(page, "service_down")
+    with serving(demo_map.bundle, "--samples", demo_map.samples) as (other, _):
+        page.route(f"{url}/**", lambda route: route.continue_(url=route.request.url.replace(url, other)))
+        page.click("[data-sample='02']")
+        page.wait_for_selector(".verdict", timeout=ANSWER_MS)
+        assert page.inner_text(".state") == "serving"
+
+
+def test_a_map_is_swapped_and_rolled_back_by_those_who_may(
+    demo_map: Demo, page_of: Pages, shoot: Shoot, tmp_path: Path
+) -> None:
+    first = json.loads((demo_map.bundle / "manifest.json").read_text())["version"]
+    second = other_version(demo_map.bundle, tmp_path / "second")
+    page = page_of()
+    with serving(demo_map.bundle, tmp_path / "second") as (url, _):
+        open_console(page, url)
+        page.click("role=tab[name='Maps']")
+        assert page.inner_text(".versions .serves code") == second
+        page.click("button:has-text('Roll back')")
+        page.wait_for_selector(f".versions .serves code:text('{first}')")
+        assert f"{first} serves now" in page.inner_text(".told")
+        assert httpx.get(f"{url}/v1/maps").json()["maps"][0]["version"] == first
+        page.wait_for_selector(f"[data-ready$='{first}']")
+        page.click("button:has-text('Show where')")
+        shoot(page, "map_rolled_back")
+        page.click("button:has-text('Swap in')")
+        page.wait_for_selector(f".versions .serves code:text('{second}')")

@@ -1,0 +1,50 @@
+"""The demo's questions as sample pairs that a service reads."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from model_training.cli.demo_map import Question
+from model_training.cli.demo_samples import write_samples
+from service.console.samples import Samples
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+
+TRUTH = transform_from(rotation_z(np.pi / 2) @ R_BODY_OPTICAL, np.array([1.0, 2.0, 3.0]))
+
+
+def question(folder: Path, **changed: Any) -> Question:
+    camera = {"camera": {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}}
+    (folder / "front.json").write_text(json.dumps(camera))
+    for name in ("000000.jpg", "000000.png"):
+        (folder / name).write_bytes(name.encode())
+    given = {"T_map_camera": TRUTH} | changed
+    return Question("1", folder / "000000.jpg", folder / "000000.png", folder / "front.json", **given)
+
+
+def test_what_is_written_is_what_a_service_reads(tmp_path: Path) -> None:
+    (sample,) = Samples.open(write_samples([question(tmp_path)], tmp_path / "samples")).by_name.values()
+    assert sample.pictures["rgb"].path.read_bytes() == b"000000.jpg"
+    assert sample.truth is not None
+    assert (sample.truth.position.z, sample.truth.heading_deg) == (3.0, pytest.approx(90))
+
+
+@pytest.mark.parametrize("changed", [{"T_map_camera": None}, {"place": 4}])
+def test_where_the_truth_says_nothing_none_is_written(tmp_path: Path, changed: dict[str, Any]) -> None:
+    (sample,) = Samples.open(write_samples([question(tmp_path, **changed)], tmp_path / "samples")).by_name.values()
+    assert sample.truth is None
+
+
+def test_written_again_the_old_ones_are_gone(tmp_path: Path) -> None:
+    asked = question(tmp_path)
+    write_samples([asked, asked], tmp_path / "samples")
+    write_samples([asked], tmp_path / "samples")
+    assert os.listdir(tmp_path / "samples") == ["01"]
+    assert not list(tmp_path.glob(".samples*"))
+
+
+def test_without_questions_the_folder_is_empty(tmp_path: Path) -> None:
+    assert Samples.open(write_samples([], tmp_path / "samples")).by_name == {}
