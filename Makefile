@@ -74,8 +74,9 @@ test-console: .venv/.torch ## the console in a real browser -> reports/console.j
 	$(BIN)/python -m pytest tests/console --ignore tests/console/test_flows.py
 	$(BIN)/python -m benchmarks.console $(ARGS)
 
+# By the lock file, as `npm ci` would; that refuses a lock without the packages of platforms that a registry does not offer.
 $(WEB)/node_modules/.installed: $(WEB)/package-lock.json
-	cd $(WEB) && npm ci --ignore-scripts --no-audit --no-fund --silent
+	cd $(WEB) && npm install --no-save --ignore-scripts --no-audit --no-fund --silent
 	@touch $@
 
 format: .venv/.torch ## put the code in shape

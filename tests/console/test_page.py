@@ -16,7 +16,7 @@ Pages = Callable[..., Any]
 Shoot = Callable[[Any, str], None]
 
 
-@pytest.mark.skipif(not AXE.exists(), reason="axe-core is not there: npm ci in service/console/web")
+@pytest.mark.skipif(not AXE.exists(), reason="axe-core is not there: npm install in service/console/web")
 @pytest.mark.parametrize("size", [DESKTOP, LAPTOP, PHONE], ids=["desktop", "laptop", "phone"])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_axe_finds_nothing_serious(url: str, page_of: Pages, shoot: Shoot, size: tuple[int, int], dark: bool) -> None:
