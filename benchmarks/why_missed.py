@@ -84,6 +84,14 @@ WHY_MISSED: dict[str, str] = {
         "all ten frames on the odometry's own poses, eight on the poses as given, which are bent by 0.36 m between the first two scans; "
         "tried: traffic voted out of the map (without it 9 and 8), a reach of 80 m, less weight up to 3.5 m above the ground"
     ),
+    "soak.slope_mib_per_hour": (
+        "measured while other work shared both cores, which is also why requests were refused; not told apart yet: memory that the "
+        "process keeps, and pages of the mapped files that it touches late; next: anonymous memory alone, on an idle machine"
+    ),
+    "registration.cpu_ms_per_query.precise": (
+        "measured beside other work, which doubles processor time here; 24.7 ms on an idle machine with the encoder before, whose "
+        "weights registration does not use"
+    ),
     "cpu_over_bare.full.rest": (
         "reading and splitting the body, JSON and the event loop take 2.5 ms of 42; gRPC takes 2.1"
     ),
