@@ -93,8 +93,8 @@ WHY_MISSED: dict[str, str] = {
         "process keeps, and pages of the mapped files that it touches late; next: anonymous memory alone, on an idle machine"
     ),
     "registration.cpu_ms_per_query.precise": (
-        "measured beside other work, which doubles processor time here; 24.7 ms on an idle machine with the encoder before, whose "
-        "weights registration does not use"
+        "26.2 ms in this run, 24.7 in the one before it, by the same code on an idle machine: the machine swings by more than what is "
+        "missing; nothing was done to it since"
     ),
     "cpu_over_bare.full.rest": (
         "reading and splitting the body, JSON and the event loop take 2.5 ms of 42; gRPC takes 2.1"
