@@ -22,6 +22,7 @@ from service.geometry.rigid import transform_from
 DRIVE = Path("2011_09_26") / "2011_09_26_drive_sync"
 LIDAR_HEIGHT_M = 1.73  # as KITTI's own figure of its car has it
 SETTINGS = OpenSettings(depth="lidar")
+IN_SIGHT = "not held out: the vote on traffic was chosen with these frames in sight"
 NO_DATA = "no recordings at {name}"
 
 
@@ -49,7 +50,7 @@ def drive_rows(report: Report, data: Path, work: Path) -> None:
         report.row(f"kitti_drive.{name}_poses.median_m", float(np.median(found)), "m", n=len(found))
     both = np.concatenate(list(errors.values()))
     report.share("kitti_drive.within_1_m", both <= 1.0, bar=1.0)
-    report.row("kitti_drive.median_m", float(np.median(both)), "m", bar=0.12, better="lower", n=len(both))
+    report.row("kitti_drive.median_m", float(np.median(both)), "m", bar=0.12, better="lower", n=len(both), why=IN_SIGHT)
 
 
 def stereo_rows(report: Report, data: Path, work: Path) -> None:
