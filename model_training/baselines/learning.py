@@ -1,0 +1,123 @@
+"""What the learned baselines share: a budget of processor time, a curve of what they gained, checkpoints to go on from.
+
+A budget is counted in processor time of all threads, so that neither other work on the machine nor a pause changes what a
+method is given.
+"""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from service.errors import DatasetError
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """State of a training after ``images`` shown: processor time (s), mean loss since the last point, and ``score``.
+
+    ``score`` is what the method watches, on frames of the training drive that are not shown; larger is better.
+    """
+
+    images: int
+    processor_s: float
+    loss: float
+    score: float
+
+
+class Training:
+    """A run's folder: its settings, its curve and its last checkpoint.
+
+    ``settings`` (plain JSON values) are kept beside the checkpoint; a folder of other settings is refused. ``budget_s`` is no
+    setting: a run that ended at a budget goes on when it is given more.
+
+    Raises:
+        DatasetError: the folder belongs to other settings.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], *, budget_s: float, patience: int = 6) -> None:
+        self.folder, self._budget_s, self._patience = folder, budget_s, patience
+        folder.mkdir(parents=True, exist_ok=True)
+        kept, text = folder / "settings.json", json.dumps(dict(settings), indent=1, sort_keys=True) + "\n"
+        if kept.exists() and kept.read_text() != text:
+            raise DatasetError(f"{kept} is of other settings; remove {folder} to train anew", field="settings")
+        kept.write_text(text)
+        self.curve = self._read_curve()
+        self._spent_before = self.curve[-1].processor_s if self.curve else 0.0
+        self._began = time.process_time()
+
+    @property
+    def processor_s(self) -> float:
+        """Processor time that the run has taken, in earlier sessions too, up to the last saved point of each."""
+        return self._spent_before + time.process_time() - self._began
+
+    @property
+    def images(self) -> int:
+        """Images shown up to the last point."""
+        return self.curve[-1].images if self.curve else 0
+
+    @property
+    def share_spent(self) -> float:
+        """Of the budget, 0 to 1: what a learning rate may follow."""
+        return min(1.0, self.processor_s / self._budget_s)
+
+    @property
+    def ended(self) -> str | None:
+        """Why there is nothing more to do: the budget is spent, or the score stopped gaining; None to go on."""
+        if self.curve and self._spent_before >= self._budget_s:
+            return "budget"
+        if self.curve and self.processor_s >= self._budget_s:
+            return "budget"
+        scores = [point.score for point in self.curve]
+        if len(scores) > self._patience and max(scores[-self._patience :]) <= max(scores[: -self._patience]):
+            return "stopped gaining"
+        return None
+
+    def point(self, images: int, loss: float, score: float, state: Mapping[str, Any]) -> CurvePoint:
+        """Note a point of the curve and save ``state`` (state_dicts and plain values), and apart the best one so far."""
+        point = CurvePoint(images, self.processor_s, loss, score)
+        best = not self.curve or score > max(each.score for each in self.curve)
+        for name in ("checkpoint.pt", "best.pt") if best else ("checkpoint.pt",):
+            part = self.folder / f"{name}.part"
+            torch.save(dict(state), part)
+            part.rename(self.folder / name)
+        self.curve.append(point)
+        part = self.folder / "curve.part"
+        part.write_text("".join(json.dumps(asdict(each)) + "\n" for each in self.curve))
+        part.rename(self.folder / "curve.jsonl")
+        return point
+
+    def checkpoint(self) -> dict[str, Any] | None:
+        """The last saved state, or None at the beginning."""
+        return self._load("checkpoint.pt")
+
+    def best(self) -> dict[str, Any]:
+        """The state with the best score.
+
+        Raises:
+            DatasetError: nothing was saved yet.
+        """
+        state = self._load("best.pt")
+        if state is None:
+            raise DatasetError(f"{self.folder} holds no best.pt yet; train first", field="folder")
+        return state
+
+    def _load(self, name: str) -> dict[str, Any] | None:
+        path = self.folder / name
+        if not path.exists():
+            return None
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        return state
+
+    def _read_curve(self) -> list[CurvePoint]:
+        path = self.folder / "curve.jsonl"
+        if not path.exists():
+            return []
+        return [CurvePoint(**json.loads(line)) for line in path.read_text().splitlines()]
+
+
+Report = Callable[[str, int, int], None]  # stage, done, of; here: a method, and per mille of its budget
