@@ -19,6 +19,7 @@ from service.geometry.rigid import heading_of_body
 from service.imaging.gather import gather
 from service.imaging.level import level_camera
 from service.imaging.view_grid import ViewGrid
+from service.maps.streets import Streets
 
 SIDE = 224
 Report = Callable[[str, int, int], None]
@@ -94,7 +95,7 @@ def make_pairs(dataset: Dataset, names: Sequence[str], folder: Path, *, report: 
     streets = dataset.streets()
     if streets is None:
         raise DatasetError(f"{dataset.folder} has no streets.geojson", field="streets")
-    np.save(part / "street.npy", nearest_streets(streets, arrays["T_map_camera"][:, :2, 3]))
+    np.save(part / "street.npy", nearest_streets(Streets.from_geojson(streets), arrays["T_map_camera"][:, :2, 3]))
     small = frames[0].camera.pinhole().scaled_to(SIDE, SIDE)
     kept = {name: getattr(small, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     (part / "pairs.json").write_text(json.dumps(kept) + "\n")
