@@ -28,12 +28,14 @@ class Report:
     Args:
         name: of the file.
         command: that makes it, for people who want to run it again.
+        folder: where it lies.
     """
 
     name: str
     command: str
     rows: list[dict[str, Any]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
+    folder: Path = REPORTS
     _keep: bool = False
     _began: float = field(default_factory=time.monotonic)
     # What is measured is the code as it was loaded, not as it is when the report is written.
@@ -83,7 +85,7 @@ class Report:
 
     def _with_others(self) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         """Rows and notes of the file as it is now, this run's in their places."""
-        path = REPORTS / f"{self.name}.json"
+        path = self.folder / f"{self.name}.json"
         if not self._keep or not path.exists():
             return self.rows, self.notes
         last = json.loads(path.read_text())
@@ -98,9 +100,9 @@ class Report:
             "date": datetime.now(UTC).isoformat(timespec="seconds"), "machine": machine(), "command": self.command,
             "minutes": round((time.monotonic() - self._began) / 60, 2),
         }  # fmt: skip
-        REPORTS.mkdir(exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         rows, notes = self._with_others()
-        path = REPORTS / f"{self.name}.json"
+        path = self.folder / f"{self.name}.json"
         part = path.with_suffix(".part")
         part.write_text(json.dumps({"made": made, "rows": rows} | ({"notes": notes} if notes else {}), indent=1) + "\n")
         part.rename(path)
@@ -127,6 +129,11 @@ def machine() -> str:
             model,
         )
     return f"{model}, {os.cpu_count()} cores, Python {sys.version.split()[0]}"
+
+
+def head_commit() -> str:
+    """The commit that is checked out."""
+    return _git("rev-parse", "HEAD")
 
 
 def _git(*arguments: str) -> str:

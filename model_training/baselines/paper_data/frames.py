@@ -4,12 +4,14 @@ Every frame draws its errors from its own seed. Frames are made in blocks; a blo
 stopped goes on with the others.
 """
 
+import hashlib
 import json
 import multiprocessing
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -33,6 +35,8 @@ LIDAR, CITY_SEED, FORMAT = "paper_32", 0, 1
 STEP_M = 0.02  # between the stations that frames are chosen from; the densest class has a frame every 3 cm
 BLOCK = 128
 Report = Callable[[str, int, int], None]
+Transform = NDArray[np.float64]
+PoseOf = Callable[[int, np.random.Generator], Transform]
 
 
 @dataclass(frozen=True)
@@ -85,12 +89,47 @@ def stations_of(city: City, total: int) -> tuple[list[Station], NDArray[np.int64
 
 
 def make_frames(folder: Path, total: int, *, workers: int | None = None, report: Report = lambda *_: None) -> Frames:
-    """Simulate, draw and keep ``total`` frames of the paper's city, or go on with what a stopped run left.
+    """Simulate, draw and keep ``total`` frames of the survey's drive, or go on with what a stopped run left.
 
     Raises:
-        DatasetError: the folder holds frames of another number.
+        DatasetError: the folder holds other frames.
     """
+    city = City(seed=CITY_SEED, name="paper")
+    where, street = stations_of(city, total)
     made_of = {"format": FORMAT, "total": total, "lidar": LIDAR, "city_seed": CITY_SEED}
+
+    def pose_of(row: int, rng: np.random.Generator) -> Transform:
+        return lidar_pose(city, where[row], rng)
+
+    return _make(folder, made_of, city, 0, pose_of, street, workers, report)
+
+
+def make_frames_at(
+    folder: Path, T_map_lidar: NDArray[np.float64], street: NDArray[np.int64], *, traversal: int,
+    workers: int | None = None, report: Report = lambda *_: None,
+) -> Frames:  # fmt: skip
+    """The same of given poses (n, 4, 4) among the vehicles and people of another drive.
+
+    Raises:
+        DatasetError: the folder holds other frames.
+    """
+    made_of = {
+        "format": FORMAT, "total": len(street), "lidar": LIDAR, "city_seed": CITY_SEED, "traversal": traversal,
+        "poses": hashlib.sha256(np.ascontiguousarray(T_map_lidar).tobytes()).hexdigest(),
+    }  # fmt: skip
+    city = City(seed=CITY_SEED, name="paper")
+
+    def pose_of(row: int, _: np.random.Generator) -> Transform:
+        T: Transform = T_map_lidar[row]
+        return T
+
+    return _make(folder, made_of, city, traversal, pose_of, street, workers, report)
+
+
+def _make(
+    folder: Path, made_of: dict[str, Any], city: City, traversal: int, pose_of: PoseOf, street: NDArray[np.int64],
+    workers: int | None, report: Report,
+) -> Frames:  # fmt: skip
     finished, begun = folder / "frames.json", folder / "frames.begun.json"
     for path in (finished, begun):
         if path.exists() and json.loads(path.read_text()) != made_of:
@@ -98,8 +137,7 @@ def make_frames(folder: Path, total: int, *, workers: int | None = None, report:
     if finished.exists():
         return Frames.open(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    city, grid = City(seed=CITY_SEED, name="paper"), ViewGrid()
-    where, street = stations_of(city, total)
+    total, grid = len(street), ViewGrid()
     shapes: dict[str, tuple[tuple[int, ...], type]] = {
         "aligned": ((total, SIZE, SIZE), np.uint8), "plain": ((total, SIZE, SIZE), np.uint8),
         "panoramas": ((total, grid.rows, grid.around), np.float16), "intensities": ((total, grid.rows, grid.around), np.uint8),
@@ -112,7 +150,8 @@ def make_frames(folder: Path, total: int, *, workers: int | None = None, report:
         begun.write_text(json.dumps(made_of) + "\n")
     todo = [first for first in range(0, total, BLOCK) if not _mark(folder, first).exists()]
     global _job
-    _job = _Job(folder, city, Scene(joined([city.static, city.occupants(0)])), where, grid, LIDARS[LIDAR].rays())
+    scene = Scene(joined([city.static, city.occupants(traversal)]))
+    _job = _Job(folder, city, scene, pose_of, total, traversal, grid, LIDARS[LIDAR].rays())
     with (
         threadpool_limits(1, user_api="blas"),
         multiprocessing.get_context("fork").Pool(workers or os.cpu_count()) as pool,
@@ -134,7 +173,9 @@ class _Job:
     folder: Path
     city: City
     scene: Scene
-    where: list[Station]
+    pose_of: PoseOf
+    total: int
+    traversal: int
     grid: ViewGrid
     rays: NDArray[np.float32]
 
@@ -153,10 +194,10 @@ def _block(first: int) -> int:
     arrays = {
         name: np.load(job.folder / f"{name}.npy", mmap_mode="r+") for name in Frames.__annotations__ if name != "street"
     }
-    rows = range(first, min(first + BLOCK, len(job.where)))
+    rows = range(first, min(first + BLOCK, job.total))
     for row in rows:
-        rng = np.random.default_rng([CITY_SEED, 41, row])
-        T = lidar_pose(job.city, job.where[row], rng)
+        rng = np.random.default_rng([CITY_SEED, 41 + job.traversal, row])
+        T = job.pose_of(row, rng)
         points = scan(job.scene, job.city.ground, LIDARS[LIDAR], job.rays, T, CONDITIONS["clear"], rng)
         arrays["aligned"][row] = picture_from_above(points[:, :3], aligned=True)
         arrays["plain"][row] = picture_from_above(points[:, :3], aligned=False)

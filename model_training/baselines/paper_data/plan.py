@@ -6,10 +6,12 @@ pairs has seen what the other drive's questions look like. The questions of ``sa
 its own vehicles, as the paper's random split has it; those of ``other_drive`` come from a drive that nothing was learnt from.
 """
 
+from model_training.baselines.paper_data.table_one import PAPER_PAIRS
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 
 TRAINING_SETS = ("own_drive_precise", "second_drive_precise")
 SPLITS = ("same_drive", "other_drive")
+DENSEST_M = 0.5  # between scans of the survey at the paper's size
 TEST_TRAVERSAL, TRAINING_TRAVERSAL = 6, 20  # nothing else in the project drives these here
 
 
@@ -31,4 +33,6 @@ def pairs_plan(pairs: int, *, per_class: bool = True, test_images: int = 64) -> 
         test("same_drive", 0, on_track=True),
         test("other_drive", TEST_TRAVERSAL, on_track=False),
     )
-    return SimulationPlan(name="paper-comparison", city="paper", seed=0, spacing_m=0.5, queries=queries)
+    # As many stations as the survey's own drive has pairs to stand on, and a margin for those that are blocked.
+    spacing_m = min(4.0, DENSEST_M * (PAPER_PAIRS // 2) / max(1, pairs // 2))
+    return SimulationPlan(name="paper-comparison", city="paper", seed=0, spacing_m=spacing_m, queries=queries)

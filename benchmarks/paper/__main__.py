@@ -1,0 +1,73 @@
+"""``make paper``: the paper's method, its baseline and others beside ours, on the same data -> reports/paper.json, paper.md, figures.
+
+The full size takes some hours on two cores. Whatever is finished is kept under ``--work``: data by blocks, trainings by
+checkpoints, answers by method; the same command goes on after a stop. ``--only`` runs some methods, ``--tables`` none: it writes
+the report from what is kept.
+"""
+
+import argparse
+from pathlib import Path
+
+from benchmarks.paper.data import PaperData, Size
+from benchmarks.paper.figures import draw_figures
+from benchmarks.paper.kept import MethodResult
+from benchmarks.paper.methods import RUNS, Bench
+from benchmarks.paper.rows import METHODS, all_rows
+from benchmarks.paper.tables import write_page
+from benchmarks.report import REPORTS, ROOT, Report
+
+
+def kept_results(bench: Bench) -> dict[str, MethodResult]:
+    """Every method that was run, and under the paper's two names the variant that was best on the pairs kept aside."""
+    names = [path.stem for path in sorted(bench.kept.glob("*.json"))]
+    found = {name: result for name in names if (result := MethodResult.load(bench.kept, name)) is not None}
+    for method in ("cnn_knn", "cnn_softmax"):
+        variants = [name for name in found if name.startswith(f"{method}_")]
+        if variants:
+            found[method] = found[max(variants, key=lambda name: found[name].aside)]
+    return found
+
+
+def main() -> None:
+    """Parse, run, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "paper", help="where data and runs are kept")
+    parser.add_argument("--out", type=Path, default=REPORTS, help="folder of the report")
+    parser.add_argument("--frames", type=int, default=Size.frames, help="LiDAR frames")
+    parser.add_argument("--pairs", type=int, default=Size.pairs, help="RGB-D pairs to learn from")
+    parser.add_argument("--test-images", type=int, help="for each split, instead of Table I's 626")
+    parser.add_argument("--budget-minutes", type=float, default=60.0, help="of processor time, for each learned method")
+    parser.add_argument("--only", nargs="+", metavar="METHOD", help=f"of: {' '.join(RUNS)}")
+    parser.add_argument("--tables", action="store_true", help="run nothing, write the report from what is kept")
+    parser.add_argument("--anew", action="store_true", help="run methods again whose answers are kept; trainings go on")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.only or ()) - set(RUNS):
+        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(RUNS)}")
+    size = Size(arguments.frames, arguments.pairs, arguments.test_images)
+    bench = Bench(PaperData(arguments.work, size), 60 * arguments.budget_minutes)
+    command = "make paper"
+    if size != Size():
+        command += f' ARGS="--frames {size.frames} --pairs {size.pairs} --test-images {size.test_images}"'
+    report = Report("paper", command, folder=arguments.out)
+    wanted = [] if arguments.tables else arguments.only or list(RUNS)
+    for name in wanted:
+        if not arguments.anew and (bench.kept / f"{name}.done").exists():
+            continue
+        print(f"--- {name}", flush=True)
+        for result in RUNS[name](bench):
+            result.save(bench.kept)
+        (bench.kept / f"{name}.done").touch()
+    results = kept_results(bench)
+    missing = dict.fromkeys((*METHODS, "cnn_knn"), "not run yet")
+    figures = all_rows(report, results, bench.data.tests, missing)
+    report.notes["size"] = (
+        f"{size.frames} LiDAR frames, {size.pairs} RGB-D pairs, {len(bench.data.tests['other_drive'])} test images a split; "
+        f"learned methods have up to {arguments.budget_minutes:g} minutes of processor time each."
+    )
+    print(f"written: {report.write()}")
+    pictures = draw_figures(arguments.out / "paper", bench.data, results)
+    print(f"written: {write_page(arguments.out / 'paper.md', bench.data, results, figures, pictures)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""The data that all methods share, made once under the work folder."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.baselines.paper_data.frames import Frames, make_frames, make_frames_at
+from model_training.baselines.paper_data.pairs import Pairs, make_pairs
+from model_training.baselines.paper_data.plan import SPLITS, TEST_TRAVERSAL, TRAINING_SETS, pairs_plan
+from model_training.baselines.paper_data.table_one import PAPER_FRAMES, PAPER_PAIRS
+from model_training.cli.progress import bars
+from model_training.datasets.dataset import Dataset
+from model_training.simulation.simulate import simulate
+from service.geometry.rigid import R_BODY_OPTICAL
+
+LIDAR_ABOVE_CAMERA_M = 0.3
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much there is: the paper's, or less where it is only to be shown that everything runs.
+
+    Attributes:
+        frames: of LiDAR.
+        pairs: of RGB and depth to learn from.
+        test_images: a split; None for Table I's 626.
+    """
+
+    frames: int = PAPER_FRAMES
+    pairs: int = PAPER_PAIRS
+    test_images: int | None = None
+
+
+class PaperData:
+    """Frames, pairs and tests of one size, made when first asked for; what is finished is reused."""
+
+    def __init__(self, work: Path, size: Size) -> None:
+        self.work, self.size = work, size
+
+    @cached_property
+    def frames(self) -> Frames:
+        """LiDAR frames of the survey's drive."""
+        with bars() as report:
+            return make_frames(self.work / f"frames-{self.size.frames}", self.size.frames, report=report)
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The dataset that pairs and tests come from, and whose survey makes our map."""
+        tests = self.size.test_images
+        plan = pairs_plan(self.size.pairs, per_class=tests is None, test_images=tests or 1)
+        folder = self.work / (f"dataset-{self.size.pairs}" + ("" if tests is None else f"-{tests}"))
+        with bars() as report:
+            simulate(plan, folder, report=report)
+        return Dataset(folder)
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """Pairs to learn from: the first half on the survey's drive, the second on another."""
+        with bars() as report:
+            return make_pairs(self.dataset, TRAINING_SETS, self.work / f"pairs-{self.size.pairs}", report=report)
+
+    @cached_property
+    def tests(self) -> dict[str, Pairs]:
+        """Queries by split."""
+        count, found = self.size.test_images or 626, {}
+        for split in SPLITS:
+            with bars() as report:
+                found[split] = make_pairs(
+                    self.dataset, (test_set(split),), self.work / f"{split}-{count}", report=report
+                )
+        return found
+
+    @cached_property
+    def other_lidar(self) -> Frames:
+        """What a LiDAR above the camera would have seen at the other drive's queries."""
+        test = self.tests["other_drive"]
+        with bars() as report:
+            return make_frames_at(
+                self.work / f"other-lidar-{len(test)}", lidar_above(np.asarray(test.T_map_camera)), np.asarray(test.street),
+                traversal=TEST_TRAVERSAL, report=report,
+            )  # fmt: skip
+
+
+def test_set(split: str) -> str:
+    """Name of a split's query set in the dataset."""
+    return f"{split}_precise"
+
+
+def lidar_above(T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T_map_lidar (n, 4, 4) of a LiDAR 0.3 m above each camera (n, 4, 4), looking where it looks."""
+    T_camera_lidar = np.eye(4)
+    T_camera_lidar[:3, :3] = R_BODY_OPTICAL.T
+    T_camera_lidar[:3, 3] = [0.0, -LIDAR_ABOVE_CAMERA_M, 0.0]  # optical axes: y down
+    above: NDArray[np.float64] = T_map_camera @ T_camera_lidar
+    return above

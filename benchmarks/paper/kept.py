@@ -1,0 +1,83 @@
+"""What each method answered, kept as JSON so that tables and figures can be made again without running it again."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.report import head_commit
+from model_training.baselines.answers import PlaceAnswers
+from model_training.baselines.learning import CurvePoint
+
+SPLITS = ("same_drive", "other_drive")
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """One method: answers by split, and what its training took.
+
+    Attributes:
+        method: as in row ids.
+        answers: by split.
+        training_s: processor seconds of training; 0 where nothing is learnt.
+        images: shown in training.
+        training_set: different images that it learnt from.
+        ended: why its training ended.
+        curve: of its training.
+        extra: plain values that tables need.
+        commit: that it was run at.
+    """
+
+    method: str
+    answers: Mapping[str, PlaceAnswers]
+    training_s: float = 0.0
+    images: int = 0
+    training_set: int = 0
+    ended: str = "nothing is learnt"
+    curve: list[CurvePoint] = field(default_factory=list)
+    extra: dict[str, Any] = field(default_factory=dict)
+    commit: str = field(default_factory=head_commit)
+
+    @property
+    def aside(self) -> float:
+        """Street accuracy on the pairs kept aside, by which variants of one method are chosen."""
+        told = self.extra.get("aside")
+        return float(self.extra["asked"]["aside"]["knn"]["5"][0]) if told is None else float(told)
+
+    def save(self, folder: Path) -> None:
+        """Write ``METHOD.json``, whole or not at all."""
+        folder.mkdir(parents=True, exist_ok=True)
+        told = {
+            "method": self.method, "commit": self.commit, "training_s": self.training_s, "images": self.images,
+            "training_set": self.training_set, "ended": self.ended, "extra": self.extra,
+            "curve": [[p.images, p.processor_s, p.loss, p.score] for p in self.curve],
+            "answers": {name: {"xy": _plain(each.xy), "street": each.street.tolist()} for name, each in self.answers.items()},
+        }  # fmt: skip
+        part = folder / f"{self.method}.part"
+        part.write_text(json.dumps(told) + "\n")
+        part.rename(folder / f"{self.method}.json")
+
+    @staticmethod
+    def load(folder: Path, method: str) -> "MethodResult | None":
+        """What was kept, or None."""
+        path = folder / f"{method}.json"
+        if not path.exists():
+            return None
+        told = json.loads(path.read_text())
+        answers = {
+            name: PlaceAnswers(np.array(each["xy"], np.float64).reshape(-1, 2), np.array(each["street"], np.int64))
+            for name, each in told["answers"].items()
+        }
+        return MethodResult(
+            told["method"], answers, told["training_s"], told["images"], told["training_set"], told["ended"],
+            [CurvePoint(int(a), b, c, d) for a, b, c, d in told["curve"]], told["extra"], told["commit"],
+        )  # fmt: skip
+
+
+def _plain(xy: NDArray[np.float64]) -> list[list[float | None]]:
+    """Rows of x and y to the millimetre; null where nothing was answered, since JSON has no NaN."""
+    return [[round(float(v), 3) if np.isfinite(v) else None for v in row] for row in xy]

@@ -1,0 +1,103 @@
+"""Every method of the comparison, run on the shared data; what each answers is kept, so a stop costs one method."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.paper.data import PaperData, test_set
+from benchmarks.paper.kept import SPLITS, MethodResult
+from benchmarks.paper.ours import bundle_of, streetfix, streetfix_stock
+from model_training.baselines.answers import PlaceAnswers
+from model_training.baselines.paper.knn import KS, PAPER_K
+from model_training.baselines.paper.variants import PLANS, Asked, Variant, run_variant, street_accuracy
+from model_training.baselines.raw_range import raw_best_views
+from model_training.cli.progress import bars
+from model_training.evaluation.error_measures import distance_errors
+from model_training.stock import ENCODER
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The data, the budget of each learned method (processor seconds) and where answers are kept."""
+
+    data: PaperData
+    budget_s: float
+
+    @property
+    def kept(self) -> Path:
+        """Folder of answers."""
+        return self.data.work / "answers"
+
+
+def paper_variant(bench: Bench, name: str) -> list[MethodResult]:
+    """One variant of the paper's method: K-NN and softmax."""
+    data = bench.data
+    with bars() as report:
+        variant = run_variant(
+            name, data.frames, data.pairs, data.tests, data.other_lidar, data.work / "runs" / "cnn",
+            budget_s=bench.budget_s, report=report,
+        )  # fmt: skip
+    extra = {"asked": {key: told_of(asked) for key, asked in variant.asked.items()}}
+    shown = data.size.frames + (data.size.pairs if PLANS[name].pairs_too else 0)
+
+    def result(method: str, answers: Mapping[str, PlaceAnswers], extra: dict[str, Any]) -> MethodResult:
+        return MethodResult(
+            f"{method}_{name}", answers, variant.processor_s, variant.images, shown, variant.ended, variant.curve, extra
+        )
+
+    return [
+        result("cnn_knn", {split: variant.asked[split].knn[PAPER_K] for split in SPLITS}, extra),
+        result("cnn_softmax", {split: variant.asked[split].softmax for split in SPLITS}, {"aside": _aside(variant)}),
+    ]
+
+
+def _aside(variant: Variant) -> float:
+    asked = variant.asked["aside"]
+    return street_accuracy(asked.softmax, asked)
+
+
+def told_of(asked: Asked) -> dict[str, Any]:
+    """Street accuracy and mean distance of softmax and of K-NN by k."""
+
+    def both(answers: PlaceAnswers) -> list[float]:
+        return [street_accuracy(answers, asked), float(distance_errors(answers.xy, asked.truth_xy).mean())]
+
+    return {
+        "kind": asked.kind, "n": len(asked.truth_street), "softmax": both(asked.softmax),
+        "knn": {str(k): both(asked.knn[k]) for k in KS},
+    }  # fmt: skip
+
+
+def raw_range(bench: Bench) -> list[MethodResult]:
+    """The raw range image at its best setting, which is chosen on pairs of the training drive."""
+    data = bench.data
+    bundle, answers = bundle_of(data, ENCODER), {}
+    street = np.asarray(bundle.place_street, np.int64)
+    xy = bundle.T_map_place[:, :2, 3]
+    names = [test_set(split) for split in SPLITS]
+    with bars() as report:
+        chosen_on = raw_best_views(bundle, data.dataset, ["second_drive_precise"], every=12, report=report)
+        asked = {name: raw_best_views(bundle, data.dataset, [name], report=report) for name in names}
+    frames = list(data.dataset.queries("second_drive_precise"))[::12]
+    truth = np.array([f.T_map_camera[:2, 3] for f in frames if f.T_map_camera is not None])
+    errors = {s: float(np.linalg.norm(xy[place] - truth, axis=1).mean()) for s, place in chosen_on.items()}
+    best = min(errors, key=lambda s: errors[s])
+    for split, name in zip(SPLITS, names, strict=True):
+        place = asked[name][best]
+        seen = place >= 0
+        answers[split] = PlaceAnswers(np.where(seen[:, None], xy[place], np.nan), np.where(seen, street[place], -1))
+    return [MethodResult("raw_range", answers, extra={"setting": best, "training_drive_mean_m": errors})]
+
+
+Method = Callable[[Bench], list[MethodResult]]
+#: By name, in the order in which they are run: those that take least first.
+RUNS: dict[str, Method] = {
+    "streetfix": lambda bench: [streetfix(bench.data)],
+    "streetfix_stock": lambda bench: [streetfix_stock(bench.data)],
+    "raw_range": raw_range,
+}
+RUNS |= {f"cnn_{name}": partial(paper_variant, name=name) for name in PLANS}

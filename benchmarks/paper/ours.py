@@ -1,0 +1,113 @@
+"""Our method in the comparison: an encoder trained from nothing on the same data, and the one that is shipped.
+
+The encoder of ``streetfix`` sees as many images as the paper's 84 iterations show its CNN, of the same frames and pairs. The
+one of ``streetfix_stock`` has never seen this city. Both maps are built as any user builds one; every answer counts, accepted
+or not.
+"""
+
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.paper.data import PaperData, Size, test_set
+from benchmarks.paper.kept import SPLITS, MethodResult
+from benchmarks.runs import MAPPING, code_hash
+from model_training.baselines.answers import PlaceAnswers
+from model_training.baselines.learning import CurvePoint
+from model_training.cli.progress import bars
+from model_training.evaluation.predict import predict
+from model_training.mapping.build import BuildSettings, build_map
+from model_training.stock import ENCODER
+from model_training.training.export import export
+from model_training.training.loop import Progress, TrainingConfig, load_run, train
+from model_training.training.packs import rows_seen_by
+from service.localization.encoder import Encoder
+from service.localization.localizer import Localizer
+from service.maps.reader import MapBundle
+
+PAPER_IMAGES_SHARE = 4 * 0.7  # four epochs over 70 % of the frames
+
+
+def config_for(size: Size) -> TrainingConfig:
+    """As many optimiser steps as show the images that the paper's iterations show its CNN; small sizes have small batches."""
+    together = min(TrainingConfig().pairs, size.pairs // 4)
+    return TrainingConfig(pairs=together, steps=max(1, round(PAPER_IMAGES_SHARE * size.frames / (2 * together))))
+
+
+def pack_of(data: PaperData) -> Path:
+    """The comparison's frames and pairs as a training pack; the large arrays are linked, not copied."""
+    folder = data.work / f"pack2-paper-0-{data.size.frames}x{data.size.pairs}"
+    if folder.exists():
+        return folder
+    part = folder.with_name(folder.name + ".part")
+    frames, pairs = data.frames, data.pairs
+    part.mkdir(parents=True, exist_ok=True)
+    for name in ("panoramas", "intensities"):
+        (part / f"{name}.npy").unlink(missing_ok=True)
+        os.link(data.work / f"frames-{data.size.frames}" / f"{name}.npy", part / f"{name}.npy")
+    np.save(part / "places.npy", frames.places)
+    np.save(part / "rows_seen.npy", rows_seen_by(frames.panoramas))
+    for name, array in (("ranges", pairs.ranges), ("rgb", pairs.colours), ("queries", pairs.views)):
+        np.save(part / f"{name}.npy", array)
+    part.rename(folder)
+    return folder
+
+
+def streetfix(data: PaperData) -> MethodResult:
+    """Train on the comparison's data, build the map, answer both tests."""
+    run, curve = data.work / "runs" / "streetfix", []
+    config = config_for(data.size)
+    spent = run / "processor_s.json"
+    before: float = json.loads(spent.read_text()) if spent.exists() else 0.0
+    began = time.process_time()
+
+    def note(progress: Progress) -> None:
+        if progress.step % 10 == 0 or progress.step == progress.steps:
+            images = progress.step * 2 * config.pairs
+            curve.append(CurvePoint(images, before + time.process_time() - began, progress.loss, progress.accuracy))
+        show("training", progress.step, progress.steps)
+
+    pack = pack_of(data)
+    try:
+        with bars() as show:
+            train([pack], run, config, device="cpu", report=note)
+    finally:
+        if run.exists():
+            spent.write_text(json.dumps(before + time.process_time() - began) + "\n")
+    encoder = run / "encoder.onnx"
+    if not encoder.exists():
+        export(load_run(run), encoder)
+    training_s: float = json.loads(spent.read_text())
+    return MethodResult(
+        "streetfix", _answers(data, encoder), training_s, config.steps * 2 * config.pairs, data.size.frames + data.size.pairs,
+        f"{config.steps} steps", curve,
+    )  # fmt: skip
+
+
+def streetfix_stock(data: PaperData) -> MethodResult:
+    """The shipped encoder, which knows other cities alone."""
+    return MethodResult("streetfix_stock", _answers(data, ENCODER), ended="trained beforehand, on 26 other cities")
+
+
+def _answers(data: PaperData, encoder: Path) -> dict[str, PlaceAnswers]:
+    bundle = bundle_of(data, encoder)
+    localizer, found = Localizer.open(bundle), {}
+    for split in SPLITS:
+        with bars() as report:
+            asked = predict(localizer, data.dataset, test_set(split), report=report)
+        found[split] = PlaceAnswers(asked.T_answer[:, :2, 3], asked.street_answer)
+    return found
+
+
+def bundle_of(data: PaperData, encoder: Path) -> MapBundle:
+    """The map of the comparison's survey at 1 m, built once for each encoder and code."""
+    name = f"{data.dataset.folder.name}-{Encoder.open(encoder).sha256[:12]}-{code_hash(*MAPPING)}"
+    folder = data.work / "maps" / name
+    if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with bars() as report:
+            build_map(data.dataset, encoder, folder, BuildSettings(name="paper-city"), report=report)
+    return MapBundle.open(folder)

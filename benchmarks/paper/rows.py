@@ -1,0 +1,107 @@
+"""Rows of the comparison, and what ours must beat."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.paper.kept import SPLITS, MethodResult
+from benchmarks.report import Report
+from model_training.baselines.answers import PlaceAnswers
+from model_training.baselines.paper_data.pairs import Pairs
+from model_training.evaluation.error_measures import (
+    distance_errors,
+    mean_error_distance,
+    mean_squared_error,
+    wilson_interval,
+)
+
+#: Images that the paper's 84 iterations show: four times 70 % of its frames.
+PAPER_IMAGES = round(4 * 0.7 * 46_741)
+METHODS = (
+    "streetfix", "cnn_knn", "cnn_softmax", "icp_pointnetlk_googlenet", "scan_context", "raw_range", "dual_encoder", "fov_encoder",
+)  # fmt: skip
+LEARNED = ("cnn_knn", "icp_pointnetlk_googlenet", "dual_encoder", "fov_encoder")
+METRICS = (("street_accuracy", "share"), ("mean_distance_error_m", "m"), ("mse_m2", "m2"), ("training_minutes", "min"))
+
+
+def errors_of(answers: PlaceAnswers, test: Pairs) -> NDArray[np.float64]:
+    """Distances (n), metres; a query without an answer counts as if the middle of all places had been answered."""
+    truth = np.asarray(test.T_map_camera)[:, :2, 3]
+    xy = np.where(np.isfinite(answers.xy), answers.xy, truth.mean(axis=0))
+    return distance_errors(xy, truth)
+
+
+def figures_of(answers: PlaceAnswers, test: Pairs) -> dict[str, float]:
+    """The comparison's figures of one method on one split."""
+    errors = errors_of(answers, test)
+    return {
+        "street_accuracy": float((answers.street == np.asarray(test.street)).mean()),
+        "mean_distance_error_m": mean_error_distance(errors),
+        "median_distance_error_m": float(np.median(errors)),
+        "mse_m2": mean_squared_error(errors),
+        "within_1_m": float((errors <= 1.0).mean()),
+    }
+
+
+def minutes_for_paper_images(result: MethodResult) -> float | None:
+    """Processor minutes of training at the number of images that the paper's iterations show."""
+    return result.training_s / 60 * PAPER_IMAGES / result.images if result.images else None
+
+
+def all_rows(
+    report: Report, results: Mapping[str, MethodResult], tests: Mapping[str, Pairs], missing: Mapping[str, str]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Write every method's rows, ours against the best of the others; returns the figures by method and split."""
+    found = {
+        method: {split: figures_of(result.answers[split], tests[split]) for split in SPLITS}
+        for method, result in results.items()
+    }
+    for method in [*METHODS, *(name for name in results if name not in METHODS)]:
+        for split in SPLITS:
+            if method not in results:
+                for key, unit in METRICS:
+                    report.row(f"paper.{method}.{split}.{key}", None, unit, why=missing[method])
+                continue
+            _rows_of(report, method, split, results[method], found, len(tests[split]))
+        if method in results and (minutes := minutes_for_paper_images(results[method])) is not None:
+            others = [m for name in LEARNED if name in results and (m := minutes_for_paper_images(results[name]))]
+            bar = min(others) if method == "streetfix" and others else None
+            report.row(
+                f"paper.{method}.minutes_for_paper_images", minutes, "min", bar=bar, better="lower", n=PAPER_IMAGES,
+                why="processor minutes" + ("; the bar is the fastest learned method's" if bar else ""),
+            )  # fmt: skip
+    return found
+
+
+def _rows_of(
+    report: Report, method: str, split: str, result: MethodResult, found: Mapping[str, Mapping[str, Mapping[str, float]]], n: int
+) -> None:  # fmt: skip
+    own = found[method][split]
+    others = [found[name][split] for name in found if not name.startswith("streetfix")]
+    row = f"paper.{method}.{split}"
+    bars: dict[str, Any] = {}
+    if method == "streetfix" and others:
+        best = max(each["street_accuracy"] for each in others)
+        bars["street_accuracy"] = (
+            best if split == "other_drive" else round(wilson_interval(round(best * n), n)[0], 4),
+            "the best other method's" + ("" if split == "other_drive" else ", lower end of its 95 % interval"),
+        )
+        if split == "other_drive":
+            bars["mean_distance_error_m"] = (min(e["mean_distance_error_m"] for e in others), "the best other method's")
+    interval = list(wilson_interval(round(own["street_accuracy"] * n), n))
+    for key, unit in METRICS[:3]:
+        bar, what = bars.get(key, (None, None))
+        better: Literal["higher", "lower"] = "higher" if key == "street_accuracy" else "lower"
+        report.row(
+            f"{row}.{key}", own[key], unit, bar=bar, better=better, n=n, ci95=interval if better == "higher" else None,
+            why=None if what is None else f"bar: {what}",
+        )  # fmt: skip
+    for key in ("median_distance_error_m", "within_1_m"):
+        report.row(f"{row}.{key}", own[key], "m" if key.endswith("_m") and key != "within_1_m" else "share", n=n)
+    told = None if math.isfinite(result.training_s) else "unknown"
+    report.row(
+        f"{row}.training_minutes", result.training_s / 60, "min", n=result.training_set, why=told or result.ended
+    )

@@ -1,0 +1,148 @@
+"""Every way in which the paper's method is tried, and what each answers.
+
+The paper trains on LiDAR images and asks with fused RGB-D images, two kinds of picture that share no image space, and does not
+say how features of one could meet those of the other. So it is tried as it stands, and in every way that could be meant.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.baselines.answers import PlaceAnswers
+from model_training.baselines.learning import CurvePoint, Report
+from model_training.baselines.paper.cnn import CLASSES, PaperCnn
+from model_training.baselines.paper.knn import KS, PAPER_K, Gallery, class_centres
+from model_training.baselines.paper.pictures import LidarPictures, Pictures, fused_pictures
+from model_training.baselines.paper.train import CnnPlan, CnnTrainer, Split, aside_pairs, outputs, shown_pairs
+from model_training.baselines.paper_data.frames import Frames
+from model_training.baselines.paper_data.pairs import Pairs
+
+#: By name; the first is the paper to the letter.
+PLANS = {
+    "as_printed": CnnPlan("aligned", as_paper=True),
+    "converged": CnnPlan("aligned"),
+    "without_pca": CnnPlan("plain"),
+    "one_space": CnnPlan("view"),
+    "one_space_both": CnnPlan("view", pairs_too=True),
+}
+WHAT = {
+    "as_printed": "LiDAR from above, aligned by PCA, 84 iterations; asked with fused pictures as the camera sees them",
+    "converged": "the same, trained until it stops gaining",
+    "without_pca": "the same without PCA",
+    "one_space": "both on the view grid (azimuth x elevation); trained on LiDAR alone",
+    "one_space_both": "both on the view grid; trained on LiDAR frames and on fused pairs",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What one set of queries is answered: by softmax, and by K-NN for every k; ``kind`` says what the queries are."""
+
+    kind: str
+    softmax: PlaceAnswers
+    knn: Mapping[int, PlaceAnswers]
+    truth_xy: NDArray[np.float64]
+    truth_street: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A trained variant: its answers by set, its cost and its curve."""
+
+    name: str
+    asked: Mapping[str, Asked]
+    processor_s: float
+    images: int
+    curve: list[CurvePoint]
+    ended: str
+
+
+def run_variant(
+    name: str, frames: Frames, pairs: Pairs, tests: Mapping[str, Pairs], other_lidar: Frames, work: Path, *, budget_s: float,
+    report: Report = lambda *_: None,
+) -> Variant:  # fmt: skip
+    """Train one variant and ask it everything.
+
+    Args:
+        name: of ``PLANS``.
+        frames: of the survey's drive.
+        pairs: of the training drives.
+        tests: RGB-D queries by split.
+        other_lidar: frames of the other drive, where ``tests`` are: to tell the leak from the gap between sensors.
+        work: where the run is kept.
+        budget_s: of processor time; the variant as printed takes its 84 iterations instead.
+        report: told the name and how much is done.
+    """
+    plan = PLANS[name]
+    trainer = CnnTrainer(plan, frames, pairs if plan.pairs_too else None, work / name, budget_s=budget_s)
+    net = trainer.run(f"CNN {name}", report)
+    told = trainer.training
+    cost, images, why = told.processor_s, told.images, told.ended or f"{trainer.iterations} iterations"
+    split, pictures = trainer.split, trainer.pictures
+    gallery = _gallery(net, pictures, split, pairs if plan.pairs_too else None)
+    centres = class_centres(frames.T_map_lidar[split.learnt, :2, 3], frames.street[split.learnt], CLASSES)
+    asked: dict[str, Asked] = {}
+
+    def ask(key: str, kind: str, drawn: Callable[[NDArray[np.int64]], Pictures], xy: NDArray[np.float64],
+            street: NDArray[np.int64]) -> None:  # fmt: skip
+        features, scores = outputs(net, drawn, len(street))
+        neighbours = gallery.neighbours(features, max(KS))
+        best = scores.argmax(axis=1)
+        asked[key] = Asked(
+            kind, PlaceAnswers(centres[best], best), {k: gallery.answers(neighbours[:, :k]) for k in KS}, xy, street
+        )
+
+    def lidar(key: str, of: Frames, rows: NDArray[np.int64]) -> None:
+        drawn = LidarPictures(of, plan.space)
+        ask(key, "LiDAR", lambda chosen: drawn.of(rows[chosen]), of.T_map_lidar[rows, :2, 3], of.street[rows])
+
+    def rgbd(key: str, of: Pairs, rows: NDArray[np.int64], *, colour: bool = True) -> None:
+        ask(key, "RGB-D" if colour else "depth", lambda chosen: fused_pictures(of, rows[chosen], plan.space, colour=colour),
+            of.T_map_camera[rows, :2, 3], of.street[rows])  # fmt: skip
+
+    lidar("lidar.same_drive", frames, split.tested)
+    lidar("lidar.other_drive", other_lidar, np.arange(len(other_lidar)))
+    rgbd("aside", pairs, aside_pairs(len(pairs)))
+    for which, test in tests.items():
+        rgbd(which, test, np.arange(len(test)))
+        rgbd(f"depth.{which}", test, np.arange(len(test)), colour=False)
+    return Variant(name, asked, cost, images, told.curve, why)
+
+
+def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs | None) -> Gallery:
+    """Features of the frames learnt from; views look both ways along the street. Pairs learnt from are known places too."""
+    frames, rows = pictures.frames, split.learnt
+    headings = (0.0, np.pi) if pictures.space == "view" else (0.0,)
+    features, xy, street = [], [], []
+    for heading in headings:
+
+        def drawn(chosen: NDArray[np.int64], turn: float = heading) -> Pictures:
+            return pictures.of(rows[chosen], np.full(len(chosen), turn))
+
+        found, _ = outputs(net, drawn, len(rows))
+        features.append(found)
+        xy.append(frames.T_map_lidar[rows, :2, 3])
+        street.append(frames.street[rows])
+    if pairs is not None:
+        shown = shown_pairs(len(pairs))
+        found, _ = outputs(net, lambda chosen: fused_pictures(pairs, shown[chosen], pictures.space), len(shown))
+        features.append(found)
+        xy.append(pairs.T_map_camera[shown, :2, 3])
+        street.append(pairs.street[shown])
+    return Gallery(np.concatenate(features), np.concatenate(xy), np.concatenate(street))
+
+
+def street_accuracy(answers: PlaceAnswers, asked: Asked) -> float:
+    """Share of queries whose class is right; an unanswered one is wrong."""
+    return float((answers.street == asked.truth_street).mean())
+
+
+def best_variant(variants: Mapping[str, Variant]) -> str:
+    """The variant that answers the pairs kept aside best by K-NN (k = 5): chosen without a look at the tests."""
+    return max(
+        variants,
+        key=lambda name: street_accuracy(variants[name].asked["aside"].knn[PAPER_K], variants[name].asked["aside"]),
+    )
