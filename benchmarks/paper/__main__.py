@@ -6,6 +6,7 @@ the report from what is kept.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 from benchmarks.paper.data import PaperData, Size
@@ -15,6 +16,8 @@ from benchmarks.paper.methods import RUNS, Bench
 from benchmarks.paper.rows import METHODS, all_rows
 from benchmarks.paper.tables import write_page
 from benchmarks.report import REPORTS, ROOT, Report
+
+REDUCED, REDUCED_MINUTES = Size(frames=640, pairs=320, test_images=24), 0.1
 
 
 def kept_results(bench: Bench) -> dict[str, MethodResult]:
@@ -31,12 +34,17 @@ def kept_results(bench: Bench) -> dict[str, MethodResult]:
 def main() -> None:
     """Parse, run, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "paper", help="where data and runs are kept")
-    parser.add_argument("--out", type=Path, default=REPORTS, help="folder of the report")
+    parser.add_argument("--work", type=Path, help="where data and runs are kept: data/paper")
+    parser.add_argument("--out", type=Path, help="folder of the report: reports")
     parser.add_argument("--frames", type=int, default=Size.frames, help="LiDAR frames")
     parser.add_argument("--pairs", type=int, default=Size.pairs, help="RGB-D pairs to learn from")
     parser.add_argument("--test-images", type=int, help="for each split, instead of Table I's 626")
     parser.add_argument("--budget-minutes", type=float, default=60.0, help="of processor time, for each learned method")
+    parser.add_argument(
+        "--reduced",
+        action="store_true",
+        help="a little of everything, in minutes -> out/paper; shows that all runs, no more",
+    )
     parser.add_argument("--only", nargs="+", metavar="METHOD", help=f"of: {' '.join(RUNS)}")
     parser.add_argument("--tables", action="store_true", help="run nothing, write the report from what is kept")
     parser.add_argument("--anew", action="store_true", help="run methods again whose answers are kept; trainings go on")
@@ -44,11 +52,15 @@ def main() -> None:
     if unknown := set(arguments.only or ()) - set(RUNS):
         parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(RUNS)}")
     size = Size(arguments.frames, arguments.pairs, arguments.test_images)
-    bench = Bench(PaperData(arguments.work, size), 60 * arguments.budget_minutes)
-    command = "make paper"
-    if size != Size():
-        command += f' ARGS="--frames {size.frames} --pairs {size.pairs} --test-images {size.test_images}"'
-    report = Report("paper", command, folder=arguments.out)
+    work, out, minutes = ROOT / "data" / "paper", REPORTS, arguments.budget_minutes
+    if arguments.reduced:
+        size, minutes = REDUCED, REDUCED_MINUTES
+        work, out = ROOT / "data" / "paper-reduced", ROOT / "out" / "paper"
+    work, out = arguments.work or work, arguments.out or out
+    bench = Bench(PaperData(work, size), 60 * minutes)
+    report = Report(
+        "paper", "make paper" + (' ARGS="' + " ".join(sys.argv[1:]) + '"' if sys.argv[1:] else ""), folder=out
+    )
     wanted = [] if arguments.tables else arguments.only or list(RUNS)
     for name in wanted:
         if not arguments.anew and (bench.kept / f"{name}.done").exists():
@@ -62,11 +74,11 @@ def main() -> None:
     figures = all_rows(report, results, bench.data.tests, missing)
     report.notes["size"] = (
         f"{size.frames} LiDAR frames, {size.pairs} RGB-D pairs, {len(bench.data.tests['other_drive'])} test images a split; "
-        f"learned methods have up to {arguments.budget_minutes:g} minutes of processor time each."
+        f"learned methods have up to {minutes:g} minutes of processor time each."
     )
     print(f"written: {report.write()}")
-    pictures = draw_figures(arguments.out / "paper", bench.data, results)
-    print(f"written: {write_page(arguments.out / 'paper.md', bench.data, results, figures, pictures)}")
+    pictures = draw_figures(out / "paper", bench.data, results)
+    print(f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures)}")
 
 
 if __name__ == "__main__":
