@@ -50,7 +50,7 @@ class PaperData:
     def dataset(self) -> Dataset:
         """The dataset that pairs and tests come from, and whose survey makes our map."""
         tests = self.size.test_images
-        plan = pairs_plan(self.size.pairs, per_class=tests is None, test_images=tests or 1)
+        plan = pairs_plan(self.size.pairs, test_images=tests)
         folder = self.work / (f"dataset-{self.size.pairs}" + ("" if tests is None else f"-{tests}"))
         with bars() as report:
             simulate(plan, folder, report=report)

@@ -15,17 +15,17 @@ DENSEST_M = 0.5  # between scans of the survey at the paper's size
 TEST_TRAVERSAL, TRAINING_TRAVERSAL = 6, 20  # nothing else in the project drives these here
 
 
-def pairs_plan(pairs: int, *, per_class: bool = True, test_images: int = 64) -> SimulationPlan:
+def pairs_plan(pairs: int, *, test_images: int | None = None) -> SimulationPlan:
     """The paper's city with its training pairs and both tests.
 
     Args:
         pairs: to learn from.
-        per_class: Table I's 626 test images for each split; else ``test_images`` anywhere (reduced runs).
-        test_images: for each split.
+        test_images: for each split; None for Table I's 626.
     """
 
     def test(name: str, traversal: int, *, on_track: bool) -> QueryPlan:
-        return QueryPlan(name=name, traversal=traversal, on_track=on_track, per_class=per_class, count=test_images)
+        few = test_images or 64  # says nothing where Table I does
+        return QueryPlan(name=name, traversal=traversal, on_track=on_track, per_class=test_images is None, count=few)
 
     queries = (
         QueryPlan(name="own_drive", traversal=0, on_track=True, count=pairs // 2),
