@@ -15,6 +15,7 @@ from benchmarks.runs import Runs
 from benchmarks.serving.fire import overload_rows, sigterm_rows, soak_rows, swap_rows
 from benchmarks.serving.hostile import hostile_rows
 from benchmarks.serving.machines import LOADING_CORE, SERVED_CORE, pin
+from benchmarks.serving.peers.measure import PEERS, peer_rows
 from benchmarks.serving.ratios import Site, ratio_rows, tail_rows
 from benchmarks.serving.sizes import size_rows
 from model_training.stock import ENCODER
@@ -32,17 +33,6 @@ def site_from(arguments: argparse.Namespace) -> Site:
     return Site(runs.bundle(dataset).path, dataset.folder, arguments.queries, PAIRS)
 
 
-def peer_rows(report: Report) -> None:
-    """The same pipeline hosted by others: rows without a value until somebody measures them."""
-    why = "LitServe, BentoML, MLServer and Ray Serve have not been measured with this pipeline yet"
-    for row, bar in (
-        ("throughput_over_best.retrieval", 1.2),
-        ("throughput_over_best.full", 1.02),
-        ("p99_under_best", 1.0),
-    ):
-        report.row(f"peers.{row}", None, "ratio", bar=bar, better="lower" if "p99" in row else "higher", why=why)
-
-
 def main() -> None:
     """Parse, measure, write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -54,8 +44,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--soak-minutes", type=float, default=30.0)
     parser.add_argument(
-        "--only", nargs="+", help="parts: ratios tail overload swap sigterm sizes hostile both_cores soak"
+        "--only", nargs="+", help="parts: ratios tail overload swap sigterm sizes hostile both_cores peers soak"
     )
+    parser.add_argument("--peers", nargs="+", default=PEERS, choices=PEERS, help="who else hosts the pipeline")
     arguments = parser.parse_args()
     site = site_from(arguments)
     told = " ".join(sys.argv[1:])
@@ -79,7 +70,9 @@ def main() -> None:
         "sizes": lambda: size_rows(report, site, core=core),
         "hostile": lambda: hostile_rows(report, site, core=core),
         "both_cores": lambda: ratio_rows(report, site, seconds=seconds, rounds=1, core=None, suffix=".both_cores"),
-        "peers": lambda: peer_rows(report),
+        "peers": lambda: peer_rows(
+            report, site, seconds=seconds, rounds=arguments.rounds, core=core, names=arguments.peers
+        ),
         "soak": lambda: soak_rows(report, site, minutes=arguments.soak_minutes, core=core),
     }
     if unknown := set(arguments.only or ()) - set(parts):

@@ -4,6 +4,7 @@ import asyncio
 from dataclasses import replace
 
 from benchmarks.serving.machines import Server
+from benchmarks.serving.peers.hosts import Host
 from model_training.loadtest.drive import Load, Shot, drive
 from model_training.loadtest.payloads import Payload
 from model_training.loadtest.processes import Usage
@@ -13,8 +14,8 @@ from model_training.loadtest.targets import Grpc, Rest, Target
 WARM_UP_S = 2.0
 
 
-def load(server: Server, face: str, sent: list[Payload], how: Load) -> tuple[Summary, list[Shot]]:
-    """One run over ``rest`` or ``grpc``."""
+def load(server: Server | Host, face: str, sent: list[Payload], how: Load) -> tuple[Summary, list[Shot]]:
+    """One run over ``rest`` or ``grpc``; a peer has ``rest`` alone."""
     before: Usage | None = None
     after: Usage | None = None
 

@@ -51,7 +51,10 @@ class Rest:
 
     def __init__(self, url: str, *, key: str | None) -> None:
         own = httpx.URL(url).host in ("127.0.0.1", "localhost", "::1")
-        self._headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        # Nothing is gained by compressing a few kilobytes, and some servers do it wherever they may.
+        self._headers = {"Accept-Encoding": "identity"}
+        if key is not None:
+            self._headers["Authorization"] = f"Bearer {key}"
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=256)
         self._client = httpx.AsyncClient(base_url=url, limits=limits, trust_env=not own, headers=self._headers)
 

@@ -1,0 +1,142 @@
+"""A peer's server: a tree of processes on one core, and how it is started, asked, measured and stopped."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from benchmarks.report import ROOT
+from benchmarks.serving.machines import SERVED_CORE, pin
+from benchmarks.serving.peers.ports import free_port
+from benchmarks.serving.peers.venvs import PeerError
+from model_training.loadtest.payloads import Payload
+from model_training.loadtest.processes import Usage, descendants, usage
+
+START_S, STOP_S = 300.0, 30.0
+
+
+class Host:
+    """A running peer.
+
+    Args:
+        command: that listens on the port, which is put at its end.
+        first: what it is asked until it answers.
+        core: it is pinned to; None for all.
+        patience_s: with its start.
+
+    Raises:
+        PeerError: it ended, or did not answer in time.
+    """
+
+    def __init__(
+        self, command: list[str], first: Payload, *, core: int | None = SERVED_CORE, patience_s: float = START_S
+    ) -> None:
+        port = free_port()
+        self.url = f"http://127.0.0.1:{port}"
+        self._folder = Path(tempfile.mkdtemp(prefix="peer-"))  # some write where they are started
+        # The code of this checkout; what the peers' environments lack of it they do not import.
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "BENTOML_HOME": str(self._folder), "BENTOML_DO_NOT_TRACK": "True"}  # fmt: skip
+        with (self._folder / "log").open("wb") as log:
+            self.process = subprocess.Popen(
+                [*command, str(port)], cwd=self._folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                start_new_session=True,
+            )  # fmt: skip
+        pin(self.process.pid, core)
+        try:
+            self._wait(first, patience_s)
+        except BaseException:
+            self.stop()
+            raise
+
+    def __enter__(self) -> Self:
+        """It runs already."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop it."""
+        self.stop()
+
+    @property
+    def used(self) -> Usage:
+        """Processor time and memory of it and its children."""
+        return usage(self.process.pid)
+
+    def stop(self) -> None:
+        """End the tree: it is asked to, then what is left of it is killed."""
+        tree = {pid: _began(pid) for pid in descendants(self.process.pid)} if self.process.poll() is None else {}
+        if tree:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        for pid, began in tree.items():
+            if began is not None and _began(pid) == began:  # and not another that got its number
+                os.kill(pid, signal.SIGKILL)
+        deadline = time.monotonic() + STOP_S
+        while any(began is not None and _began(pid) == began for pid, began in tree.items()):
+            if time.monotonic() > deadline:
+                raise PeerError(f"its processes did not end: {sorted(tree)}")
+            time.sleep(0.01)
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _wait(self, first: Payload, patience_s: float) -> None:
+        deadline = time.monotonic() + patience_s
+        last = "nothing listens"
+        while time.monotonic() < deadline:
+            if self.process.poll() is not None:
+                raise PeerError(f"it ended with code {self.process.returncode}: {self._said()}")
+            try:
+                answered = httpx.post(
+                    f"{self.url}/v1/localize", content=first.body, headers={"Content-Type": first.content_type}, timeout=30
+                )  # fmt: skip
+            except httpx.TransportError as error:
+                last = type(error).__name__
+            else:
+                if answered.status_code == 200:
+                    return
+                last = f"{answered.status_code} {answered.text[:200]}"
+            time.sleep(0.2)
+        raise PeerError(f"no answer within {patience_s:.0f} s, the last was {last}: {self._said()}")
+
+    def _said(self) -> str:
+        """The end of its log, on one line."""
+        return " ".join((self._folder / "log").read_text(errors="replace").split())[-300:]
+
+
+def ask(url: str, payload: Payload) -> dict[str, Any]:
+    """The answer to one request.
+
+    Raises:
+        PeerError: there is none.
+    """
+    try:
+        answered = httpx.post(
+            f"{url}/v1/localize", content=payload.body, headers={"Content-Type": payload.content_type}, timeout=60
+        )
+    except httpx.TransportError as error:
+        raise PeerError(f"no answer: {type(error).__name__}") from error
+    if answered.status_code != 200:
+        raise PeerError(f"it answered {answered.status_code}: {answered.text[:200]}")
+    told: dict[str, Any] = json.loads(answered.content)
+    return told
+
+
+def _began(pid: int) -> str | None:
+    """When a process began, in the kernel's ticks; None where there is none, or it is only not yet waited for."""
+    try:
+        fields = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return None
+    return None if fields[0] == "Z" else fields[19]

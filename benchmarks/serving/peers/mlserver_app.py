@@ -1,0 +1,55 @@
+"""The pipeline in MLServer: ``python -m benchmarks.serving.peers.mlserver_app BUNDLE PORT``.
+
+``parallel_workers`` is 0, which runs models in the server's own process (docs.seldon.ai/mlserver/user-guide/parallel-inference): with one
+core a second process only adds copies. No batching, metrics, gzip or access log. A custom REST handler takes multipart, as JSON of the V2
+protocol would carry the pictures in base64; it runs in the event loop, as MLServer's own runtimes do without workers.
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+from benchmarks.serving.peers.pipeline import PATH, Pipeline  # first: it limits the pools
+from benchmarks.serving.peers.ports import free_port
+
+from fastapi import Request, Response  # isort: skip
+from mlserver import MLModel  # isort: skip
+from mlserver.handlers import custom_handler  # isort: skip
+
+
+class Localization(MLModel):
+    """Parts in, JSON out."""
+
+    async def load(self) -> bool:
+        """Open the map."""
+        self._pipeline = Pipeline(Path(self.settings.parameters.uri))
+        return True
+
+    @custom_handler(rest_path=PATH)
+    async def localize(self, request: Request) -> Response:
+        """Localize."""
+        async with request.form() as form:
+            parts = [await form[name].read() for name in ("rgb", "depth", "request")]
+        return Response(self._pipeline.answer(*parts), media_type="application/json")
+
+
+def main() -> None:
+    """Write the settings where it was started, and become ``mlserver start``."""
+    bundle, port = sys.argv[1:]
+    settings = {
+        "debug": False, "parallel_workers": 0, "host": "127.0.0.1", "http_port": int(port), "grpc_port": free_port(),
+        "metrics_endpoint": None, "gzip_enabled": False,
+    }  # fmt: skip
+    model = {
+        "name": "streetfix", "implementation": "benchmarks.serving.peers.mlserver_app.Localization",
+        "parameters": {"uri": bundle},
+    }  # fmt: skip
+    Path("settings.json").write_text(json.dumps(settings))
+    Path("model-settings.json").write_text(json.dumps(model))
+    command = Path(sys.executable).with_name("mlserver")
+    os.execv(sys.executable, [sys.executable, str(command), "start", "."])  # noqa: S606  # no shell
+
+
+if __name__ == "__main__":
+    main()

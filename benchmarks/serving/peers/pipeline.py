@@ -1,0 +1,50 @@
+"""What every peer hosts: the pipeline of ``benchmarks.serving.bare``, with the service's own reading of requests and writing of answers.
+
+It runs in a peer's environment, so it imports the core and the contract, and no face.
+"""
+
+from pathlib import Path
+
+from service.runtime.threads import limit_pools, limit_pools_before_import
+
+limit_pools_before_import()
+
+from service.contract.convert import answer_from, parsed, query_from  # noqa: E402  # after the pools' limits
+from service.contract.schema import LocalizeRequest  # noqa: E402  # after the pools' limits
+from service.imaging.decode import decode_depth, decode_rgb  # noqa: E402
+from service.localization.encoder import Encoder  # noqa: E402
+from service.localization.localizer import Localizer  # noqa: E402
+from service.localization.query import Query  # noqa: E402
+from service.maps.reader import MapBundle  # noqa: E402
+from service.runtime.engine import Located  # noqa: E402
+
+#: Where each peer listens, so that one load generator sends the same bytes to all.
+PATH = "/v1/localize"
+
+
+class Pipeline:
+    """An open map that answers.
+
+    Args:
+        bundle: the map.
+    """
+
+    def __init__(self, bundle: Path) -> None:
+        limit_pools()
+        self._bundle = MapBundle.open(bundle)
+        self._localizer = Localizer(self._bundle, Encoder.open(self._bundle.encoder_bytes()))
+
+    def answer(self, rgb: bytes, depth: bytes, request: LocalizeRequest | bytes) -> bytes:
+        """The JSON of REST's answer to the three parts of its body; the request may have been read already."""
+        read = parsed(request, LocalizeRequest) if isinstance(request, bytes) else request
+        asked = query_from(read, rgb=rgb, depth=depth)
+        depth_m = decode_depth(
+            depth, camera=asked.camera, encoding=asked.depth_encoding, scale_m=asked.scale_m, kind=asked.depth_kind,
+            baseline_m=asked.baseline_m, max_range_m=asked.max_range_m,
+        )  # fmt: skip
+        query = Query(
+            rgb=decode_rgb(rgb), depth_m=depth_m, camera=asked.camera, neighbours=asked.neighbours, refine=asked.refine,
+            baseline_m=asked.baseline_m,
+        )  # fmt: skip
+        answer = answer_from(Located(self._localizer.localize(query), self._bundle))
+        return answer.model_dump_json(by_alias=True).encode()

@@ -1,0 +1,72 @@
+"""A virtual environment for each peer, with the libraries of the pipeline at the versions that Streetfix itself runs with."""
+
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+from benchmarks.report import ROOT
+
+FOLDER = ROOT / "data" / "peers"
+#: What is installed, to the letter: the framework and what it serves with.
+REQUIREMENTS: dict[str, tuple[str, ...]] = {
+    "litserve": (
+        "litserve==0.2.19", "fastapi==0.165.0", "httptools==0.9.0", "python-multipart==0.0.34", "starlette==1.10.0", "uvicorn==0.54.0",
+        "uvloop==0.23.0",
+    ),
+    "bentoml": (
+        "bentoml==1.4.39", "httptools==0.9.0", "python-multipart==0.0.34", "starlette==1.10.0", "uvicorn==0.54.0", "uvloop==0.23.0",
+    ),
+    "mlserver": (
+        "mlserver==1.7.1", "fastapi==0.115.14", "httptools==0.9.0", "orjson==3.13.0", "python-multipart==0.0.34", "starlette==0.46.2",
+        "uvicorn==0.54.0", "uvloop==0.23.0",
+    ),
+    "ray": (
+        "ray[serve]==2.60.0", "fastapi==0.165.0", "httptools==0.9.0", "python-multipart==0.0.34", "starlette==1.10.0", "uvicorn==0.54.0",
+        "uvloop==0.23.0",
+    ),
+}  # fmt: skip
+#: What the pipeline and the contract import, at the versions that run here, or the comparison would be of these. Not all that
+#: Streetfix needs: its gRPC face wants a newer protobuf than MLServer.
+PIPELINE = (
+    "faiss-cpu", "isal", "jaxtyping", "numpy", "onnxruntime", "opencv-python-headless", "prometheus-client", "pydantic",
+    "pydantic-settings", "zstandard",
+)  # fmt: skip
+
+
+class PeerError(Exception):
+    """A peer could not be installed, started or asked; says why, for the report."""
+
+
+def python_of(name: str, folder: Path = FOLDER) -> Path:
+    """The interpreter of a peer's environment, which is made where it is not as the table says.
+
+    Raises:
+        PeerError: it cannot be installed.
+    """
+    place = folder / name
+    python, stamp = place / "bin" / "python", place / "installed.txt"
+    pinned = [f"{each}=={version(each)}" for each in PIPELINE]
+    wanted = "\n".join([sys.version, *REQUIREMENTS[name], *pinned]) + "\n"
+    if not stamp.exists() or stamp.read_text() != wanted:
+        # Streetfix is not installed: a peer runs the code of this checkout, by PYTHONPATH, and needs what that imports.
+        uv("venv", "--clear", "--python", sys.executable, str(place))
+        uv("pip", "install", "--compile-bytecode", "--python", str(python), *REQUIREMENTS[name], *pinned)
+        stamp.write_text(wanted)
+    return python
+
+
+def uv(*arguments: str) -> None:
+    """Run it.
+
+    Raises:
+        PeerError: it failed; with the last line that it said.
+    """
+    command = [str(Path(sys.executable).with_name("uv")), *arguments, "--quiet"]
+    try:
+        subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    except FileNotFoundError as error:
+        raise PeerError(f"there is no {command[0]}; `make .venv/.uv` installs it") from error
+    except subprocess.CalledProcessError as error:
+        said = " ".join(error.stderr.split())[-300:]
+        raise PeerError(f"uv {arguments[0]} failed: {said}") from error
