@@ -35,19 +35,22 @@ class ContextSettings:
     Chosen on a simulated city of 300 x 300 m (seed 2001, 1,868 places), shares of 150 pictures on the survey's track, and of
     150 of another drive, whose nearest place lies within 5 m:
 
-    ====================================================  ===========  ===========
-    settings                                              on track     other drive
-    ====================================================  ===========  ===========
-    20 rings, 60 sectors (the publication's), floor 0     0.953        0.613
-    the same, of all that the camera sees                 0.753        0.433
-    the same, mean height                                 0.867        0.467
-    the same, floor 0.3 m; floor 1 m; reach 30 m          0.973 0.973 0.887  0.607 0.607 0.507
-    20 x 90; 20 x 120; 20 x 180                           0.973 0.980 0.987  0.680 0.713 0.793
-    40 x 60; 40 x 120; 40 x 120, floor 0.5 m              0.967 0.980 0.987  0.627 0.753 0.747
-    **40 x 180, floor 0.3 m**                             **1.000**    **0.800**
-    60 x 180; 30 x 240, floor 0.3 m                       1.000 0.993  0.773 0.800
-    40 x 180, floor 0.3 m, mean height                    0.987        0.780
-    ====================================================  ===========  ===========
+    ==================================================  =========  ===========
+    rings x sectors, floor, height; all else as below   on track   other drive
+    ==================================================  =========  ===========
+    20 x 60 (the publication's), 0 m, highest           0.953      0.613
+    the same, of all that the camera sees               0.753      0.433
+    the same, reach 30 m                                0.887      0.507
+    20 x 60, 0 m, mean                                  0.867      0.467
+    20 x 60, 0.3 m, highest                             0.973      0.607
+    20 x 120, 0 m, highest                              0.980      0.713
+    20 x 180, 0 m, highest                              0.987      0.793
+    40 x 120, 0 m, highest                              0.980      0.753
+    **40 x 180, 0.3 m, highest**                        **1.000**  **0.800**
+    40 x 180, 0.3 m, mean                               0.987      0.780
+    60 x 180, 0.3 m, highest                            1.000      0.773
+    30 x 240, 0.3 m, highest                            0.993      0.800
+    ==================================================  =========  ===========
     """
 
     rings: int = 40
