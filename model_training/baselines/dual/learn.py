@@ -140,25 +140,25 @@ def _learn(lesson: Lesson, settings: LearnSettings, folder: Path, budget_s: floa
     if state is not None:
         towers.load_state_dict(state["towers"])
         optimiser.load_state_dict(state["optimiser"])
-    images, losses = training.images, []
-    for planes, xy, views, views_xy in lesson.batches(settings, np.random.default_rng([settings.seed, 2, images])):
+    images, losses = training.images, list[float]()
+
+    def point() -> None:
+        state = {"towers": towers.state_dict(), "optimiser": optimiser.state_dict()}
+        training.point(images, float(np.mean(losses)), watch_score(towers, lesson), state)
+        losses.clear()
+
+    for batch in lesson.batches(settings, np.random.default_rng([settings.seed, 2, images])):
         if training.ended is not None:
             break
         for group in optimiser.param_groups:
             group["lr"] = settings.learning_rate * rate_at(training.share_spent, settings.warm_up_share)
-        loss = step(towers.train(), optimiser, (planes, xy, views, views_xy), settings)
-        images += 2 * len(planes)
-        losses.append(loss)
+        losses.append(step(towers.train(), optimiser, batch, settings))
+        images += 2 * len(batch[0])
         report(settings.kind, round(1000 * training.share_spent), 1000)
         if training.share_spent >= _next_point(training, settings, budget_s):
-            score = watch_score(towers, lesson)
-            training.point(
-                images,
-                float(np.mean(losses)),
-                score,
-                {"towers": towers.state_dict(), "optimiser": optimiser.state_dict()},
-            )
-            losses = []
+            point()
+    if losses:  # since the last point, where the budget ended while a batch was drawn
+        point()
     return training
 
 

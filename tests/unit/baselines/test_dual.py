@@ -236,6 +236,15 @@ def test_a_stopped_training_goes_on_and_answers(kind, street_frames, street_pair
     assert len([json.loads(line) for line in more.curve.read_text().splitlines()]) >= 2
 
 
+def test_what_was_learnt_since_the_last_point_is_kept_at_the_end(lesson_of, tmp_path, monkeypatch):
+    due = {0: 0.0}  # the first at once, no other before the end
+    monkeypatch.setattr("model_training.baselines.dual.learn._next_point", lambda run, *_: due.get(len(run.curve), 2.0))
+    settings = LearnSettings("dual", **TINY)
+    training = learn(lesson_of("dual", settings), settings, tmp_path, budget_s=0.1, report=lambda *_: None)
+    assert len(training.curve) == 2
+    assert training.curve[1].images > training.curve[0].images
+
+
 def test_a_folder_of_other_settings_is_refused(lesson_of, tmp_path):
     settings = LearnSettings("dual", **TINY)
     lesson = lesson_of("dual", settings, places=40)
