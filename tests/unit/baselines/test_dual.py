@@ -240,7 +240,7 @@ def test_what_was_learnt_since_the_last_point_is_kept_at_the_end(lesson_of, tmp_
     due = {0: 0.0}  # the first at once, no other before the end
     monkeypatch.setattr("model_training.baselines.dual.learn._next_point", lambda run, *_: due.get(len(run.curve), 2.0))
     settings = LearnSettings("dual", **TINY)
-    training = learn(lesson_of("dual", settings), settings, tmp_path, budget_s=0.1, report=lambda *_: None)
+    training = learn(lesson_of("dual", settings), settings, tmp_path, budget_s=1.0, report=lambda *_: None)
     assert len(training.curve) == 2
     assert training.curve[1].images > training.curve[0].images
 
