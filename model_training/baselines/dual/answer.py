@@ -9,7 +9,7 @@ import torch
 
 from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.dual.encode import encoded_pictures, encoded_places
-from model_training.baselines.dual.learn import Kind, LearnSettings, Lesson, learn, size_of, towers_of, views_of
+from model_training.baselines.dual.learn import BEST, Kind, LearnSettings, Lesson, learn, size_of, towers_of, views_of
 from model_training.baselines.dual.lidar_views import LidarViews
 from model_training.baselines.dual.pictures import Sweeps, pictures_of
 from model_training.baselines.dual.towers import Towers
@@ -43,14 +43,15 @@ def run(
         tests: by name; of the pairs' camera.
         work: folder of the training.
         kind: ``dual`` sees whole panoramas, ``fov`` what a camera would see of them, at 24 headings a place.
-        budget_s: processor seconds of all threads for the training, those of earlier sessions included.
+        budget_s: processor seconds of the process for the training, those of earlier sessions included; so two trainings need
+            two processes.
         report: told of the training (per mille of its budget) and of places encoded.
         settings: of the training; the best known by default.
 
     Raises:
         DatasetError: ``work`` is of other settings, or no pair was taken near a frame.
     """
-    settings = settings or LearnSettings(kind)
+    settings = settings or BEST[kind]
     grid, size = ViewGrid(), size_of(kind)
     pictures = pictures_of(pairs, size)
     views = views_of(kind, pictures.camera, grid)
