@@ -11,10 +11,14 @@ import numpy as np
 from benchmarks.paper.data import PaperData, test_set
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.paper.ours import bundle_of, streetfix, streetfix_stock
+from model_training.baselines import dual
 from model_training.baselines.answers import PlaceAnswers
+from model_training.baselines.dual.learn import Kind
+from model_training.baselines.learning import read_curve
 from model_training.baselines.paper.knn import KS, PAPER_K
 from model_training.baselines.paper.variants import PLANS, Asked, Variant, run_variant, street_accuracy
 from model_training.baselines.raw_range import raw_best_views
+from model_training.baselines.scan_context import locate
 from model_training.cli.progress import bars
 from model_training.evaluation.error_measures import distance_errors
 from model_training.stock import ENCODER
@@ -93,11 +97,33 @@ def raw_range(bench: Bench) -> list[MethodResult]:
     return [MethodResult("raw_range", answers, extra={"setting": best, "training_drive_mean_m": errors})]
 
 
+def scan_context(bench: Bench) -> list[MethodResult]:
+    """Scan Context; its settings come from another city."""
+    answers = {}
+    for split, test in bench.data.tests.items():
+        with bars() as report:
+            answers[split] = locate(bench.data.frames, test, report=report)
+    return [MethodResult("scan_context", answers)]
+
+
+def dual_encoder(bench: Bench, kind: Kind) -> list[MethodResult]:
+    """Two towers, without view alignment (``dual``) or behind the camera's field of view (``fov``)."""
+    data, folder = bench.data, bench.data.work / "runs" / kind
+    with bars() as report:
+        found = dual.run(data.frames, data.pairs, data.tests, folder, kind=kind, budget_s=bench.budget_s, report=report)
+    shown = data.size.frames + data.size.pairs
+    curve = read_curve(found.curve)
+    return [MethodResult(f"{kind}_encoder", found.answers, found.processor_s, found.images, shown, "budget", curve)]
+
+
 Method = Callable[[Bench], list[MethodResult]]
 #: By name, in the order in which they are run: those that take least first.
 RUNS: dict[str, Method] = {
     "streetfix": lambda bench: [streetfix(bench.data)],
     "streetfix_stock": lambda bench: [streetfix_stock(bench.data)],
     "raw_range": raw_range,
+    "scan_context": scan_context,
+    "dual": partial(dual_encoder, kind="dual"),
+    "fov": partial(dual_encoder, kind="fov"),
 }
 RUNS |= {f"cnn_{name}": partial(paper_variant, name=name) for name in PLANS}

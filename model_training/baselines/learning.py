@@ -6,7 +6,8 @@ method is given.
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from typing import Any
 import torch
 
 from service.errors import DatasetError
+
+
+CURVE = "curve.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +31,17 @@ class CurvePoint:
     processor_s: float
     loss: float
     score: float
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch with one thread: two spend more processor time on waiting for each other than they save."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class Training:
@@ -46,7 +61,7 @@ class Training:
         if kept.exists() and kept.read_text() != text:
             raise DatasetError(f"{kept} is of other settings; remove {folder} to train anew", field="settings")
         kept.write_text(text)
-        self.curve = self._read_curve()
+        self.curve = read_curve(folder / CURVE)
         self._spent_before = self.curve[-1].processor_s if self.curve else 0.0
         self._began = time.process_time()
 
@@ -68,9 +83,7 @@ class Training:
     @property
     def ended(self) -> str | None:
         """Why there is nothing more to do: the budget is spent, or the score stopped gaining; None to go on."""
-        if self.curve and self._spent_before >= self._budget_s:
-            return "budget"
-        if self.curve and self.processor_s >= self._budget_s:
+        if self.processor_s >= self._budget_s:
             return "budget"
         scores = [point.score for point in self.curve]
         if len(scores) > self._patience and max(scores[-self._patience :]) <= max(scores[: -self._patience]):
@@ -88,7 +101,7 @@ class Training:
         self.curve.append(point)
         part = self.folder / "curve.part"
         part.write_text("".join(json.dumps(asdict(each)) + "\n" for each in self.curve))
-        part.rename(self.folder / "curve.jsonl")
+        part.rename(self.folder / CURVE)
         return point
 
     def checkpoint(self) -> dict[str, Any] | None:
@@ -113,11 +126,12 @@ class Training:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         return state
 
-    def _read_curve(self) -> list[CurvePoint]:
-        path = self.folder / "curve.jsonl"
-        if not path.exists():
-            return []
-        return [CurvePoint(**json.loads(line)) for line in path.read_text().splitlines()]
+
+def read_curve(path: Path) -> list[CurvePoint]:
+    """The points of a run; none where it has not begun."""
+    if not path.exists():
+        return []
+    return [CurvePoint(**json.loads(line)) for line in path.read_text().splitlines()]
 
 
 Report = Callable[[str, int, int], None]  # stage, done, of; here: a method, and per mille of its budget

@@ -17,7 +17,7 @@ from model_training.baselines.dual.pairing import frames_near, watched
 from model_training.baselines.dual.pictures import CAMERA_PLANES, FIELD, LIDAR_PLANES, WHOLE, Pictures, Sweeps
 from model_training.baselines.dual.towers import Tower, Towers
 from model_training.baselines.gallery import thinned
-from model_training.baselines.learning import Report, Training
+from model_training.baselines.learning import Report, Training, one_thread
 from model_training.training.losses import Side, paired_info_nce
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
@@ -140,14 +140,10 @@ def learn(lesson: Lesson, settings: LearnSettings, folder: Path, *, budget_s: fl
     """Train until the budget is spent, or go on with what a stopped run left; Ctrl-C loses what came after the last point.
 
     The learning rate rises, then falls to nothing along a cosine over the budget, so the run is not stopped for a score that
-    rests on a plateau. One thread: two of them spend more processor time on waiting for each other than they save.
+    rests on a plateau.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         return _learn(lesson, settings, folder, budget_s, report)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _learn(lesson: Lesson, settings: LearnSettings, folder: Path, budget_s: float, report: Report) -> Training:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from model_training.baselines.learning import Report, Training
+from model_training.baselines.learning import Report, Training, one_thread
 from model_training.baselines.paper.cnn import PaperCnn
 from model_training.baselines.paper.pictures import LidarPictures, Pictures, Space, fused_pictures
 from model_training.baselines.paper_data.frames import Frames
@@ -103,11 +103,24 @@ class CnnTrainer:
 
     def run(self, name: str, report: Report = lambda *_: None) -> PaperCnn:
         """Train to the end and give the network back: the last one as in the paper, else the best one."""
-        learnt = self._learnt
-        batch = -(-len(learnt) // ITERATIONS_AN_EPOCH) if self.plan.as_paper else self.plan.batch
+        with one_thread():
+            self._train(name, report)
+        if not self.plan.as_paper:
+            self.net.load_state_dict(self.training.best()["net"])
+        trained: PaperCnn = self.net.eval()
+        return trained
+
+    def _train(self, name: str, report: Report) -> None:
+        batch = -(-len(self._learnt) // ITERATIONS_AN_EPOCH) if self.plan.as_paper else self.plan.batch
         most = self.iterations * batch if self.plan.as_paper else None
-        every = batch * (ITERATIONS_AN_EPOCH // 3) if self.plan.as_paper else max(batch, len(learnt) // 4)
-        images, losses = self.training.images, []
+        every = batch * max(1, ITERATIONS_AN_EPOCH // 3) if self.plan.as_paper else max(batch, len(self._learnt) // 4)
+        images, losses = self.training.images, list[float]()
+
+        def point() -> None:
+            state = {"net": self.net.state_dict(), "optimiser": self._optimiser.state_dict()}
+            self.training.point(images, float(np.mean(losses)), self._watched_accuracy(), state)
+            losses.clear()
+
         while not self._done(images, most):
             if not self.plan.as_paper:
                 share = self.training.share_spent
@@ -115,17 +128,12 @@ class CnnTrainer:
                     group["lr"] = self.plan.rate * (0.5 * (1 + np.cos(np.pi * share)) + 0.01)
             losses.append(self._step(batch))
             images += batch
-            if images // every > (images - batch) // every:
-                score = self._watched_accuracy()
-                state = {"net": self.net.state_dict(), "optimiser": self._optimiser.state_dict()}
-                self.training.point(images, float(np.mean(losses)), score, state)
-                losses = []
             spent = images / most if most else self.training.share_spent
             report(name, round(1000 * spent), 1000)
-        if not self.plan.as_paper:
-            self.net.load_state_dict(self.training.best()["net"])
-        trained: PaperCnn = self.net.eval()
-        return trained
+            if images // every > (images - batch) // every:
+                point()
+        if losses:  # since the last point, where the budget ended between two
+            point()
 
     @property
     def iterations(self) -> int:
