@@ -16,7 +16,6 @@ import torch
 
 from service.errors import DatasetError
 
-
 CURVE = "curve.jsonl"
 
 
