@@ -12,6 +12,9 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import inverse, transform_points
 
 REACH_M = 30.0  # of depth and of the map about a pose; PointNetLK's unit of length
+HIDING_CELLS = 28  # of the picture, a side; some points of the map fall into each
+HIDDEN_BEHIND = 1.3  # times the nearest z of its cell, and a metre: ground runs away within a cell
+MAP_EVERY = 3  # of the map's points in view one is compared: some thousands are left, of which hundreds are drawn
 STRIDE = 3  # of the depth picture's pixels
 CELL_M = 0.4  # one point in so large a cell, so that what is near does not outweigh the rest
 FEWEST = 50  # points of a cloud that is worth comparing
@@ -36,13 +39,21 @@ def thinned(points: PointsF64) -> PointsF64:
 
 
 def map_points_in_view(cloud: MapCloud, T_map_camera: NDArray[np.float64], camera: PinholeCamera) -> PointsF64:
-    """The map within the camera's reach and field of view; also what stands behind something else."""
-    points = transform_points(inverse(T_map_camera), cloud.around(T_map_camera[:3, 3], REACH_M))
+    """What the map shows from a pose: its points within the camera's reach and field of view that nothing stands before."""
+    points = transform_points(inverse(T_map_camera), cloud.around(T_map_camera[:3, 3], REACH_M, every=MAP_EVERY))
     ahead = points[points[:, 2] > 0.5]
-    u = camera.fx * ahead[:, 0] / ahead[:, 2] + camera.cx
-    v = camera.fy * ahead[:, 1] / ahead[:, 2] + camera.cy
-    inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
-    return thinned(ahead[inside])
+    u = np.floor((camera.fx * ahead[:, 0] / ahead[:, 2] + camera.cx + 0.5) / (camera.width / HIDING_CELLS)).astype(
+        np.int64
+    )
+    v = np.floor((camera.fy * ahead[:, 1] / ahead[:, 2] + camera.cy + 0.5) / (camera.height / HIDING_CELLS)).astype(
+        np.int64
+    )
+    inside = (u >= 0) & (u < HIDING_CELLS) & (v >= 0) & (v < HIDING_CELLS)
+    ahead, cell = ahead[inside], (v * HIDING_CELLS + u)[inside]
+    nearest_m = np.full(HIDING_CELLS**2, np.inf)
+    np.minimum.at(nearest_m, cell, ahead[:, 2])
+    seen: PointsF64 = ahead[ahead[:, 2] <= HIDDEN_BEHIND * nearest_m[cell] + 1.0]
+    return seen
 
 
 def sampled(points: PointsF64, count: int, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -1,6 +1,6 @@
 """The map as points: the survey's scans in one cloud, thinned, for registration."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,29 +27,28 @@ class MapCloud:
     """``points_map`` (n, 3): means of the voxels, metres, map frame."""
 
     points_map: PointsF64
-    _tiles: dict[tuple[int, int], NDArray[np.int64]] = field(init=False, default_factory=dict, repr=False)
 
-    def __post_init__(self) -> None:
-        if not len(self.points_map):
-            return
-        cell = np.floor(self.points_map[:, :2] / TILE_M).astype(np.int64)
-        order = np.lexsort((cell[:, 1], cell[:, 0]))
-        starts = np.flatnonzero(np.r_[True, (np.diff(cell[order], axis=0) != 0).any(axis=1)])
-        for rows in np.split(order, starts[1:]):
-            x, y = cell[rows[0]]
-            self._tiles[int(x), int(y)] = rows
-
-    def around(self, xyz: NDArray[np.float64], reach_m: float) -> PointsF64:
-        """Points in a ball about a position (3)."""
+    def around(self, xyz: NDArray[np.float64], reach_m: float, *, every: int = 1) -> PointsF64:
+        """Points in a ball about a position (3): each tile's ``every``-th, so that the whole is thinned evenly."""
         low = np.floor((xyz[:2] - reach_m) / TILE_M).astype(int)
         high = np.floor((xyz[:2] + reach_m) / TILE_M).astype(int)
-        rows = [self._tiles[x, y] for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1)
-                if (x, y) in self._tiles]  # fmt: skip
-        if not rows:
-            return np.zeros((0, 3))
-        near = self.points_map[np.concatenate(rows)]
+        tiles = [(x, y) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1)]
+        near = np.concatenate(
+            [np.zeros((0, 3)), *(self._tiles[each][::every] for each in tiles if each in self._tiles)]
+        )
         inside: PointsF64 = near[((near - xyz) ** 2).sum(axis=1) < reach_m**2]
         return inside
+
+    @cached_property
+    def _tiles(self) -> dict[tuple[int, int], PointsF64]:
+        """The points of each square of ground, in no order."""
+        shuffled = np.random.default_rng(0).permutation(self.points_map)
+        cell = np.floor(shuffled[:, :2] / TILE_M).astype(np.int64)
+        order = np.lexsort((cell[:, 1], cell[:, 0]))
+        cell, ordered = cell[order], shuffled[order]
+        starts = np.flatnonzero((np.diff(cell, axis=0) != 0).any(axis=1)) + 1
+        return {(int(xy[0, 0]), int(xy[0, 1])): points
+                for xy, points in zip(np.split(cell, starts), np.split(ordered, starts), strict=True) if len(points)}  # fmt: skip
 
     @cached_property
     def target(self) -> tuple[Any, Any]:

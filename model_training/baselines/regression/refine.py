@@ -1,7 +1,7 @@
 """Registration of a query whose pose a network has guessed: PointNetLK, then ICP, against the map cloud.
 
-Either keeps the estimate before it where it cannot register: too few points, no convergence, too few inliers, or further away than
-it can have seen.
+Either keeps the estimate before it where it cannot register: too few points, no convergence, too few inliers, fewer points on the
+map than before, or further away than it can have seen.
 """
 
 from dataclasses import dataclass
@@ -15,10 +15,11 @@ from model_training.baselines.regression.lucas_kanade import aligned
 from model_training.baselines.regression.map_cloud import MapCloud, small_gicp_package
 from model_training.baselines.regression.pointnet import PointNet
 from service.geometry.camera import PinholeCamera
-from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw
+from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_points
 
 LK_POINTS, LK_ITERATIONS = 1024, 20
 LK_MOST_M = 15.0
+NEAR_M = 1.0
 #: Point to plane: the map's points are means of voxels and no point that the camera measured, but they lie on its surfaces.
 ICP_KIND = "PLANE_ICP"
 ICP_REACHES_M = (4.0, 1.0)  # how far a point's partner may be, coarse then fine
@@ -41,7 +42,11 @@ class Refined:
 def by_pointnet_lk(
     net: PointNet, cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform, camera: PinholeCamera
 ) -> Refined:  # fmt: skip
-    """Align a query's points (n, 3) to what the map shows from its estimated pose."""
+    """Align a query's points (n, 3) to what the map shows from its estimated pose.
+
+    Raises:
+        ExtraMissingError: small_gicp is not installed.
+    """
     shown = map_points_in_view(cloud, T_map_camera, camera)
     if min(len(shown), len(points_camera)) < FEWEST:
         return Refined(T_map_camera, registered=False)
@@ -54,7 +59,17 @@ def by_pointnet_lk(
     T_estimate_camera[:3, 3] *= REACH_M
     if not nearer or not np.linalg.norm(T_estimate_camera[:3, 3]) <= LK_MOST_M:
         return Refined(T_map_camera, registered=False)
-    return Refined(_rigid(T_map_camera @ T_estimate_camera), registered=True)
+    T_found = _rigid(T_map_camera @ T_estimate_camera)
+    if share_on_map(cloud, points_camera, T_found) < share_on_map(cloud, points_camera, T_map_camera):
+        return Refined(T_map_camera, registered=False)
+    return Refined(T_found, registered=True)
+
+
+def share_on_map(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -> float:
+    """Share of a query's points (n, 3) that have a point of the map within a metre."""
+    _, tree = cloud.target
+    _, squares = tree.batch_nearest_neighbor_search(transform_points(T_map_camera, points_camera), num_threads=1)
+    return float(np.mean(np.asarray(squares) < NEAR_M**2))
 
 
 def by_icp(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -> Refined:

@@ -17,6 +17,6 @@ def cosine(rate: float, share_spent: float) -> float:
 
 
 def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
-    """Give all groups the rate."""
+    """Give all groups the rate, a group's ``times`` over where it has such a factor."""
     for group in optimiser.param_groups:
-        group["lr"] = rate
+        group["lr"] = rate * group.get("times", 1.0)

@@ -34,9 +34,9 @@ class LkSettings:
     """Everything that decides what a run learns; metres, rad."""
 
     batch: int = 16
-    points: int = 384
+    points: int = 256
     iterations: int = 5
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     gradient_norm: float = 1.0
     level_m: float = 3.0  # standard deviations of a wrong pose: along the ground,
     height_m: float = 0.3

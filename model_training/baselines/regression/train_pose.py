@@ -115,7 +115,10 @@ class _Learner:
         # Channels last: 28.7 against 20.6 pictures a second.
         self._net = GoogLeNet(dropout=settings.dropout).to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
         self._loss = PoseLoss()
-        groups = [{"params": self._net.parameters()}, {"params": self._loss.parameters(), "weight_decay": 0.0}]
+        # The variances have a way to go, from a city's width to a street's, and Adam's steps are of the rate's size.
+        groups = [
+            {"params": self._net.parameters()}, {"params": self._loss.parameters(), "weight_decay": 0.0, "times": 10.0}
+        ]  # fmt: skip
         self._optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay)
 
     def draw(self, shown: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ from model_training.baselines.regression.clouds import depth_points, map_points_
 from model_training.baselines.regression.lucas_kanade import transform_of
 from model_training.baselines.regression.map_cloud import MapCloud, make_map_cloud
 from model_training.baselines.regression.pointnet import PointNet
-from model_training.baselines.regression.refine import by_icp, by_pointnet_lk
+from model_training.baselines.regression.refine import by_icp, by_pointnet_lk, share_on_map
 from service.errors import ExtraMissingError
 from service.geometry.rigid import inverse, transform_points
 
@@ -44,6 +44,15 @@ def test_a_camera_is_shown_what_lies_before_it(query, hall):
     assert len(seen) > 200
     assert (np.abs(seen[:, 0]) <= seen[:, 2] * 1.01).all()
     assert (np.linalg.norm(seen, axis=1) < 30.0).all()
+
+
+def test_what_stands_behind_a_wall_is_not_shown(query, hall):
+    _, T_map_camera, camera = query
+    behind = transform_points(T_map_camera, np.random.default_rng(0).uniform([-2, -1, 20], [2, 1, 25], (300, 3)))
+    wall = transform_points(T_map_camera, np.random.default_rng(1).uniform([-3, -3, 10], [3, 3, 10.1], (5000, 3)))
+    seen = map_points_in_view(MapCloud(np.r_[behind, wall]), T_map_camera, camera)
+    assert len(seen) > 1000
+    assert (seen[:, 2] < 11).all()
 
 
 def test_points_around_are_those_of_a_slow_search(hall):
@@ -88,9 +97,25 @@ def test_pointnet_lk_brings_the_points_onto_what_the_map_shows(query, net, monke
     wrong = off_by(T_map_camera, 0.4, 0.0, 0.4, 0.0, 0.03, 0.0)
     shown = transform_points(inverse(wrong) @ T_map_camera, points)
     monkeypatch.setattr(refine, "map_points_in_view", lambda *_: shown)
-    found = by_pointnet_lk(net, MapCloud(shown), points, wrong, camera)
+    found = by_pointnet_lk(net, MapCloud(transform_points(T_map_camera, points)), points, wrong, camera)
     assert found.registered
     np.testing.assert_allclose(found.T_map_camera[:3, 3], T_map_camera[:3, 3], atol=0.1)
+
+
+def test_pointnet_lk_keeps_the_pose_where_its_own_fits_the_map_worse(query, hall, net, monkeypatch):
+    """What the map shows is said to lie 3 m ahead of where it lies."""
+    points, T_map_camera, camera = query
+    points = points[:: len(points) // refine.LK_POINTS][: refine.LK_POINTS]
+    monkeypatch.setattr(refine, "map_points_in_view", lambda *_: points + [0.0, 0.0, 3.0])
+    found = by_pointnet_lk(net, hall, points, T_map_camera, camera)
+    assert not found.registered
+    np.testing.assert_array_equal(found.T_map_camera, T_map_camera)
+
+
+def test_points_on_the_map_are_counted_within_a_metre(query):
+    points, T_map_camera, _ = query
+    own = MapCloud(transform_points(T_map_camera, points))
+    assert share_on_map(own, np.r_[points, points + 500.0], T_map_camera) == 0.5
 
 
 def test_pointnet_lk_keeps_the_pose_where_the_map_shows_nothing(query, hall, net):
