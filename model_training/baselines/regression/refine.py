@@ -2,6 +2,7 @@
 
 Either keeps the estimate before it where it cannot register: too few points, no convergence, too few inliers, fewer points on the
 map than before, or further away than it can have seen.
+ICP's reaches are no matter of much: (8, 2.5, 1) and (15, 5, 1) m found no more of poses 3, 8 and 15 m off (2026-11-22).
 """
 
 from dataclasses import dataclass

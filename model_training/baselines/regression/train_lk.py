@@ -1,7 +1,8 @@
 """Training of PointNetLK: depth against the map, from poses that are off by a known motion.
 
 Published: ModelNet's objects, after learning to tell their classes. Here: the depth of the training pairs, simulated as a
-LiDAR's points are, against the crop of the map that a wrong pose shows, from the beginning.
+LiDAR's points are, against the crop of the map that a wrong pose shows, from the beginning. Of two learning rates the larger
+gained more in 130 s of processor time (median error 4.0 against 4.4 m, 2026-11-22).
 """
 
 import json
