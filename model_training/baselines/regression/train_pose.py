@@ -1,9 +1,10 @@
 """Training of GoogLeNet on RGB-D pairs.
 
 [31] trained for 4,200 minutes; here it is trained from scratch on the paper's 7,600 pairs, for what a budget gives. The settings
-are those that gained most in 180 s of processor time each (2026-11-22, median error of the pairs kept back; the city's middle is
-131 m off): pictures of 64 x 64 84 m, of 96 x 96 103 m, since 62 or 32 pictures a second are learnt from (112 x 112: 24); twice the
-learning rate 100 m; the variances of the loss at the network's own rate, not ten times it, 95 m with 64 and 118 m with 112.
+are those that gained most in 180 s of processor time, one run each (2026-11-22, median error of the pairs kept back; the city's
+middle is 131 m off): pictures of 64 x 64 84 m, of 96 x 96 103 m, since 62 or 32 pictures a second are learnt from (112 x 112: 24);
+twice the learning rate 100 m; the variances of the loss at the network's own rate, not ten times it, 95 m with 64 x 64 and 118 m
+with 112 x 112. So short a run favours small pictures; longer ones were not tried.
 """
 
 import json
