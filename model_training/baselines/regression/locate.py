@@ -1,0 +1,76 @@
+"""The whole of [31], stage by stage: GoogLeNet's pose, PointNetLK's, ICP's."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.baselines.answers import PlaceAnswers, nearest_streets
+from model_training.baselines.learning import Report
+from model_training.baselines.paper_data.pairs import Pairs
+from model_training.baselines.regression.clouds import depth_points
+from model_training.baselines.regression.map_cloud import MapCloud
+from model_training.baselines.regression.pointnet import PointNet
+from model_training.baselines.regression.refine import by_icp, by_pointnet_lk
+from model_training.baselines.regression.threads import one_thread
+from model_training.baselines.regression.train_pose import PoseRegressor
+from service.maps.streets import Streets
+
+#: Each goes on from the one before it; the last is the method.
+STAGES = ("googlenet", "googlenet_pointnetlk", "icp_pointnetlk_googlenet")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageAnswers:
+    """``places``; ``T_map_camera`` (n, 4, 4); ``registered`` (n): the stage's own answer, not the one of the stage before it."""
+
+    places: PlaceAnswers
+    T_map_camera: NDArray[np.float64]
+    registered: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Method:
+    """What is needed to locate."""
+
+    regressor: PoseRegressor
+    net: PointNet
+    cloud: MapCloud
+    streets: Streets
+
+
+def locate(method: Method, pairs: Pairs, *, report: Report = lambda *_: None) -> PlaceAnswers:
+    """Where each pair was taken, after all stages.
+
+    Raises:
+        ExtraMissingError: small_gicp is not installed.
+    """
+    return locate_by_stage(method, pairs, report=report)[STAGES[-1]].places
+
+
+def locate_by_stage(method: Method, pairs: Pairs, *, report: Report = lambda *_: None) -> Mapping[str, StageAnswers]:
+    """The same with what each of ``STAGES`` answered.
+
+    Raises:
+        ExtraMissingError: small_gicp is not installed.
+    """
+    with one_thread():
+        guessed = method.regressor.poses(pairs)
+        after_lk, after_icp = guessed.copy(), guessed.copy()
+        by_lk, by_last = np.zeros(len(pairs), np.bool_), np.zeros(len(pairs), np.bool_)
+        for row in range(len(pairs)):
+            points = depth_points(pairs, row)
+            first = by_pointnet_lk(method.net, method.cloud, points, guessed[row], pairs.camera)
+            second = by_icp(method.cloud, points, first.T_map_camera)
+            after_lk[row], by_lk[row] = first.T_map_camera, first.registered
+            after_icp[row], by_last[row] = second.T_map_camera, second.registered
+            report("refinement", row + 1, len(pairs))
+    every = np.ones(len(pairs), np.bool_)
+    stages = zip(STAGES, (guessed, after_lk, after_icp), (every, by_lk, by_last), strict=True)
+    return {name: _answered(method.streets, T, own) for name, T, own in stages}
+
+
+def _answered(streets: Streets, T_map_camera: NDArray[np.float64], registered: NDArray[np.bool_]) -> StageAnswers:
+    xy = T_map_camera[:, :2, 3].copy()
+    return StageAnswers(PlaceAnswers(xy, nearest_streets(streets, xy)), T_map_camera, registered)

@@ -1,0 +1,105 @@
+"""Registration of a query whose pose a network has guessed: PointNetLK, then ICP, against the map cloud.
+
+Either keeps the estimate before it where it cannot register: too few points, no convergence, too few inliers, fewer points on the
+map than before, or further away than it can have seen.
+ICP's reaches are no matter of much: (8, 2.5, 1) and (15, 5, 1) m found no more of poses 3, 8 and 15 m off (2026-11-22).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from model_training.baselines.regression.clouds import FEWEST, REACH_M, map_points_in_view, sampled
+from model_training.baselines.regression.lucas_kanade import aligned
+from model_training.baselines.regression.map_cloud import MapCloud, small_gicp_package
+from model_training.baselines.regression.pointnet import PointNet
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_points
+
+LK_POINTS, LK_ITERATIONS = 1024, 20
+LK_MOST_M = 15.0
+NEAR_M = 1.0
+#: Point to plane: the map's points are means of voxels and no point that the camera measured, but they lie on its surfaces.
+ICP_KIND = "PLANE_ICP"
+ICP_REACHES_M = (4.0, 1.0)  # how far a point's partner may be, coarse then fine
+ICP_ITERATIONS = 40
+ICP_LEAST_INLIERS = 0.6  # of the points, within the fine reach
+ICP_MOST_M = 10.0
+
+PointsF64 = NDArray[np.float64]  # (n, 3)
+Transform = NDArray[np.float64]  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """``T_map_camera``, and whether it is the registration's own; else it is what was given."""
+
+    T_map_camera: Transform
+    registered: bool
+
+
+def by_pointnet_lk(
+    net: PointNet, cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform, camera: PinholeCamera
+) -> Refined:  # fmt: skip
+    """Align a query's points (n, 3) to what the map shows from its estimated pose.
+
+    Raises:
+        ExtraMissingError: small_gicp is not installed.
+    """
+    shown = map_points_in_view(cloud, T_map_camera, camera)
+    if min(len(shown), len(points_camera)) < FEWEST:
+        return Refined(T_map_camera, registered=False)
+    rng = np.random.default_rng(3)
+    template, source = (torch.from_numpy(sampled(each, LK_POINTS, rng))[None] for each in (shown, points_camera))
+    with torch.inference_mode():
+        found = aligned(net, template, source, iterations=LK_ITERATIONS)
+        nearer = bool(found.residual.norm() < found.first_residual.norm())  # False for NaN
+    T_estimate_camera = found.T_template_source[0].double().numpy().copy()
+    T_estimate_camera[:3, 3] *= REACH_M
+    if not nearer or not np.linalg.norm(T_estimate_camera[:3, 3]) <= LK_MOST_M:
+        return Refined(T_map_camera, registered=False)
+    T_found = _rigid(T_map_camera @ T_estimate_camera)
+    if share_on_map(cloud, points_camera, T_found) < share_on_map(cloud, points_camera, T_map_camera):
+        return Refined(T_map_camera, registered=False)
+    return Refined(T_found, registered=True)
+
+
+def share_on_map(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -> float:
+    """Share of a query's points (n, 3) that have a point of the map within a metre."""
+    _, tree = cloud.target
+    _, squares = tree.batch_nearest_neighbor_search(transform_points(T_map_camera, points_camera), num_threads=1)
+    return float(np.mean(np.asarray(squares) < NEAR_M**2))
+
+
+def by_icp(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -> Refined:
+    """Register a query's points (n, 3) to the map cloud from an estimated pose.
+
+    Raises:
+        ExtraMissingError: small_gicp is not installed.
+    """
+    package = small_gicp_package()
+    if min(len(points_camera), len(cloud.points_map)) < FEWEST:
+        return Refined(T_map_camera, registered=False)
+    (target, tree), source, T = cloud.target, package.PointCloud(points_camera), T_map_camera
+    for reach_m in ICP_REACHES_M:
+        found = package.align(
+            target, source, tree, T, registration_type=ICP_KIND, max_correspondence_distance=reach_m, num_threads=1,
+            max_iterations=ICP_ITERATIONS,
+        )  # fmt: skip
+        T = np.asarray(found.T_target_source, np.float64)
+        if not np.isfinite(T).all():
+            return Refined(T_map_camera, registered=False)
+    moved_m = float(np.linalg.norm(T[:3, 3] - T_map_camera[:3, 3]))
+    enough = found.num_inliers >= ICP_LEAST_INLIERS * len(points_camera)
+    if not found.converged or not enough or moved_m > ICP_MOST_M:
+        return Refined(T_map_camera, registered=False)
+    return Refined(_rigid(T), registered=True)
+
+
+def _rigid(T: Transform) -> Transform:
+    """The same with a rotation that is one to the last digit: single precision is not."""
+    exact = T.copy()
+    exact[:3, :3] = rotation_from_quaternion_xyzw(quaternion_xyzw_from(T[:3, :3]))
+    return exact
