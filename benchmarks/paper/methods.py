@@ -1,7 +1,7 @@
 """Every method of the comparison, run on the shared data; what each answers is kept, so a stop costs one method."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from model_training.baselines.learning import read_curve
 from model_training.baselines.paper.knn import KS, PAPER_K
 from model_training.baselines.paper.variants import PLANS, Asked, Variant, run_variant, street_accuracy
 from model_training.baselines.raw_range import raw_best_views
+from model_training.baselines.regression.locate import STAGES
+from model_training.baselines.regression.run import run as run_regression
 from model_training.baselines.scan_context import locate
 from model_training.cli.progress import bars
 from model_training.evaluation.error_measures import distance_errors
@@ -116,6 +118,27 @@ def dual_encoder(bench: Bench, kind: Kind) -> list[MethodResult]:
     return [MethodResult(f"{kind}_encoder", found.answers, found.processor_s, found.images, shown, "budget", curve)]
 
 
+def regression(bench: Bench) -> list[MethodResult]:
+    """The paper's baseline, after each of its three stages; both of its networks count as its training."""
+    data, folder = bench.data, bench.data.work / "runs" / "regression"
+    with bars() as report:
+        found = run_regression(
+            data.pairs, data.dataset.folder, data.tests, folder, budget_s=bench.budget_s, report=report
+        )
+    pose, lk = found.trainings["googlenet"], found.trainings["pointnet_lk"]
+    results = []
+    for stage in STAGES:
+        costs = [pose] if stage == "googlenet" else [pose, lk]
+        answers = {split: each[stage].places for split, each in found.answers.items()}
+        results.append(
+            MethodResult(
+                stage, answers, sum(c.processor_s for c in costs), sum(c.images for c in costs), data.size.pairs,
+                pose.ended, read_curve(pose.curve), {"pointnet_lk": [asdict(p) for p in read_curve(lk.curve)]},
+            )
+        )  # fmt: skip
+    return results
+
+
 Method = Callable[[Bench], list[MethodResult]]
 #: By name, in the order in which they are run: those that take least first.
 RUNS: dict[str, Method] = {
@@ -123,6 +146,7 @@ RUNS: dict[str, Method] = {
     "streetfix_stock": lambda bench: [streetfix_stock(bench.data)],
     "raw_range": raw_range,
     "scan_context": scan_context,
+    "regression": regression,
     "dual": partial(dual_encoder, kind="dual"),
     "fov": partial(dual_encoder, kind="fov"),
 }

@@ -34,7 +34,11 @@ class CurvePoint:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch with one thread: two spend more processor time on waiting for each other than they save."""
+    """Torch with one thread: two spend more processor time on waiting for each other than they save.
+
+    Measured with other work on two cores: 28.7 pictures of 112 x 112 learnt from in a second of processor time, with two
+    threads 14.6.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.baselines.answers import PlaceAnswers, nearest_streets
-from model_training.baselines.learning import Report
+from model_training.baselines.learning import Report, one_thread
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.baselines.regression.clouds import depth_points
 from model_training.baselines.regression.map_cloud import MapCloud
 from model_training.baselines.regression.pointnet import PointNet
 from model_training.baselines.regression.refine import by_icp, by_pointnet_lk
-from model_training.baselines.regression.threads import one_thread
 from model_training.baselines.regression.train_pose import PoseRegressor
 from service.maps.streets import Streets
 

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_training.baselines.learning import Report, Training
+from model_training.baselines.learning import Report, Training, one_thread
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.baselines.regression.clouds import FEWEST, REACH_M, depth_points, map_points_in_view, sampled
 from model_training.baselines.regression.lucas_kanade import aligned, alignment_loss, transform_of
@@ -25,7 +25,6 @@ from model_training.baselines.regression.map_cloud import MapCloud
 from model_training.baselines.regression.pictures import watched_rows
 from model_training.baselines.regression.pointnet import PointNet
 from model_training.baselines.regression.schedule import cosine, set_rate
-from model_training.baselines.regression.threads import one_thread
 from service.errors import DatasetError
 from service.geometry.rigid import inverse
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model_training.baselines.learning import Report, Training
+from model_training.baselines.learning import Report, Training, one_thread
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.baselines.regression.googlenet import GoogLeNet, Pose
 from model_training.baselines.regression.pictures import (
@@ -29,7 +29,6 @@ from model_training.baselines.regression.pictures import (
 )
 from model_training.baselines.regression.pose_loss import PoseLoss
 from model_training.baselines.regression.schedule import cosine, set_rate
-from model_training.baselines.regression.threads import one_thread
 
 NAME = "GoogLeNet"
 EVALUATED = 64  # pictures at once

@@ -37,7 +37,7 @@ def camera_at(x, y, heading_rad):
 @pytest.fixture(scope="session", autouse=True)
 def one_thread():
     """Two threads that wait for each other on a busy machine take many times as long."""
-    from model_training.baselines.regression.threads import one_thread
+    from model_training.baselines.learning import one_thread
 
     with one_thread():
         yield
