@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from service.errors import BundleError
 
 FILE = "streets.geojson"
-Ring = Float64[NDArray[np.float64], "n 2"]
+Ring = Float64[NDArray[np.float64], "_ 2"]  # rings of one street differ in length
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,5 +44,8 @@ class Gallery:
 
 
 def class_centres(xy: NDArray[np.float64], street: NDArray[np.int64], classes: int) -> NDArray[np.float64]:
-    """Mean position (classes, 2) of each class: where the softmax, which knows no position, is taken to answer."""
-    return np.stack([xy[street == each].mean(axis=0) for each in range(classes)])
+    """Mean position (classes, 2) of each class, NaN of one without frames: where the softmax, which knows none, is taken to be."""
+    centres = np.full((classes, 2), np.nan)
+    for each in np.unique(street):
+        centres[each] = xy[street == each].mean(axis=0)
+    return centres

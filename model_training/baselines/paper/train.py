@@ -1,5 +1,6 @@
 """Training the paper's CNN: as the paper says (84 iterations), and until it stops gaining."""
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from model_training.baselines.paper_data.pairs import Pairs
 LEARNT_SHARE = 0.7  # of the frames, at random: the paper's split
 ITERATIONS_AN_EPOCH, EPOCHS = 21, 4  # the paper's
 WATCHED_BLOCKS, WATCHED_SHARE, WATCHED_EACH = 20, 0.05, 10
+PATIENCE = 12  # points of the curve without a gain, a quarter of an epoch each
 CHUNK = 128  # pictures in memory at a time; gradients of a larger batch are summed over them
 SEED = 0
 
@@ -82,7 +84,9 @@ def aside_pairs(total: int) -> NDArray[np.int64]:
 class CnnTrainer:
     """One run: a plan, its data, its folder."""
 
-    def __init__(self, plan: CnnPlan, frames: Frames, pairs: Pairs | None, folder: Path, *, budget_s: float) -> None:
+    def __init__(
+        self, plan: CnnPlan, frames: Frames, pairs: Pairs | None, folder: Path, *, budget_s: float, patience: int = PATIENCE
+    ) -> None:  # fmt: skip
         self.plan, self.frames, self.pairs = plan, frames, pairs
         self.split = split_of(len(frames))
         # As printed nothing is chosen by what is watched: all of the 70 % is learnt from, some of the 30 % is watched.
@@ -90,7 +94,7 @@ class CnnTrainer:
         self._learnt = all_learnt if plan.as_paper else self.split.learnt
         self._watched = self.split.tested[::WATCHED_EACH] if plan.as_paper else self.split.watched
         self.pictures = LidarPictures(frames, plan.space)
-        self.training = Training(folder, asdict(plan) | {"frames": len(frames)}, budget_s=budget_s)
+        self.training = Training(folder, asdict(plan) | {"frames": len(frames)}, budget_s=budget_s, patience=patience)
         self._rng = np.random.default_rng([SEED, self.training.images])
         torch.manual_seed(SEED)
         self.net = PaperCnn().to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
@@ -125,7 +129,7 @@ class CnnTrainer:
             if not self.plan.as_paper:
                 share = self.training.share_spent
                 for group in self._optimiser.param_groups:
-                    group["lr"] = self.plan.rate * (0.5 * (1 + np.cos(np.pi * share)) + 0.01)
+                    group["lr"] = self.plan.rate * (0.5 * (1 + math.cos(math.pi * share)) + 0.01)
             losses.append(self._step(batch))
             images += batch
             spent = images / most if most else self.training.share_spent

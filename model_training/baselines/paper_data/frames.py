@@ -34,6 +34,7 @@ from service.imaging.view_grid import ViewGrid, panorama_from_points
 LIDAR, CITY_SEED, FORMAT = "paper_32", 0, 1
 STEP_M = 0.02  # between the stations that frames are chosen from; the densest class has a frame every 3 cm
 BLOCK = 128
+FINISHED, BEGUN = "frames.json", "frames.begun.json"
 Report = Callable[[str, int, int], None]
 Transform = NDArray[np.float64]
 PoseOf = Callable[[int, np.random.Generator], Transform]
@@ -64,7 +65,7 @@ class Frames:
         Raises:
             DatasetError: the folder is not whole.
         """
-        if not (folder / "frames.json").exists():
+        if not (folder / FINISHED).exists():
             raise DatasetError(f"{folder} holds no finished frames; run make paper", field="frames")
         return Frames(**{name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
                          for name in Frames.__annotations__})  # fmt: skip
@@ -94,9 +95,11 @@ def make_frames(folder: Path, total: int, *, workers: int | None = None, report:
     Raises:
         DatasetError: the folder holds other frames.
     """
+    made_of: dict[str, Any] = {"format": FORMAT, "total": total, "lidar": LIDAR, "city_seed": CITY_SEED}
+    if _finished(folder, made_of):
+        return Frames.open(folder)
     city = City(seed=CITY_SEED, name="paper")
     where, street = stations_of(city, total)
-    made_of = {"format": FORMAT, "total": total, "lidar": LIDAR, "city_seed": CITY_SEED}
 
     def pose_of(row: int, rng: np.random.Generator) -> Transform:
         return lidar_pose(city, where[row], rng)
@@ -113,10 +116,12 @@ def make_frames_at(
     Raises:
         DatasetError: the folder holds other frames.
     """
-    made_of = {
+    made_of: dict[str, Any] = {
         "format": FORMAT, "total": len(street), "lidar": LIDAR, "city_seed": CITY_SEED, "traversal": traversal,
         "poses": hashlib.sha256(np.ascontiguousarray(T_map_lidar).tobytes()).hexdigest(),
     }  # fmt: skip
+    if _finished(folder, made_of):
+        return Frames.open(folder)
     city = City(seed=CITY_SEED, name="paper")
 
     def pose_of(row: int, _: np.random.Generator) -> Transform:
@@ -126,16 +131,22 @@ def make_frames_at(
     return _make(folder, made_of, city, traversal, pose_of, street, workers, report)
 
 
+def _finished(folder: Path, made_of: dict[str, Any]) -> bool:
+    """Whether there is nothing to do; ``folder`` holds these frames, or nothing.
+
+    Raises:
+        DatasetError: it holds others.
+    """
+    for path in (folder / FINISHED, folder / BEGUN):
+        if path.exists() and json.loads(path.read_text()) != made_of:
+            raise DatasetError(f"{path} is of other frames; remove {folder}, or choose another --work", field="work")
+    return (folder / FINISHED).exists()
+
+
 def _make(
     folder: Path, made_of: dict[str, Any], city: City, traversal: int, pose_of: PoseOf, street: NDArray[np.int64],
     workers: int | None, report: Report,
 ) -> Frames:  # fmt: skip
-    finished, begun = folder / "frames.json", folder / "frames.begun.json"
-    for path in (finished, begun):
-        if path.exists() and json.loads(path.read_text()) != made_of:
-            raise DatasetError(f"{path} is of other frames; remove {folder}, or choose another --work", field="work")
-    if finished.exists():
-        return Frames.open(folder)
     folder.mkdir(parents=True, exist_ok=True)
     total, grid = len(street), ViewGrid()
     shapes: dict[str, tuple[tuple[int, ...], type]] = {
@@ -143,6 +154,7 @@ def _make(
         "panoramas": ((total, grid.rows, grid.around), np.float16), "intensities": ((total, grid.rows, grid.around), np.uint8),
         "places": ((total, 4), np.float64), "T_map_lidar": ((total, 4, 4), np.float64),
     }  # fmt: skip
+    begun = folder / BEGUN
     if not begun.exists():
         for name, (shape, kind) in shapes.items():
             np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=kind, shape=shape).flush()
@@ -162,7 +174,7 @@ def _make(
             report("LiDAR frames", done, total)
     for first in range(0, total, BLOCK):
         _mark(folder, first).unlink()
-    begun.rename(finished)
+    begun.rename(folder / FINISHED)
     return Frames.open(folder)
 
 
