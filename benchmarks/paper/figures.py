@@ -86,7 +86,7 @@ def _setup() -> Figure:
     axes.annotate(
         "RGB and depth, 640 x 480, 90 degrees, 1.5 m",
         (1.0, 1.5),
-        (2.2, 3.9),
+        (0.2, 3.9),
         arrowprops={"arrowstyle": "-"},
         color=THEIRS,
     )
@@ -108,7 +108,7 @@ def _rgb_and_depth(dataset: Dataset) -> Figure:
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4))
     axes[0].imshow(frame.rgb())
     shown = axes[1].imshow(_shown_depth(frame.depth_m()), cmap="viridis_r", vmax=MAX_DEPTH_M)
-    figure.colorbar(shown, ax=axes[1], label="depth (m)")
+    figure.colorbar(shown, ax=axes[1], label="depth (m)", fraction=0.035)
     for each in axes:
         each.axis("off")
     return figure
@@ -133,6 +133,7 @@ def _scan(dataset: Dataset) -> Figure:
     side = figure.add_subplot(1, 2, 1, projection="3d")
     side.scatter(near[:, 0], near[:, 1], near[:, 2], c=near[:, 2], s=0.4, cmap="viridis")
     side.set_box_aspect((1, 1, 0.2))
+    side.set_zticks([0, 8])
     side.view_init(elev=28, azim=-60)
     above = figure.add_subplot(1, 2, 2)
     shown = above.scatter(near[:, 0], near[:, 1], c=near[:, 2], s=0.4, cmap="viridis")
@@ -154,7 +155,7 @@ def _pictures25d(data: PaperData) -> Figure:
 
 def _one_space(data: PaperData) -> Figure:
     test, frames = data.tests["same_drive"], data.frames
-    figure, axes = plt.subplots(2, 3, figsize=(11, 5))
+    figure, axes = plt.subplots(2, 3, figsize=(9, 6), layout="tight")
     rows = np.linspace(0, len(test) - 1, 5).astype(np.int64)[1:4]
     for (top, low), row in zip(axes.T, rows, strict=True):
         away = np.linalg.norm(np.asarray(frames.places)[:, :2] - test.views[row, :2], axis=1)
