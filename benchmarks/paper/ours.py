@@ -16,7 +16,7 @@ from benchmarks.paper.data import PaperData, Size, test_set
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.runs import MAPPING, code_hash
 from model_training.baselines.answers import PlaceAnswers
-from model_training.baselines.learning import CurvePoint
+from model_training.baselines.learning import CurvePoint, one_thread
 from model_training.cli.progress import bars
 from model_training.evaluation.predict import predict
 from model_training.mapping.build import BuildSettings, build_map
@@ -72,7 +72,7 @@ def streetfix(data: PaperData) -> MethodResult:
 
     pack = pack_of(data)
     try:
-        with bars() as show:
+        with one_thread(), bars() as show:
             train([pack], run, config, device="cpu", report=note)
     finally:
         if run.exists():
