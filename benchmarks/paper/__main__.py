@@ -78,7 +78,7 @@ def main() -> None:
     )
     print(f"written: {report.write()}")
     pictures = draw_figures(out / "paper", bench.data, results)
-    print(f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures)}")
+    print(f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures, minutes)}")
 
 
 if __name__ == "__main__":

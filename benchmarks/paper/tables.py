@@ -36,7 +36,12 @@ Figures = Mapping[str, Mapping[str, Mapping[str, float]]]
 
 
 def write_page(
-    path: Path, data: PaperData, results: Mapping[str, MethodResult], figures: Figures, pictures: Mapping[str, str]
+    path: Path,
+    data: PaperData,
+    results: Mapping[str, MethodResult],
+    figures: Figures,
+    pictures: Mapping[str, str],
+    budget_minutes: float,
 ) -> Path:
     """Write the page and say where it is."""
     parts = [
@@ -49,7 +54,7 @@ def write_page(
         _claims(results, figures),
         _variants(results),
         _ks(results),
-        _how(),
+        _how(budget_minutes),
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(line for part in parts for line in [*part, ""]))
@@ -168,9 +173,10 @@ def _table_three(results: Mapping[str, MethodResult], figures: Figures) -> list[
             continue
         other, own, result = figures[method]["other_drive"], figures[method]["same_drive"], results[method]
         minutes = minutes_for_paper_images(result)
+        spent = "beforehand" if method == "streetfix_stock" else f"{result.training_s / 60:.1f}"
         lines.append(
             f"| {title} | {other['mean_distance_error_m']:.3f} | {other['median_distance_error_m']:.3f} | {other['street_accuracy']:.4f} "
-            f"| {own['mean_distance_error_m']:.3f} | {own['street_accuracy']:.4f} | {result.training_s / 60:.1f} "
+            f"| {own['mean_distance_error_m']:.3f} | {own['street_accuracy']:.4f} | {spent} "
             f"| {'-' if minutes is None else f'{minutes:.1f}'} | {result.training_set} |"
         )
     return lines
@@ -217,6 +223,8 @@ _SETS = {
 
 def _variants(results: Mapping[str, MethodResult]) -> list[str]:
     known = {name: results[f"cnn_knn_{name}"] for name in WHAT if f"cnn_knn_{name}" in results}
+    if not known:
+        return []
     lines = [
         "## The paper's method, every way it can be meant", "",
         "Street accuracy by K-NN (k = 5) / by softmax, and K-NN's mean distance. Chance is about 1 in 10.", "",
@@ -239,6 +247,8 @@ def _variants(results: Mapping[str, MethodResult]) -> list[str]:
 
 def _ks(results: Mapping[str, MethodResult]) -> list[str]:
     known = {name: results[f"cnn_knn_{name}"] for name in WHAT if f"cnn_knn_{name}" in results}
+    if not known:
+        return []
     lines = ["## K-NN against softmax, k from 1 to 21", "", "Street accuracy; the paper takes k = 5.", ""]
     lines += [
         "| variant, queries | softmax | " + " | ".join(f"k={k}" for k in KS) + " |",
@@ -252,12 +262,13 @@ def _ks(results: Mapping[str, MethodResult]) -> list[str]:
     return lines
 
 
-def _how() -> list[str]:
+def _how(budget_minutes: float) -> list[str]:
     return [
         "## How it was read", "",
         ("- 84 iterations in 4 epochs of 21 over 70 % of 46,741 frames make batches of 1,558 (summed over parts of 128). SGDM, rate 3e-4, "
         "momentum 0.9."),
-        ("- The others have up to 60 minutes of processor time each, or end when what they watch (stretches of street, or pairs, of the "
+        (f"- The others have up to {budget_minutes:g} minutes of processor time each, or end when what they watch (stretches of "
+        "street, or pairs, of the "
         "training drives that they are not shown) stops gaining."),
         ("- Pairs: half ride on the survey's own drive, half on another with other vehicles, both directions, up to 2 m aside. Same-drive "
         "queries stand on the survey's track among its vehicles; other-drive ones come from a drive that nothing was learnt from."),
