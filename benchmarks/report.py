@@ -35,7 +35,7 @@ class Report:
     command: str
     rows: list[dict[str, Any]] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
-    folder: Path = REPORTS
+    folder: Path = field(default_factory=lambda: REPORTS)
     _keep: bool = False
     _began: float = field(default_factory=time.monotonic)
     # What is measured is the code as it was loaded, not as it is when the report is written.
