@@ -23,7 +23,7 @@ class MethodResult:
     Attributes:
         method: as in row ids.
         answers: by split.
-        training_s: processor seconds of training; 0 where nothing is learnt.
+        training_s: processor seconds of training; 0 where nothing is learnt, None where it was before all this.
         images: shown in training.
         training_set: different images that it learnt from.
         ended: why its training ended.
@@ -34,7 +34,7 @@ class MethodResult:
 
     method: str
     answers: Mapping[str, PlaceAnswers]
-    training_s: float = 0.0
+    training_s: float | None = 0.0
     images: int = 0
     training_set: int = 0
     ended: str = "nothing is learnt"

@@ -89,7 +89,9 @@ def streetfix(data: PaperData) -> MethodResult:
 
 def streetfix_stock(data: PaperData) -> MethodResult:
     """The shipped encoder, which knows other cities alone."""
-    return MethodResult("streetfix_stock", _answers(data, ENCODER), ended="trained beforehand, on 26 other cities")
+    return MethodResult(
+        "streetfix_stock", _answers(data, ENCODER), None, ended="trained beforehand, on 26 other cities"
+    )
 
 
 def _answers(data: PaperData, encoder: Path) -> dict[str, PlaceAnswers]:

@@ -1,6 +1,5 @@
 """Rows of the comparison, and what ours must beat."""
 
-import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -48,7 +47,9 @@ def figures_of(answers: PlaceAnswers, test: Pairs) -> dict[str, float]:
 
 def minutes_for_paper_images(result: MethodResult) -> float | None:
     """Processor minutes of training at the number of images that the paper's iterations show."""
-    return result.training_s / 60 * PAPER_IMAGES / result.images if result.images else None
+    if not result.images or result.training_s is None:
+        return None
+    return result.training_s / 60 * PAPER_IMAGES / result.images
 
 
 def all_rows(
@@ -101,7 +102,5 @@ def _rows_of(
         )  # fmt: skip
     for key in ("median_distance_error_m", "within_1_m"):
         report.row(f"{row}.{key}", own[key], "m" if key.endswith("_m") and key != "within_1_m" else "share", n=n)
-    told = None if math.isfinite(result.training_s) else "unknown"
-    report.row(
-        f"{row}.training_minutes", result.training_s / 60, "min", n=result.training_set, why=told or result.ended
-    )
+    minutes = None if result.training_s is None else result.training_s / 60
+    report.row(f"{row}.training_minutes", minutes, "min", n=result.training_set, why=result.ended)

@@ -5,6 +5,7 @@ method is given.
 """
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ import torch
 from service.errors import DatasetError
 
 CURVE = "curve.jsonl"
+WARM_UP = 0.02  # of a budget: the rate rises first
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,20 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def cosine_share(share_spent: float, *, warm_up: float = 0.0, least: float = 0.01) -> float:
+    """Of a learning rate, when a share of the budget is spent: a line up, then half a cosine down to ``least``."""
+    if share_spent < warm_up:
+        return max(share_spent / warm_up, least)
+    done = (share_spent - warm_up) / (1.0 - warm_up)
+    return least + (1.0 - least) * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
+    """Give all groups the rate, a group's ``times`` over where it has such a factor."""
+    for group in optimiser.param_groups:
+        group["lr"] = rate * group.get("times", 1.0)
 
 
 class Training:

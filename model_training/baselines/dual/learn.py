@@ -17,7 +17,7 @@ from model_training.baselines.dual.pairing import frames_near, watched
 from model_training.baselines.dual.pictures import CAMERA_PLANES, FIELD, LIDAR_PLANES, WHOLE, Pictures, Sweeps
 from model_training.baselines.dual.towers import Tower, Towers
 from model_training.baselines.gallery import thinned
-from model_training.baselines.learning import Report, Training, one_thread
+from model_training.baselines.learning import Report, Training, cosine_share, one_thread, set_rate
 from model_training.training.losses import Side, paired_info_nce
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
@@ -165,8 +165,7 @@ def _learn(lesson: Lesson, settings: LearnSettings, folder: Path, budget_s: floa
     for batch in lesson.batches(settings, np.random.default_rng([settings.seed, 2, images])):
         if training.ended is not None:
             break
-        for group in optimiser.param_groups:
-            group["lr"] = settings.learning_rate * rate_at(training.share_spent, settings.warm_up_share)
+        set_rate(optimiser, settings.learning_rate * cosine_share(training.share_spent, warm_up=settings.warm_up_share))
         losses.append(step(towers.train(), optimiser, batch, settings))
         images += 2 * len(batch[0])
         report(settings.kind, round(1000 * training.share_spent), 1000)
@@ -190,13 +189,6 @@ def step(
     torch.nn.utils.clip_grad_norm_(towers.parameters(), settings.gradient_norm)
     optimiser.step()
     return float(loss.detach())
-
-
-def rate_at(share: float, warm_up_share: float) -> float:
-    """Of the learning rate, when a share of the budget is spent: a line up, then half a cosine down to 0."""
-    if share < warm_up_share:
-        return max(share / warm_up_share, 0.01)
-    return 0.5 * (1 + math.cos(math.pi * (share - warm_up_share) / (1 - warm_up_share)))
 
 
 def watch_score(towers: Towers, lesson: Lesson) -> float:

@@ -1,6 +1,5 @@
 """Training the paper's CNN: as the paper says (84 iterations), and until it stops gaining."""
 
-import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from model_training.baselines.learning import Report, Training, one_thread
+from model_training.baselines.learning import Report, Training, cosine_share, one_thread, set_rate
 from model_training.baselines.paper.cnn import PaperCnn
 from model_training.baselines.paper.pictures import LidarPictures, Pictures, Space, fused_pictures
 from model_training.baselines.paper_data.frames import Frames
@@ -127,9 +126,7 @@ class CnnTrainer:
 
         while not self._done(images, most):
             if not self.plan.as_paper:
-                share = self.training.share_spent
-                for group in self._optimiser.param_groups:
-                    group["lr"] = self.plan.rate * (0.5 * (1 + math.cos(math.pi * share)) + 0.01)
+                set_rate(self._optimiser, self.plan.rate * cosine_share(self.training.share_spent))
             losses.append(self._step(batch))
             images += batch
             spent = images / most if most else self.training.share_spent

@@ -17,14 +17,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from model_training.baselines.learning import Report, Training, one_thread
+from model_training.baselines.learning import WARM_UP, Report, Training, cosine_share, one_thread, set_rate
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.baselines.regression.clouds import FEWEST, REACH_M, depth_points, map_points_in_view, sampled
 from model_training.baselines.regression.lucas_kanade import aligned, alignment_loss, transform_of
 from model_training.baselines.regression.map_cloud import MapCloud
 from model_training.baselines.regression.pictures import watched_rows
 from model_training.baselines.regression.pointnet import PointNet
-from model_training.baselines.regression.schedule import cosine, set_rate
 from service.errors import DatasetError
 from service.geometry.rigid import inverse
 
@@ -126,7 +125,7 @@ class _Learner:
     def step(self, shown: NDArray[np.int64], share_spent: float) -> float:
         """Learn from a batch of some rows; the mean loss."""
         settings = self._settings
-        set_rate(self._optimiser, cosine(settings.learning_rate, share_spent))
+        set_rate(self._optimiser, settings.learning_rate * cosine_share(share_spent, warm_up=WARM_UP))
         batch = self._batch(self._rng.choice(shown, settings.batch), self._rng)
         if batch is None:
             raise DatasetError("no pair's depth meets the map; are both of one city?", field="pairs")

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from model_training.baselines.learning import Report, Training, one_thread
+from model_training.baselines.learning import WARM_UP, Report, Training, cosine_share, one_thread, set_rate
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.baselines.regression.googlenet import GoogLeNet, Pose
 from model_training.baselines.regression.pictures import (
@@ -28,7 +28,6 @@ from model_training.baselines.regression.pictures import (
     watched_rows,
 )
 from model_training.baselines.regression.pose_loss import PoseLoss
-from model_training.baselines.regression.schedule import cosine, set_rate
 
 NAME = "GoogLeNet"
 EVALUATED = 64  # pictures at once
@@ -134,7 +133,7 @@ class _Learner:
     def step(self, rows: NDArray[np.int64], share_spent: float) -> float:
         """Learn from pairs; the mean loss."""
         settings = self._settings
-        set_rate(self._optimiser, cosine(settings.learning_rate, share_spent))
+        set_rate(self._optimiser, settings.learning_rate * cosine_share(share_spent, warm_up=WARM_UP))
         self._net.train()
         planes = planes_of(self._pairs, rows, settings.side, jitter=settings.jitter, rng=self._rng)
         heads = self._net(planes.contiguous(memory_format=torch.channels_last))

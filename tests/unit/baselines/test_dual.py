@@ -10,7 +10,6 @@ from model_training.baselines.dual.learn import (
     LearnSettings,
     Lesson,
     learn,
-    rate_at,
     size_of,
     step,
     towers_of,
@@ -173,14 +172,6 @@ def test_pairs_of_another_city_are_refused(street_frames, street_pairs):
     pictures = pictures_of(pairs, WHOLE)
     with pytest.raises(DatasetError, match="near a LiDAR frame"):
         Lesson.of(pictures, pairs.views, sweeps_of(street_frames(2)), WholePanorama(GRID), LearnSettings("dual"))
-
-
-def test_the_learning_rate_rises_and_falls_to_nothing():
-    assert rate_at(0.0, 0.1) == pytest.approx(0.01)
-    assert rate_at(0.05, 0.1) == pytest.approx(0.5)
-    assert rate_at(0.1, 0.1) == pytest.approx(1.0)
-    assert rate_at(0.55, 0.1) == pytest.approx(0.5)
-    assert rate_at(1.0, 0.1) == pytest.approx(0.0)
 
 
 def test_a_batch_holds_each_picture_with_a_frame_near_it(lesson_of):

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from model_training.baselines.learning import Training
+from model_training.baselines.learning import Training, cosine_share, set_rate
 from service.errors import DatasetError
 
 
@@ -78,3 +78,21 @@ def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
 def test_there_is_no_best_state_before_the_first_point(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"holds no best\.pt yet"):
         Training(tmp_path, {}, budget_s=1.0).best()
+
+
+def test_the_rate_rises_to_all_of_it_and_falls_to_a_hundredth() -> None:
+    assert cosine_share(0.0, warm_up=0.1) == pytest.approx(0.01)
+    assert cosine_share(0.05, warm_up=0.1) == pytest.approx(0.5)
+    assert cosine_share(0.1, warm_up=0.1) == pytest.approx(1.0)
+    assert cosine_share(0.55, warm_up=0.1) == pytest.approx(0.505)
+    assert cosine_share(1.0, warm_up=0.1) == pytest.approx(0.01)
+    assert cosine_share(0.0) == pytest.approx(1.0)
+
+
+def test_a_group_may_have_a_multiple_of_the_rate() -> None:
+    one, two = torch.nn.Parameter(torch.zeros(1)), torch.nn.Parameter(torch.zeros(1))
+    optimiser = torch.optim.SGD([{"params": [one]}, {"params": [two], "times": 10.0}], lr=1.0)
+
+    set_rate(optimiser, 0.2)
+
+    assert [group["lr"] for group in optimiser.param_groups] == pytest.approx([0.2, 2.0])

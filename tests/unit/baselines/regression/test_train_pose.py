@@ -8,7 +8,6 @@ from model_training.baselines.regression import train_pose as module
 from model_training.baselines.regression.googlenet import GoogLeNet, Pose
 from model_training.baselines.regression.pictures import MapFrame, planes_of, poses_of
 from model_training.baselines.regression.pose_loss import PoseLoss
-from model_training.baselines.regression.schedule import cosine
 from model_training.baselines.regression.train_pose import PoseRegressor, PoseSettings, train_pose
 from service.errors import DatasetError
 
@@ -95,10 +94,3 @@ def test_threads_are_given_back_after_a_training(run_in_two_parts, pairs_in_hall
     before = torch.get_num_threads()
     train_pose(pairs_in_hall(), tmp_path / "run", SMALL, budget_s=0.1)
     assert torch.get_num_threads() == before
-
-
-def test_the_rate_rises_and_falls_to_a_hundredth():
-    assert cosine(1.0, 0.0) == pytest.approx(0.01)
-    assert cosine(1.0, 0.02) == pytest.approx(1.0)
-    assert cosine(1.0, 0.51) == pytest.approx(0.505)
-    assert cosine(1.0, 1.0) == pytest.approx(0.01)
