@@ -9,7 +9,10 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SOURCES = (Path("service/registration/kernel.c"), Path("service/imaging/gather.c"), Path("service/imaging/depth16.c"))
+SOURCES = tuple(
+    Path("service") / name
+    for name in ("registration/kernel.c", "imaging/gather.c", "imaging/level.c", "imaging/depth16.c")
+)
 FLAGS = ["-O3", "-std=c11", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
 
 

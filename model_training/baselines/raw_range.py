@@ -16,7 +16,7 @@ from model_training.mapping.build import BuildSettings, view_ranges
 from service.errors import NoDepthError
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import ViewGrid
-from service.localization.localizer import TURNS_RAD
+from service.localization.localizer import turns_on
 from service.maps.reader import MapBundle
 
 Ranges = NDArray[np.float32]
@@ -111,11 +111,11 @@ def _query_ranges(
                     frame.camera.pinhole(),
                     grid=grid,
                     rows_seen=bundle.rows_seen,
-                    turns_rad=TURNS_RAD,
+                    turns=turns_on(grid),
                 )
                 rows.append(views.planes[:, 0])
                 usable.append(True)
             except NoDepthError:
-                rows.append(np.zeros((len(TURNS_RAD), grid.rows, grid.columns), np.float32))
+                rows.append(np.zeros((len(turns_on(grid)), grid.rows, grid.columns), np.float32))
                 usable.append(False)
     return np.stack(rows), np.array(usable)

@@ -5,7 +5,7 @@ from ctypes import c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
-from service.errors import StreetfixError
+from service.compiled import load
 
 LIBRARY = Path(__file__).with_name("_depth16.so")
 
@@ -17,9 +17,7 @@ def library() -> ctypes.CDLL:
     Raises:
         StreetfixError: it was not compiled.
     """
-    if not LIBRARY.exists():
-        raise StreetfixError(f"{LIBRARY.name} is missing beside {__file__}: install the package again (pip install .)")
-    found = ctypes.CDLL(str(LIBRARY))
+    found = load(LIBRARY)
     found.streetfix_unfilter.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
     found.streetfix_rvl.argtypes = [c_void_p, c_int64, c_int64, c_void_p]
     found.streetfix_unfilter.restype = found.streetfix_rvl.restype = c_int64

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy.typing import NDArray
 
-from service.errors import StreetfixError
+from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation
 from service.imaging.view_grid import ViewGrid
@@ -26,9 +26,7 @@ class _Picture(Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    if not LIBRARY.exists():
-        raise StreetfixError(f"{LIBRARY.name} is missing beside {__file__}: install the package again (pip install .)")
-    library = ctypes.CDLL(str(LIBRARY))
+    library = load(LIBRARY)
     library.streetfix_gather.argtypes = [
         c_void_p, c_int64, c_void_p, c_void_p, POINTER(_Picture), c_void_p, POINTER(_Picture), c_double, c_double, c_int64,
         c_void_p, c_void_p, c_void_p,

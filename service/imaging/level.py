@@ -4,23 +4,30 @@ Map views are level with the ground under the vehicle, so queries must be too. A
 a stereo one shows it badly, so the plane is fitted under a prior (gravity or the mounting, and the usual height).
 """
 
+import ctypes
+from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
+from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, Rotation, rotation_taking
 
+LIBRARY = Path(__file__).with_name("_level.so")
 STEP_PIXELS = 80  # the picture is read at about this many columns
 REACH_M = 14.0
 NEAR_M = 1.0
 TILT_PRIOR_RAD = np.deg2rad(1.5)
 HEIGHT_PRIOR_M = 0.12
-NOISE_M = 0.08  # of one ground point, across the plane
+NOISE_M, NOISE_PER_M = 0.08, 0.01  # of one ground point, across the plane; more for each metre of its distance
 CORRELATED = 50.0  # so many neighbouring points err together: the fit counts them once
+#: How far a point may lie from the plane of the round before: metres, and metres for each metre of distance.
+BANDS = np.array([(0.5, 0.08), (0.35, 0.05), (0.25, 0.03), (0.2, 0.02), (0.2, 0.02)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +64,7 @@ def level_camera(
         nominal_height_m: usual height of the camera above the ground.
     """
     R = nominal_level(down_camera)
-    v, u, rays = _rays(camera, *depth_m.shape)
-    z = depth_m[v, u].astype(np.float64)
-    measured = (z > NEAR_M) & (z < REACH_M)
-    points = (z[measured, None] * rays[measured]) @ R.T
-    slope_x, slope_y, ground = _fit_plane(points, nominal_height_m)
+    slope_x, slope_y, ground = _fit_ground(depth_m, camera, R, nominal_height_m)
     normal = np.array([-slope_x, -slope_y, 1.0])
     normal /= np.linalg.norm(normal)
     R_level = rotation_taking(normal, np.array([0.0, 0.0, 1.0])) @ R
@@ -74,34 +77,42 @@ def level_camera(
     return CameraLevel(R_level, float(-ground * normal[2]))
 
 
-@lru_cache(maxsize=16)
-def _rays(
-    camera: PinholeCamera, height: int, width: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Float64[NDArray[np.float64], "n 3"]]:
-    """Rows and columns of the pixels that are read of a picture, and their rays at z = 1; the same for every picture of a camera."""
+class _Picture(Structure):
+    _fields_ = [("height", c_int64), ("width", c_int64), *((name, c_double) for name in ("fx", "fy", "cx", "cy"))]
+
+
+class _Ground(Structure):
+    _fields_ = [(name, c_double) for name in (
+        "near_m", "reach_m", "below_m", "height_m", "tilt_prior", "height_prior_m", "noise_m", "noise_per_m", "correlated",
+    )]  # fmt: skip
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    library = load(LIBRARY)
+    library.streetfix_fit_ground.argtypes = [
+        c_void_p, POINTER(_Picture), c_int64, c_void_p, POINTER(_Ground), c_void_p, c_int64, c_void_p, c_void_p,
+    ]  # fmt: skip
+    library.streetfix_fit_ground.restype = None
+    return library
+
+
+def _fit_ground(
+    depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R: Rotation, height_m: float
+) -> tuple[float, float, float]:
+    """Slopes and offset of z = a x + b y + c near z = -height, level frame R; the prior alone where no ground is seen."""
+    depth_m, R = np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(R, np.float64)
+    height, width = depth_m.shape
+    if R.shape != (3, 3):
+        raise ValueError(f"R {R.shape} is no rotation")
     own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
     step = max(1, width // STEP_PIXELS)
-    v, u = (each.reshape(-1) for each in np.mgrid[step // 2 : height : step, step // 2 : width : step])
-    rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
-    for each in (v, u, rays):
-        each.setflags(write=False)
-    return v, u, rays
-
-
-def _fit_plane(points: NDArray[np.float64], height_m: float) -> tuple[float, float, float]:
-    """Slopes and offset of z = a x + b y + c near z = -height; the prior alone where no ground is seen."""
-    prior = np.diag([1 / TILT_PRIOR_RAD**2, 1 / TILT_PRIOR_RAD**2, 1 / HEIGHT_PRIOR_M**2])
-    mean = np.array([0.0, 0.0, -height_m])
-    solution = mean
-    near = points[points[:, 2] < -0.3 * height_m]
-    design, z = np.column_stack([near[:, :2], np.ones(len(near))]), near[:, 2]
-    reach = np.hypot(near[:, 0], near[:, 1])
-    certainty = 1.0 / ((NOISE_M + 0.01 * reach) ** 2 * CORRELATED)
-    for band_m, band_slope in ((0.5, 0.08), (0.35, 0.05), (0.25, 0.03), (0.2, 0.02), (0.2, 0.02)):
-        keep = np.abs(z - design @ solution) < band_m + band_slope * reach
-        if not keep.any():
-            break
-        weighted = design * np.where(keep, certainty, 0.0)[:, None]
-        information = weighted.T @ design + prior
-        solution = np.linalg.solve(information, weighted.T @ z + prior @ mean)
-    return float(solution[0]), float(solution[1]), float(solution[2])
+    found, points = np.empty(3), np.empty((-(-height // step) * -(-width // step), 5))
+    _library().streetfix_fit_ground(
+        depth_m.ctypes.data, byref(_Picture(height, width, own.fx, own.fy, own.cx, own.cy)), step, R.ctypes.data,
+        byref(_Ground(
+            NEAR_M, REACH_M, 0.3 * height_m, height_m, TILT_PRIOR_RAD, HEIGHT_PRIOR_M, NOISE_M, NOISE_PER_M, CORRELATED
+        )),
+        BANDS.ctypes.data, len(BANDS), points.ctypes.data, found.ctypes.data,
+    )  # fmt: skip
+    return float(found[0]), float(found[1]), float(found[2])

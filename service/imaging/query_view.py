@@ -48,9 +48,9 @@ def query_view(
     nominal_height_m: float = 1.5,
     turn_rad: float = 0.0,
 ) -> QueryView:
-    """One view of a query; see ``query_views``."""
+    """One view of a query, at any heading against the optical axis (counter-clockwise); see ``query_views``."""
     views = query_views(
-        rgb, depth_m, camera, grid=grid, rows_seen=rows_seen, turns_rad=(turn_rad,),
+        rgb, depth_m, camera, grid=grid, rows_seen=rows_seen, turns=(0,), turn_rad=turn_rad,
         down_camera=down_camera, nominal_height_m=nominal_height_m,
     )  # fmt: skip
     return QueryView(views.planes[0], views.R_level_camera, views.height_m, views.measured_share)
@@ -63,7 +63,8 @@ def query_views(
     *,
     grid: ViewGrid,
     rows_seen: Bool[NDArray[np.bool_], " rows"],
-    turns_rad: tuple[float, ...],
+    turns: tuple[int, ...],
+    turn_rad: float = 0.0,
     down_camera: Float64[NDArray[np.float64], "3"] | None = None,
     nominal_height_m: float = 1.5,
 ) -> QueryViews:
@@ -75,7 +76,8 @@ def query_views(
         camera: pinhole intrinsics.
         grid: the map's view grid.
         rows_seen: rows that the map's survey covers; the others are cut here too.
-        turns_rad: headings of the views against the optical axis, counter-clockwise.
+        turns: headings of the views, in whole columns of the grid counter-clockwise: all of them are cut out of one wide view.
+        turn_rad: what those are counted from, against the optical axis.
         down_camera: gravity in the camera frame, if known.
         nominal_height_m: of the camera above the ground, where the picture does not show it.
 
@@ -83,19 +85,20 @@ def query_views(
         NoDepthError: no cell of the grid holds a measurement.
     """
     level = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=nominal_height_m)
-    planes = np.zeros((len(turns_rad), len(PLANES), grid.rows, grid.columns), np.float32)
-    for view, turn_rad in zip(planes, turns_rad, strict=True):
-        R_camera_view = level.R_level_camera.T @ rotation_z(turn_rad)
-        ranges, colour, observed = gather(rgb, depth_m, camera, R_camera_view, grid)
-        seen = observed & rows_seen[:, None]
-        ranges *= seen
-        colour *= seen[..., None]
-        intensity, v1, v2 = ihs_linear(colour)
-        # Depth takes the place of the intensity, the colour stays (``service.imaging.fusion``).
-        view[0], view[1], view[2] = ranges, v1, v2
-        view[3] = heights_of(ranges, level.height_m, grid)
-        view[4] = seen
-        view[5] = brightness(intensity, measured=ranges > 0, seen=seen)
+    aside = max(abs(turn) for turn in turns)
+    R_camera_view = level.R_level_camera.T @ rotation_z(turn_rad)
+    ranges, colour, seen = gather(rgb, depth_m, camera, R_camera_view, grid.widened(aside))
+    seen &= rows_seen[:, None]
+    ranges *= seen
+    colour *= seen[..., None]
+    intensity, v1, v2 = ihs_linear(colour)
+    # Depth takes the place of the intensity, the colour stays (``service.imaging.fusion``).
+    wide = np.stack([ranges, v1, v2, heights_of(ranges, level.height_m, grid), seen])
+    planes = np.empty((len(turns), len(PLANES), grid.rows, grid.columns), np.float32)
+    for view, turn in zip(planes, turns, strict=True):
+        cut = slice(aside - turn, aside - turn + grid.columns)
+        view[:5] = wide[:, :, cut]
+        view[5] = brightness(intensity[:, cut], measured=view[0] > 0, seen=seen[:, cut])
     if not planes[:, 0].any():
         raise NoDepthError(
             "the depth picture has no measurement inside the view grid "
@@ -103,4 +106,5 @@ def query_views(
             f"{grid.elevation_top_deg:g} degrees of elevation): check scale, kind and the camera's intrinsics",
             field="depth",
         )
+    turns_rad = tuple(turn_rad + turn * grid.column_rad for turn in turns)
     return QueryViews(planes, turns_rad, level.R_level_camera, level.height_m, float(np.mean(planes[:, 0] > 0)))

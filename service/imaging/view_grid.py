@@ -5,7 +5,7 @@ heading of the view, z up (normal to the local ground). A cell is a ray, not an 
 ray through its centre, metres; 0 is "no measurement". Both sides forget what lies beyond ``max_range_m``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -50,6 +50,16 @@ class ViewGrid:
             span / 2 - span * (np.arange(self.columns) + 0.5) / self.columns
         )
         return azimuths
+
+    @property
+    def column_rad(self) -> float:
+        """Azimuth from a column to the next."""
+        return float(np.deg2rad(self.azimuth_span_deg)) / self.columns
+
+    def widened(self, columns: int) -> "ViewGrid":
+        """The same with so many further columns on either side."""
+        count = self.columns + 2 * columns
+        return replace(self, columns=count, azimuth_span_deg=self.azimuth_span_deg * count / self.columns)
 
     @property
     def around(self) -> int:

@@ -8,6 +8,7 @@ import numpy as np
 from service.errors import BundleError
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews, query_views
+from service.imaging.view_grid import ViewGrid
 from service.localization.answer import Answer, Timings
 from service.localization.decide import decide
 from service.localization.encoder import Encoder, Provider
@@ -22,7 +23,7 @@ from service.maps.reader import MapBundle
 from service.registration.points import inverse_depth_noise
 
 #: A query is also asked turned a third of the fan's 15 degrees either way: some turn is then within 2.5 degrees of a view.
-TURNS_RAD = tuple(float(turn) for turn in np.deg2rad([-5.0, 0.0, 5.0]))
+TURN_RAD = float(np.deg2rad(5.0))
 
 #: Distinct places that are looked up at least: registration starts from several.
 RANKED = 40
@@ -56,7 +57,7 @@ class Localizer:
         self.encoder = encoder
         self.clusters = clusters or ClusterSettings()
         self.refining = refining or RefineSettings()
-        self.turns_rad = TURNS_RAD
+        self.turns = turns_on(bundle.grid)
 
     @classmethod
     def open(cls, bundle: MapBundle, *, provider: Provider = "cpu") -> "Localizer":
@@ -99,7 +100,7 @@ class Localizer:
         """
         started = perf_counter()
         views = query_views(
-            query.rgb, query.depth_m, query.camera, turns_rad=self.turns_rad,
+            query.rgb, query.depth_m, query.camera, turns=self.turns,
             grid=self.bundle.grid, rows_seen=self.bundle.rows_seen, down_camera=query.down_camera,
         )  # fmt: skip
         fused = perf_counter()
@@ -180,6 +181,12 @@ class Localizer:
         above_lidar_m = view.height_m - self.bundle.manifest.lidar_height_m
         position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])
         return transform_from(hypothesis.R_map_level @ view.R_level_camera, position_m)
+
+
+def turns_on(grid: ViewGrid) -> tuple[int, ...]:
+    """The turns at which a query is asked, in the nearest whole number of columns."""
+    columns = max(1, round(TURN_RAD / grid.column_rad))
+    return (-columns, 0, columns)
 
 
 def _places_of(query: Query) -> int:

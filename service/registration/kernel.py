@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 from numpy.typing import NDArray
 
-from service.errors import StreetfixError
+from service.compiled import load
 from service.geometry.camera import PinholeCamera
 
 UNKNOWNS = 8  # translation, rotation, log scale, disparity offset
@@ -64,9 +64,7 @@ class SolverOptions:
 
 @cache
 def _library() -> ctypes.CDLL:
-    if not LIBRARY.exists():
-        raise StreetfixError(f"{LIBRARY.name} is missing beside {__file__}: install the package again (pip install .)")
-    library = ctypes.CDLL(str(LIBRARY))
+    library = load(LIBRARY)
     library.streetfix_align.argtypes = [
         POINTER(_Grid), c_void_p, POINTER(_Query), POINTER(_Options), c_double, c_double, c_int64, c_void_p,
     ]  # fmt: skip

@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z
+from service.imaging import level as module
 from service.imaging.level import level_camera, nominal_level
 
 CAMERA = PinholeCamera(160, 120, 80.0, 80.0, 79.5, 59.5)
@@ -97,3 +100,44 @@ def test_the_nominal_level_is_a_rotation_whose_third_row_is_up():
     R = nominal_level(down)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(R[2], -down, atol=1e-12)
+
+
+def plain_fit(depth_m, camera, R, height_m):
+    """The fit as NumPy says it."""
+    own = camera.scaled_to(depth_m.shape[1], depth_m.shape[0])
+    step = max(1, depth_m.shape[1] // module.STEP_PIXELS)
+    v, u = (
+        each.reshape(-1) for each in np.mgrid[step // 2 : depth_m.shape[0] : step, step // 2 : depth_m.shape[1] : step]
+    )
+    z = depth_m[v, u].astype(np.float64)
+    measured = (z > module.NEAR_M) & (z < module.REACH_M)
+    rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
+    points = (z[measured, None] * rays[measured]) @ R.T
+    prior = np.diag([1 / module.TILT_PRIOR_RAD**2, 1 / module.TILT_PRIOR_RAD**2, 1 / module.HEIGHT_PRIOR_M**2])
+    mean = solution = np.array([0.0, 0.0, -height_m])
+    near = points[points[:, 2] < -0.3 * height_m]
+    design, z = np.column_stack([near[:, :2], np.ones(len(near))]), near[:, 2]
+    reach = np.hypot(near[:, 0], near[:, 1])
+    certainty = 1.0 / ((module.NOISE_M + module.NOISE_PER_M * reach) ** 2 * module.CORRELATED)
+    for band_m, band_slope in module.BANDS:
+        keep = np.abs(z - design @ solution) < band_m + band_slope * reach
+        if not keep.any():
+            break
+        weighted = design * np.where(keep, certainty, 0.0)[:, None]
+        solution = np.linalg.solve(weighted.T @ design + prior, weighted.T @ z + prior @ mean)
+    return solution
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1), pitch_deg=st.floats(-8, 8), roll_deg=st.floats(-8, 8), noise=st.floats(0, 0.3),
+    size=st.sampled_from([(120, 160), (61, 79), (30, 500), (1, 1)]), holes=st.floats(0, 1),
+)  # fmt: skip
+def test_the_compiled_fit_says_what_plain_numpy_says(seed, pitch_deg, roll_deg, noise, size, holes):
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera(size[1], size[0], 80.0, 80.0, size[1] / 2, size[0] / 2)
+    depth_m = ground_depth(tilted(pitch_deg=pitch_deg, roll_deg=roll_deg), 1.6, camera=camera)
+    depth_m *= rng.normal(1, noise, depth_m.shape).astype(np.float32)
+    depth_m[rng.random(depth_m.shape) < holes] = rng.choice([0.0, np.nan, np.inf, -5.0, 1e30])
+    found = module._fit_ground(depth_m, camera, R_BODY_OPTICAL, 1.5)
+    np.testing.assert_allclose(found, plain_fit(depth_m, camera, R_BODY_OPTICAL, 1.5), rtol=1e-7, atol=1e-9)

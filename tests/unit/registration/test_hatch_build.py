@@ -11,7 +11,9 @@ from typing import Any, Generic, TypeVar
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
-C_FILES = ("service/registration/kernel.c", "service/imaging/gather.c", "service/imaging/depth16.c")
+C_FILES = tuple(
+    f"service/{name}.c" for name in ("registration/kernel", "imaging/gather", "imaging/level", "imaging/depth16")
+)
 T = TypeVar("T")
 
 
@@ -114,6 +116,7 @@ def test_each_file_is_compiled_beside_its_source(hook, machine, commands, tree, 
     assert data["artifacts"] == [
         "/service/registration/_kernel.so",
         "/service/imaging/_gather.so",
+        "/service/imaging/_level.so",
         "/service/imaging/_depth16.so",
     ]
 
