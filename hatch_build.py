@@ -11,7 +11,13 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 SOURCES = tuple(
     Path("service") / name
-    for name in ("registration/kernel.c", "imaging/gather.c", "imaging/level.c", "imaging/depth16.c")
+    for name in (
+        "registration/kernel.c",
+        "registration/points.c",
+        "imaging/gather.c",
+        "imaging/level.c",
+        "imaging/depth16.c",
+    )
 )
 FLAGS = ["-O3", "-std=c11", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
 

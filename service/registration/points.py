@@ -4,15 +4,39 @@ A triangulating camera errs by a share of its disparity, so by the square of the
 itself: on a plane the inverse depth is linear in the pixel, so what its second difference leaves is noise.
 """
 
+import ctypes
+from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from numpy.typing import NDArray
 
+from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation
 from service.registration.kernel import QueryPoints
+
+LIBRARY = Path(__file__).with_name("_points.so")
+#: Noise is read off each so manieth row, between pixels so far apart: nearer ones may have been smoothed together.
+NOISE_ROWS, NOISE_STEP, FEWEST_DIFFERENCES = 4, 2, 100
+
+
+class _Blocks(Structure):
+    _fields_ = [*((name, c_int64) for name in ("width", "size", "skip", "rows", "columns")),
+                *((name, c_double) for name in ("edge", "noise", "reach"))]  # fmt: skip
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    library = load(LIBRARY)
+    library.streetfix_blocks.argtypes = [c_void_p, POINTER(_Blocks), c_void_p]
+    library.streetfix_blocks.restype = None
+    library.streetfix_second_differences.argtypes = [c_void_p, c_int64, c_int64, c_int64, c_int64, c_void_p]
+    library.streetfix_second_differences.restype = c_int64
+    return library
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,15 +75,15 @@ class PointSettings:
 
 def inverse_depth_noise(depth_m: Float32[NDArray[np.float32], "H W"]) -> float:
     """Standard deviation of one pixel's inverse depth, 1/m: from second differences along rows."""
-    picture = depth_m[::4]
-    valid = picture > 0
-    inverse = np.where(valid, 1.0 / np.where(valid, picture, 1), 0).astype(np.float32)
-    step = 2  # neighbours at one pixel may have been smoothed together
-    second = inverse[:, : -2 * step] - 2 * inverse[:, step:-step] + inverse[:, 2 * step :]
-    known = valid[:, : -2 * step] & valid[:, step:-step] & valid[:, 2 * step :]
-    if known.sum() < 100:
+    depth_m = np.ascontiguousarray(depth_m, np.float32)
+    height, width = depth_m.shape
+    room = np.empty(-(-height // NOISE_ROWS) * width, np.float32)
+    known = _library().streetfix_second_differences(
+        depth_m.ctypes.data, height, width, NOISE_ROWS, NOISE_STEP, room.ctypes.data
+    )
+    if known < FEWEST_DIFFERENCES:
         return 0.25 / 80.0
-    return float(1.4826 * np.median(np.abs(second[known])) / np.sqrt(6.0))
+    return float(1.4826 * np.median(room[:known]) / np.sqrt(6.0))
 
 
 def points_of(
@@ -81,46 +105,35 @@ def points_of(
     own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
     size = max(1, width // settings.columns)
     rows, columns = height // size, width // size
-    skip = max(1, size // 4)
-    blocks = depth_m[: rows * size, : columns * size].reshape(rows, size, columns, size)[:, ::skip, :, ::skip]
-    samples = np.ascontiguousarray(blocks.transpose(0, 2, 1, 3)).reshape(rows * columns, -1)
-    valid = samples > 0
-    count = valid.sum(axis=1)
-    inverse = np.where(valid, 1.0 / np.where(valid, samples, 1), np.inf).astype(np.float32)
-    inverse.sort(axis=1)
-    enough = count >= max(1, (samples.shape[1] + 1) // 2)
-    at = np.arange(len(inverse))
-    pick = [inverse[at, np.maximum((share * (count - 1)).astype(int), 0)] for share in (0.1, 0.5, 0.9)]
-    # The median of an even number lies between the two middle ones: the lower alone would push every surface away.
-    pick[1] = 0.5 * (pick[1] + inverse[at, np.maximum(count // 2, 0)])
-    low, middle, high = (np.where(enough, p, 1.0) for p in pick)
+    skip = max(1, size // 4)  # so at most 49 pixels of a block are read
     noise = inverse_depth_noise(depth_m) if noise is None else noise
-    spread = (high - low) - 2.56 * noise
-    z = (1.0 / middle).astype(np.float32)
-    keep = enough & (spread < settings.edge * middle) & (z < settings.reach_m)
-    v, u = np.divmod(at, columns)
+    depth_m, z = np.ascontiguousarray(depth_m, np.float32), np.empty(rows * columns, np.float32)
+    _library().streetfix_blocks(
+        depth_m.ctypes.data, byref(_Blocks(width, size, skip, rows, columns, settings.edge, noise, settings.reach_m)),
+        z.ctypes.data,
+    )  # fmt: skip
+    kept = np.flatnonzero(z)
+    z, (v, u) = z[kept], np.divmod(kept, columns)
     centre_px = float(np.arange(0, size, skip).mean())  # of the pixels that were read, not of the block
     u, v = u * size + centre_px, v * size + centre_px
     rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
-    length = np.linalg.norm(rays, axis=1)
-    sigma = np.hypot(z**2 * noise * np.sqrt(1 + settings.correlated) * length, settings.floor_m)
     level: Float64[NDArray[np.float64], "n 3"] = rays @ R_level_camera.T
-    chosen = _chosen(np.flatnonzero(keep), z[:, None] * level, height_m, settings)
-    f = np.float32
-    above_m = z[chosen] * level[chosen, 2] + height_m
+    xyz = z[:, None] * level
+    chosen = _chosen(xyz[:, 2] + height_m < settings.ground_m, settings)
+    xyz, z, level, length = xyz[chosen], z[chosen], level[chosen], np.linalg.norm(rays[chosen], axis=1)
+    sigma = np.hypot(z**2 * noise * np.sqrt(1 + settings.correlated) * length, settings.floor_m)
+    above_m = xyz[:, 2] + height_m
     movable = (above_m > settings.ground_m) & (above_m < settings.movable_m)
+    f = np.float32
     return QueryPoints(
-        xyz=(z[:, None] * level)[chosen].astype(f), ray=(level / length[:, None])[chosen].astype(f), sigma=sigma[chosen].astype(f),
-        weight=np.where(movable, settings.movable_weight, 1.0).astype(f), q=(z / focal_baseline_px_m)[chosen].astype(f),
+        xyz=xyz.astype(f), ray=(level / length[:, None]).astype(f), sigma=sigma.astype(f),
+        weight=np.where(movable, settings.movable_weight, 1.0).astype(f), q=(z / focal_baseline_px_m).astype(f),
     )  # fmt: skip
 
 
-def _chosen(
-    rows: NDArray[np.intp], xyz: Float64[NDArray[np.float64], "n 3"], height_m: float, settings: PointSettings
-) -> NDArray[np.intp]:
-    """Evenly spread rows, the ground's at most their share."""
-    ground = xyz[rows, 2] + height_m < settings.ground_m
-    above, below = rows[~ground], rows[ground]
+def _chosen(ground: Bool[NDArray[np.bool_], " n"], settings: PointSettings) -> NDArray[np.intp]:
+    """Evenly spread points, the ground's at most their share."""
+    above, below = np.flatnonzero(~ground), np.flatnonzero(ground)
     most_below = int(settings.ground_share * settings.points)
     above = _thinned(above, settings.points - min(len(below), most_below))
     limit = max(50, int(len(above) * settings.ground_share / (1 - settings.ground_share)))

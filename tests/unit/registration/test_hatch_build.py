@@ -12,7 +12,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
 C_FILES = tuple(
-    f"service/{name}.c" for name in ("registration/kernel", "imaging/gather", "imaging/level", "imaging/depth16")
+    f"service/{name}.c"
+    for name in ("registration/kernel", "registration/points", "imaging/gather", "imaging/level", "imaging/depth16")
 )
 T = TypeVar("T")
 
@@ -115,6 +116,7 @@ def test_each_file_is_compiled_beside_its_source(hook, machine, commands, tree, 
     assert not list(tree.rglob("*.part"))
     assert data["artifacts"] == [
         "/service/registration/_kernel.so",
+        "/service/registration/_points.so",
         "/service/imaging/_gather.so",
         "/service/imaging/_level.so",
         "/service/imaging/_depth16.so",

@@ -213,3 +213,45 @@ def test_the_noise_may_be_given_and_is_then_not_read_off_the_picture():
     straight = np.argmax(found.ray @ R_BODY_OPTICAL[:, 2])
     assert found.sigma[straight] == pytest.approx(0.1 * np.sqrt(2), rel=1e-3)
     assert points_in(depth, replace(ALL, floor_m=0.0)).sigma.max() < 1e-3
+
+
+def plain_blocks(depth_m, wanted, noise):
+    """Depth of each block, 0 where it gives none, as NumPy says it."""
+    height, width = depth_m.shape
+    size = max(1, width // wanted.columns)
+    rows, columns, skip = height // size, width // size, max(1, size // 4)
+    found = np.zeros(rows * columns, np.float32)
+    for at in range(rows * columns):
+        v, u = at // columns * size, at % columns * size
+        block = depth_m[v : v + size : skip, u : u + size : skip].ravel()
+        inverse = np.sort(1 / block[block > 0])
+        if len(inverse) >= max(1, (len(block) + 1) // 2):
+            low, high = inverse[int(0.1 * (len(inverse) - 1))], inverse[int(0.9 * (len(inverse) - 1))]
+            middle = np.median(inverse)
+            if high - low - 2.56 * noise < wanted.edge * middle and 1 / middle < wanted.reach_m:
+                found[at] = 1 / middle
+    return found
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1), holes=st.floats(0, 1), spread=st.floats(0, 0.2), columns=st.sampled_from([10, 13, 22, 46, 70, 999]),
+)  # fmt: skip
+def test_the_compiled_blocks_are_those_of_plain_numpy(seed, holes, spread, columns):
+    rng = np.random.default_rng(seed)
+    depth_m = (rng.uniform(1, 45, (61, 1)) * rng.normal(1, spread, (61, 160)).clip(0.1)).astype(np.float32)
+    depth_m[rng.random(depth_m.shape) < holes] = rng.choice([0.0, np.nan, -3.0])
+    wanted = replace(ALL, columns=columns)
+    expected = plain_blocks(depth_m, wanted, 1e-4)
+    found = np.sort(depths_of(points_in(depth_m, wanted, noise=1e-4)))
+    np.testing.assert_allclose(found, np.sort(expected[expected > 0]), rtol=1e-5)
+
+
+def test_noise_is_read_as_plain_numpy_reads_it():
+    rng = np.random.default_rng(4)
+    depth_m = (1 / (0.1 + rng.normal(0, 0.002, (50, 70)))).astype(np.float32)
+    depth_m[rng.random(depth_m.shape) < 0.2] = 0
+    with np.errstate(divide="ignore"):
+        inverse = np.where(depth_m > 0, 1 / depth_m, np.nan)[::4]
+    second = np.abs(inverse[:, :-4] - 2 * inverse[:, 2:-2] + inverse[:, 4:])
+    assert inverse_depth_noise(depth_m) == pytest.approx(1.4826 * np.nanmedian(second) / np.sqrt(6), rel=1e-5)

@@ -1,0 +1,104 @@
+/* Thins a depth picture to blocks, each with the median of its inverse depths, and reads the picture's noise off its rows.
+ *
+ * Sizes and pointers are checked in Python. */
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+enum { LANES = 64, MOST_SAMPLES = 64, MOST_STEPS = 1024 };
+
+/* Sorts any number of values by the same exchanges (merge exchange: Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M),
+ * so that many blocks are sorted side by side. */
+static int64_t network(int n, uint8_t steps[MOST_STEPS][2])
+{
+    int64_t count = 0;
+    int top = 1;
+    while (2 * top < n) top *= 2;
+    for (int p = n > 1 ? top : 0; p > 0; p /= 2) {
+        int q = top, r = 0, d = p;
+        for (;;) {
+            for (int i = 0; i < n - d; i++)
+                if ((i & p) == r) {
+                    steps[count][0] = (uint8_t)i;
+                    steps[count][1] = (uint8_t)(i + d);
+                    count++;
+                }
+            if (q == p) break;
+            d = q - p;
+            q /= 2;
+            r = p;
+        }
+    }
+    return count;
+}
+
+typedef struct {
+    int64_t width;        /* of the picture */
+    int64_t size, skip;   /* of a block, and from one pixel that is read of it to the next; at most MOST_SAMPLES are read */
+    int64_t rows, columns; /* of blocks */
+    double edge, noise, reach;
+} Blocks;
+
+/* z: of each block the depth whose inverse is the median; 0 where too few pixels are measured, on an edge, or beyond the reach. */
+void streetfix_blocks(const float *depth, const Blocks *b, float *z)
+{
+    uint8_t steps[MOST_STEPS][2];
+    int samples = 0;
+    for (int64_t y = 0; y < b->size; y += b->skip)
+        for (int64_t x = 0; x < b->size; x += b->skip) samples++;
+    const int64_t count = network(samples, steps);
+    const int enough = samples + 1 > 2 ? (samples + 1) / 2 : 1;
+    float value[MOST_SAMPLES][LANES];
+    int measured[LANES];
+    for (int64_t row = 0; row < b->rows; row++)
+        for (int64_t first = 0; first < b->columns; first += LANES) {
+            const int64_t lanes = b->columns - first < LANES ? b->columns - first : LANES;
+            memset(measured, 0, sizeof measured);
+            int s = 0;
+            for (int64_t y = 0; y < b->size; y += b->skip)
+                for (int64_t x = 0; x < b->size; x += b->skip, s++) {
+                    const float *from = depth + (row * b->size + y) * b->width + first * b->size + x;
+                    for (int64_t k = 0; k < lanes; k++) {
+                        const float d = from[k * b->size];
+                        const int known = d > 0;
+                        value[s][k] = known ? 1.0f / d : INFINITY;
+                        measured[k] += known;
+                    }
+                    for (int64_t k = lanes; k < LANES; k++) value[s][k] = INFINITY;
+                }
+            for (int64_t i = 0; i < count; i++) {
+                float *one = value[steps[i][0]], *other = value[steps[i][1]];
+                for (int k = 0; k < LANES; k++) {
+                    const float low = one[k] < other[k] ? one[k] : other[k], high = one[k] < other[k] ? other[k] : one[k];
+                    one[k] = low;
+                    other[k] = high;
+                }
+            }
+            for (int64_t k = 0; k < lanes; k++) {
+                const int n = measured[k];
+                float *out = z + row * b->columns + first + k;
+                *out = 0;
+                if (n < enough) continue;
+                const float low = value[(int)(0.1 * (n - 1))][k], high = value[(int)(0.9 * (n - 1))][k];
+                /* The median of an even number lies between the two middle ones: the lower alone would push every surface away. */
+                const float middle = 0.5f * (value[(int)(0.5 * (n - 1))][k] + value[n / 2][k]);
+                const float far = 1.0f / middle;
+                if ((double)(high - low) - 2.56 * b->noise < b->edge * (double)middle && far < (float)b->reach) *out = far;
+            }
+        }
+}
+
+/* Absolute second differences of the inverse depth along every `every`-th row, of pixels `step` apart; how many there are. */
+int64_t streetfix_second_differences(const float *depth, int64_t height, int64_t width, int64_t every, int64_t step, float *out)
+{
+    int64_t count = 0;
+    for (int64_t y = 0; y < height; y += every) {
+        const float *row = depth + y * width;
+        for (int64_t x = 0; x + 2 * step < width; x++) {
+            const float a = row[x], b = row[x + step], c = row[x + 2 * step];
+            if (a > 0 && b > 0 && c > 0) out[count++] = fabsf(1.0f / a - 2.0f * (1.0f / b) + 1.0f / c);
+        }
+    }
+    return count;
+}
