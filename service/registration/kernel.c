@@ -24,13 +24,14 @@ typedef struct {
     const int32_t *nearest;      /* (blocks, 512): surfel nearest to the cell's centre, -1 for none */
 } Grid;
 
+/* Each array has room for a whole number of batches (AHEAD); what is beyond count is zero. */
 typedef struct {
     int64_t count;
-    const float *xyz;    /* (n, 3) level frame */
-    const float *ray;    /* (n, 3) unit */
-    const float *sigma;  /* (n) standard deviation along the ray, metres */
-    const float *weight; /* (n) share of the information that a point brings */
-    const float *q;      /* (n) depth / (focal x baseline); 0: no disparity offset */
+    const float *xyz[3]; /* level frame */
+    const float *ray[3]; /* unit */
+    const float *sigma;  /* standard deviation along the ray, metres */
+    const float *weight; /* share of the information that a point brings */
+    const float *q;      /* depth / (focal x baseline); 0: no disparity offset */
 } Query;
 
 typedef struct {
@@ -52,21 +53,15 @@ typedef struct {
 
 #define HEIGHT 60.0 /* m */
 #define AHEAD 32 /* points whose memory is fetched together: one by one, most of the time would go into waiting for it */
+#define LANES 8  /* sums that run side by side; the same on every machine, so that all get the same answer */
 
-/* Where the number of the surfel nearest to a point is kept; 0 far from every surface. */
-static inline const int32_t *cell_at(const Grid *g, double x, double y, double z)
-{
-    /* Without floor(), a call on a plain x86-64: what is not negative may be cut off instead. */
-    double scale = 1.0 / g->cell, fx = (x - g->ox) * scale, fy = (y - g->oy) * scale, fz = (z - g->oz) * scale;
-    if (!(fx >= 0 && fy >= 0 && fz >= 0 && fx < 1e9 && fy < 1e9 && fz < 1e9)) return 0;
-    uint32_t ix = (uint32_t)(int64_t)fx, iy = (uint32_t)(int64_t)fy, iz = (uint32_t)(int64_t)fz;
-    uint32_t a = ix / BLOCK, b = iy / BLOCK, c = iz / BLOCK;
-    if (a >= g->bx || b >= g->by || c >= g->bz) return 0;
-    int32_t block = g->block[(a * g->by + b) * g->bz + c];
-    if (block < 0) return 0;
-    uint32_t inside = ((ix % BLOCK) * BLOCK + iy % BLOCK) * BLOCK + iz % BLOCK;
-    return g->nearest + (int64_t)block * BLOCK_CELLS + inside;
-}
+/* Compiled twice, once for processors with wider registers; which one runs is decided when the library is loaded. Neither contracts
+ * products and sums (ISO C), so their answers are equal. */
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define WIDE __attribute__((flatten, target_clones("avx2", "default")))
+#else
+#define WIDE
+#endif
 
 /* Cholesky solution of A x = b in place; 0 where A is not positive definite. */
 static int solve(double A[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])
@@ -113,28 +108,52 @@ static void turn_left(double R[9], const double w_in[3])
     memcpy(R, out, sizeof out);
 }
 
-static inline void place(const Query *q, int64_t i, const State *s, double e_scale, double y[3], double *stretch)
-{
-    *stretch = e_scale / (1.0 + s->offset * q->q[i]);
-    double px = *stretch * q->xyz[3 * i], py = *stretch * q->xyz[3 * i + 1], pz = *stretch * q->xyz[3 * i + 2];
-    for (int k = 0; k < 3; k++) y[k] = s->R[3 * k] * px + s->R[3 * k + 1] * py + s->R[3 * k + 2] * pz;
-}
+/* Points of a query side by side, from where they stand to what they tell. */
+typedef struct {
+    double y[3][AHEAD], at[3][AHEAD], stretch[AHEAD]; /* turned into the map's axes; in the map */
+    const Surfel *found[AHEAD];
+    double gr[UNKNOWNS][AHEAD], r[AHEAD], w[AHEAD], known[AHEAD]; /* gradient of the residual, residual, weight; 1 on a surface */
+} Batch;
 
-/* Points first .. first + count - 1 as they stand in the map: ``y`` turned, ``w`` in the world, and their nearest surfels. */
-static void look_up(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
-                    int64_t count, double y[][3], double w[][3], double *stretch, const Surfel **found)
+/* Points first .. first + count - 1 as they stand in the map, and their nearest surfels. */
+static inline void look_up(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
+                           int64_t count, Batch *b)
 {
     const int32_t *cells[AHEAD];
+    int32_t in[3][AHEAD];
+    for (int k = 0; k < AHEAD; k++) b->stretch[k] = e_scale / (1.0 + s->offset * q->q[first + k]);
+    for (int k = 0; k < AHEAD; k++) {
+        const double px = b->stretch[k] * q->xyz[0][first + k], py = b->stretch[k] * q->xyz[1][first + k];
+        const double pz = b->stretch[k] * q->xyz[2][first + k];
+        for (int a = 0; a < 3; a++) {
+            b->y[a][k] = s->R[3 * a] * px + s->R[3 * a + 1] * py + s->R[3 * a + 2] * pz;
+            b->at[a][k] = b->y[a][k] + s->t[a];
+        }
+    }
+    /* What is not negative may be cut off instead of rounded down; what lies beyond the grid, or is no number, is none of its cells. */
+    const double origin[3] = {g->ox, g->oy, g->oz}, scale = 1.0 / g->cell;
+    for (int a = 0; a < 3; a++)
+        for (int k = 0; k < AHEAD; k++) {
+            double cell = (b->at[a][k] - origin[a]) * scale;
+            cell = cell >= 0 ? cell : -2.0;
+            cell = cell < 1e9 ? cell : -2.0;
+            in[a][k] = (int32_t)cell;
+        }
     for (int64_t k = 0; k < count; k++) {
-        place(q, first + k, s, e_scale, y[k], stretch + k);
-        for (int a = 0; a < 3; a++) w[k][a] = y[k][a] + s->t[a];
-        cells[k] = cell_at(g, w[k][0], w[k][1], w[k][2]);
-        if (cells[k]) __builtin_prefetch(cells[k]);
+        const int32_t ix = in[0][k], iy = in[1][k], iz = in[2][k];
+        const int64_t i = ix / BLOCK, j = iy / BLOCK, l = iz / BLOCK;
+        cells[k] = 0;
+        if ((ix | iy | iz) < 0 || i >= g->bx || j >= g->by || l >= g->bz) continue;
+        const int32_t block = g->block[(i * g->by + j) * g->bz + l];
+        if (block < 0) continue;
+        cells[k] = g->nearest + (int64_t)block * BLOCK_CELLS + ((ix % BLOCK) * BLOCK + iy % BLOCK) * BLOCK + iz % BLOCK;
+        __builtin_prefetch(cells[k]);
     }
     for (int64_t k = 0; k < count; k++) {
-        found[k] = cells[k] && *cells[k] >= 0 ? surfels + *cells[k] : 0;
-        if (found[k]) __builtin_prefetch(found[k]);
+        b->found[k] = cells[k] && *cells[k] >= 0 ? surfels + *cells[k] : 0;
+        if (b->found[k]) __builtin_prefetch(b->found[k]);
     }
+    for (int64_t k = count; k < AHEAD; k++) b->found[k] = 0;
 }
 
 /* The camera stands at its height above the anchor's ground, upright on it; scale and offset are small. */
@@ -172,59 +191,94 @@ static void add_priors(const Options *o, const State *s, double n, double H[UNKN
         }
 }
 
-/* What one point tells: its residual's gradient, the residual r itself, its weight; 0 where no surface is within reach. */
-static inline int term(const Query *q, const Options *o, const State *s, double robust, int64_t i, const double y[3],
-                       const double at[3], double stretch, double e_scale, const Surfel *m, double gr[UNKNOWNS], double *r_out,
-                       double *w_out)
+/* What points tell: their residuals' gradients, the residuals, their weights; 0 where no surface is within reach. */
+static inline void tell(const Query *q, const Options *o, const State *s, double robust, double e_scale, int64_t first, Batch *b)
 {
-    if (!m) return 0;
-    double dx = at[0] - m->x, dy = at[1] - m->y, dz = at[2] - m->z;
-    if (dx * dx + dy * dy + dz * dz > o->reach * o->reach) return 0;
-    double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
-    for (int k = 0; k < 3; k++)
-        c += (&m->nx)[k] * (s->R[3 * k] * q->ray[3 * i] + s->R[3 * k + 1] * q->ray[3 * i + 1] + s->R[3 * k + 2] * q->ray[3 * i + 2]);
-    gr[0] = m->nx, gr[1] = m->ny, gr[2] = m->nz;
-    gr[3] = y[1] * m->nz - y[2] * m->ny;
-    gr[4] = y[2] * m->nx - y[0] * m->nz;
-    gr[5] = y[0] * m->ny - y[1] * m->nx;
-    gr[6] = y[0] * m->nx + y[1] * m->ny + y[2] * m->nz;
-    gr[7] = -gr[6] * q->q[i] * stretch / e_scale;
-    /* A triangulating camera errs evenly in 1 / range. Its noise must be told from the range where the ray meets the surface:
-     * by the measured one, what is seen too near counts as well measured and pulls everything its way. */
-    double ratio = gr[6] != 0 ? 1 - r / gr[6] : 1;
-    ratio = ratio < 0.5 ? 0.5 : ratio > 2 ? 2 : ratio;
-    double along = q->sigma[i] * c;
-    double variance = along * along * ratio * ratio * ratio + o->surface * o->surface + (double)m->thickness * m->thickness;
-    double k2 = 4 * variance + robust * robust, damp = k2 / (k2 + r * r);
-    *r_out = r;
-    *w_out = q->weight[i] * damp * damp / variance;
-    return 1;
+    double n[3][AHEAD], off[3][AHEAD], thickness[AHEAD];
+    for (int k = 0; k < AHEAD; k++) {
+        const Surfel *m = b->found[k];
+        b->known[k] = m != 0;
+        if (!m) {
+            n[0][k] = n[1][k] = off[0][k] = off[1][k] = off[2][k] = 0;
+            n[2][k] = thickness[k] = 1; /* so that no variance is 0 */
+            continue;
+        }
+        n[0][k] = m->nx, n[1][k] = m->ny, n[2][k] = m->nz;
+        off[0][k] = b->at[0][k] - m->x, off[1][k] = b->at[1][k] - m->y, off[2][k] = b->at[2][k] - m->z;
+        thickness[k] = m->thickness;
+    }
+    const float *rx = q->ray[0] + first, *ry = q->ray[1] + first, *rz = q->ray[2] + first;
+    const float *sigma = q->sigma + first, *weight = q->weight + first, *depth = q->q + first;
+    const double reach2 = o->reach * o->reach, surface2 = o->surface * o->surface, robust2 = robust * robust;
+    for (int k = 0; k < AHEAD; k++) {
+        const double dx = off[0][k], dy = off[1][k], dz = off[2][k], nx = n[0][k], ny = n[1][k], nz = n[2][k];
+        const double y0 = b->y[0][k], y1 = b->y[1][k], y2 = b->y[2][k];
+        const double there = b->known[k], use = dx * dx + dy * dy + dz * dz > reach2 ? 0.0 : there;
+        const double r = nx * dx + ny * dy + nz * dz;
+        const double c = nx * (s->R[0] * (double)rx[k] + s->R[1] * (double)ry[k] + s->R[2] * (double)rz[k])
+                       + ny * (s->R[3] * (double)rx[k] + s->R[4] * (double)ry[k] + s->R[5] * (double)rz[k])
+                       + nz * (s->R[6] * (double)rx[k] + s->R[7] * (double)ry[k] + s->R[8] * (double)rz[k]);
+        const double along_y = y0 * nx + y1 * ny + y2 * nz;
+        b->gr[0][k] = nx, b->gr[1][k] = ny, b->gr[2][k] = nz;
+        b->gr[3][k] = y1 * nz - y2 * ny;
+        b->gr[4][k] = y2 * nx - y0 * nz;
+        b->gr[5][k] = y0 * ny - y1 * nx;
+        b->gr[6][k] = along_y;
+        b->gr[7][k] = -along_y * depth[k] * b->stretch[k] / e_scale;
+        /* A triangulating camera errs evenly in 1 / range. Its noise must be told from the range where the ray meets the surface:
+         * by the measured one, what is seen too near counts as well measured and pulls everything its way. */
+        double ratio = 1 - r / (along_y != 0 ? along_y : 1);
+        ratio = along_y != 0 ? ratio : 1;
+        ratio = ratio < 0.5 ? 0.5 : ratio;
+        ratio = ratio > 2 ? 2 : ratio;
+        const double along = sigma[k] * c;
+        const double variance = along * along * ratio * ratio * ratio + surface2 + thickness[k] * thickness[k];
+        const double k2 = 4 * variance + robust2, damp = k2 / (k2 + r * r);
+        b->r[k] = r;
+        b->w[k] = use * weight[k] * damp * damp / variance;
+        b->known[k] = use;
+    }
 }
 
-static void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, State *s)
+static inline void add_products(const double *one, const double *other, double *sums)
 {
+    double own[LANES] = {0};
+    for (int k = 0; k < AHEAD; k += LANES)
+        for (int l = 0; l < LANES; l++) own[l] += one[k + l] * other[k + l];
+    for (int l = 0; l < LANES; l++) sums[l] += own[l];
+}
+
+static inline void align_one(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, State *s)
+{
+    Batch batch;
     double known = 0;
     for (int64_t i = 0; i < q->count; i++) known += q->weight[i];
     for (int64_t it = 0; it < o->iterations; it++) {
         double share = o->iterations > 1 ? (double)it / (double)(o->iterations - 1) : 1.0;
         double robust = o->robust_first * pow(o->robust_last / o->robust_first, share);
-        double H[UNKNOWNS][UNKNOWNS] = {{0}}, b[UNKNOWNS] = {0}, gr[UNKNOWNS], r, w, e_scale = exp(s->log_scale);
-        double total = 0, batch_y[AHEAD][3], batch_w[AHEAD][3], batch_stretch[AHEAD];
-        const Surfel *batch_found[AHEAD];
-        for (int64_t i = 0; i < q->count; i++) {
-            int64_t in = i % AHEAD, left = q->count - i;
-            if (in == 0)
-                look_up(g, surfels, q, s, e_scale, i, left < AHEAD ? left : AHEAD, batch_y, batch_w, batch_stretch, batch_found);
-            if (!term(q, o, s, robust, i, batch_y[in], batch_w[in], batch_stretch[in], e_scale, batch_found[in], gr, &r, &w)) continue;
+        double sums[UNKNOWNS][UNKNOWNS + 1][LANES] = {{{0}}}, e_scale = exp(s->log_scale), total = 0;
+        for (int64_t first = 0; first < q->count; first += AHEAD) {
+            const int64_t left = q->count - first, count = left < AHEAD ? left : AHEAD;
+            look_up(g, surfels, q, s, e_scale, first, count, &batch);
+            tell(q, o, s, robust, e_scale, first, &batch);
             for (int a = 0; a < UNKNOWNS; a++) {
-                double wa = w * gr[a];
-                b[a] -= wa * r;
-                for (int d = 0; d <= a; d++) H[a][d] += wa * gr[d];
+                double weighted[AHEAD];
+                for (int k = 0; k < AHEAD; k++) weighted[k] = batch.w[k] * batch.gr[a][k];
+                for (int d = 0; d <= a; d++) add_products(weighted, batch.gr[d], sums[a][d]);
+                add_products(weighted, batch.r, sums[a][UNKNOWNS]);
             }
-            total += q->weight[i];
+            for (int64_t k = 0; k < count; k++) total += batch.known[k] * q->weight[first + k];
         }
-        for (int a = 0; a < UNKNOWNS; a++)
-            for (int d = 0; d < a; d++) H[d][a] = H[a][d];
+        double H[UNKNOWNS][UNKNOWNS], b[UNKNOWNS];
+        for (int a = 0; a < UNKNOWNS; a++) {
+            for (int d = 0; d <= a; d++) {
+                H[a][d] = 0;
+                for (int l = 0; l < LANES; l++) H[a][d] += sums[a][d][l];
+                H[d][a] = H[a][d];
+            }
+            b[a] = 0;
+            for (int l = 0; l < LANES; l++) b[a] -= sums[a][UNKNOWNS][l];
+        }
         for (int a = 0; a < UNKNOWNS; a++) memcpy(s->H + a * UNKNOWNS, H[a], sizeof H[a]);
         s->seen = total;
         add_priors(o, s, known, H, b);
@@ -239,34 +293,36 @@ static void align_one(const Grid *g, const Surfel *surfels, const Query *q, cons
 }
 
 /* Share of the query's weight that lies on the map: weighted by how well each point is measured, softly cut. */
-static void score_one(const Grid *g, const Surfel *surfels, const Query *q, double tolerance, double height_min, State *s)
+static inline void score_one(const Grid *g, const Surfel *surfels, const Query *q, double tolerance, double height_min, State *s)
 {
+    Batch batch;
     double inliers = 0, total = 0, e_scale = exp(s->log_scale);
-    double batch_y[AHEAD][3], batch_w[AHEAD][3], batch_stretch[AHEAD];
-    const Surfel *batch_found[AHEAD];
-    for (int64_t i = 0; i < q->count; i++) {
-        int64_t in = i % AHEAD, left = q->count - i;
-        if (in == 0)
-            look_up(g, surfels, q, s, e_scale, i, left < AHEAD ? left : AHEAD, batch_y, batch_w, batch_stretch, batch_found);
-        double sigma = q->sigma[i];
-        if (batch_y[in][2] < height_min) continue;
-        double w = q->weight[i] / (1 + 4 * sigma * sigma);
-        total += w;
-        const Surfel *m = batch_found[in];
-        if (!m) continue;
-        double dx = batch_w[in][0] - m->x, dy = batch_w[in][1] - m->y, dz = batch_w[in][2] - m->z;
-        if (dx * dx + dy * dy + dz * dz > 1.0 + 4 * sigma * sigma) continue;
-        double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
-        for (int k = 0; k < 3; k++)
-            c += (&m->nx)[k] * (s->R[3 * k] * q->ray[3 * i] + s->R[3 * k + 1] * q->ray[3 * i + 1] + s->R[3 * k + 2] * q->ray[3 * i + 2]);
-        double variance = sigma * sigma * c * c + tolerance * tolerance;
-        inliers += w * exp(-0.5 * r * r / variance);
+    for (int64_t first = 0; first < q->count; first += AHEAD) {
+        const int64_t left = q->count - first, count = left < AHEAD ? left : AHEAD;
+        look_up(g, surfels, q, s, e_scale, first, count, &batch);
+        for (int64_t k = 0; k < count; k++) {
+            const int64_t i = first + k;
+            double sigma = q->sigma[i];
+            if (batch.y[2][k] < height_min) continue;
+            double w = q->weight[i] / (1 + 4 * sigma * sigma);
+            total += w;
+            const Surfel *m = batch.found[k];
+            if (!m) continue;
+            double dx = batch.at[0][k] - m->x, dy = batch.at[1][k] - m->y, dz = batch.at[2][k] - m->z;
+            if (dx * dx + dy * dy + dz * dz > 1.0 + 4 * sigma * sigma) continue;
+            double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
+            for (int a = 0; a < 3; a++)
+                c += (&m->nx)[a] * (s->R[3 * a] * q->ray[0][i] + s->R[3 * a + 1] * q->ray[1][i] + s->R[3 * a + 2] * q->ray[2][i]);
+            double variance = sigma * sigma * c * c + tolerance * tolerance;
+            inliers += w * exp(-0.5 * r * r / variance);
+        }
     }
     s->inliers = total > 0 ? inliers / total : 0;
     s->cost = total;
 }
 
-void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, double tolerance, double height_min, int64_t count, State *states)
+WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, double tolerance,
+                          double height_min, int64_t count, State *states)
 {
     for (int64_t k = 0; k < count; k++) {
         if (o->iterations > 0) align_one(g, surfels, q, o, states + k);
@@ -277,15 +333,15 @@ void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const
 /* The pull (weight times residual times gradient) of each patch of the picture at a pose, summed: (patches, 8), zero at first. */
 void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch, double *pulls)
 {
-    double e_scale = exp(s->log_scale), gr[UNKNOWNS], r, w;
-    double batch_y[AHEAD][3], batch_w[AHEAD][3], batch_stretch[AHEAD];
-    const Surfel *batch_found[AHEAD];
-    for (int64_t i = 0; i < q->count; i++) {
-        int64_t in = i % AHEAD, left = q->count - i;
-        if (in == 0)
-            look_up(g, surfels, q, s, e_scale, i, left < AHEAD ? left : AHEAD, batch_y, batch_w, batch_stretch, batch_found);
-        if (!term(q, o, s, o->robust_last, i, batch_y[in], batch_w[in], batch_stretch[in], e_scale, batch_found[in], gr, &r, &w)) continue;
-        for (int a = 0; a < UNKNOWNS; a++) pulls[UNKNOWNS * patch[i] + a] += w * r * gr[a];
+    Batch batch;
+    const double e_scale = exp(s->log_scale);
+    for (int64_t first = 0; first < q->count; first += AHEAD) {
+        const int64_t left = q->count - first, count = left < AHEAD ? left : AHEAD;
+        look_up(g, surfels, q, s, e_scale, first, count, &batch);
+        tell(q, o, s, o->robust_last, e_scale, first, &batch);
+        for (int64_t k = 0; k < count; k++)
+            for (int a = 0; a < UNKNOWNS; a++)
+                pulls[UNKNOWNS * patch[first + k] + a] += batch.w[k] * batch.r[k] * batch.gr[a][k];
     }
 }
 

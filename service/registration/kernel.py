@@ -16,6 +16,7 @@ from service.geometry.camera import PinholeCamera
 
 UNKNOWNS = 8  # translation, rotation, log scale, disparity offset
 BLOCK = 8
+AHEAD = 32  # points that the kernel works on side by side
 LIBRARY = Path(__file__).with_name("_kernel.so")
 
 #: A surface element: position relative to the grid's origin, unit normal, thickness across the surface (m), points.
@@ -34,7 +35,8 @@ class _Grid(Structure):
 
 
 class _Query(Structure):
-    _fields_ = [("count", c_int64), *((name, c_void_p) for name in ("xyz", "ray", "sigma", "weight", "q"))]
+    _fields_ = [("count", c_int64), ("xyz", c_void_p * 3), ("ray", c_void_p * 3),
+                *((name, c_void_p) for name in ("sigma", "weight", "q"))]  # fmt: skip
 
 
 class _Options(Structure):
@@ -167,7 +169,19 @@ def pulls(
 
 def _as_c(query: QueryPoints, options: SolverOptions) -> tuple[_Query, _Options]:
     given = _Options(**{field[0]: getattr(options, field[0]) for field in _Options._fields_})
-    return _Query(len(query), *(getattr(query, name).ctypes.data for name in QueryPoints.__slots__)), given
+    planes = np.zeros((9, -(-len(query) // AHEAD) * AHEAD), np.float32)
+    for rows, values in (
+        (slice(0, 3), query.xyz.T),
+        (slice(3, 6), query.ray.T),
+        (6, query.sigma),
+        (7, query.weight),
+        (8, query.q),
+    ):
+        planes[rows, : len(query)] = values
+    at = [planes.ctypes.data + number * planes.strides[0] for number in range(len(planes))]
+    points = _Query(len(query), (c_void_p * 3)(*at[:3]), (c_void_p * 3)(*at[3:6]), *at[6:])
+    points.planes = planes  # lives as long as what points there
+    return points, given
 
 
 def nearest_grid(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> NearestGrid:
