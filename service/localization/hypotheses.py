@@ -76,29 +76,27 @@ def cluster(matches: ViewMatches, settings: ClusterSettings) -> tuple[Hypothesis
     """
     count = min(settings.views, len(matches))
     weights = similarity_weights(matches.similarity[:count], settings.temperature)
-    left = np.ones(count, np.bool_)
+    near = _near(matches, count, settings)
+    streets, left = matches.street[:count], np.ones(count, np.bool_)
     found: list[Hypothesis] = []
     while left.any():
-        members = _members_around(int(np.argmax(left)), matches, left, settings)
+        members = near[left.argmax()] & left
+        named = streets[members & (streets >= 0)]
+        if len(named):
+            members &= (streets == named[0]) | (streets < 0)
         left &= ~members
         found.append(_hypothesis(np.flatnonzero(members), matches, weights))
     return tuple(sorted(found, key=lambda hypothesis: -hypothesis.weight))
 
 
-def _members_around(
-    seed: int, matches: ViewMatches, left: Bool[NDArray[np.bool_], " n"], settings: ClusterSettings
-) -> Bool[NDArray[np.bool_], " n"]:
-    count = len(left)
-    offset_m = matches.T_map_place[:count, :2, 3] - matches.T_map_place[seed, :2, 3]
-    turn = matches.heading_rad[:count] - matches.heading_rad[seed]
-    near = np.hypot(offset_m[:, 0], offset_m[:, 1]) <= settings.radius_m
-    alike = np.cos(turn) >= np.cos(settings.heading_rad)
-    members: Bool[NDArray[np.bool_], " n"] = left & near & alike
-    streets = matches.street[:count]
-    named = streets[members & (streets >= 0)]
-    if len(named):
-        members &= (streets == named[0]) | (streets < 0)
-    return members
+def _near(matches: ViewMatches, count: int, settings: ClusterSettings) -> Bool[NDArray[np.bool_], "n n"]:
+    """Which of the first ``count`` matches lie near which, in space and heading."""
+    at, heading_rad = matches.T_map_place[:count, :2, 3], matches.heading_rad[:count]
+    offset_m = at[:, None] - at
+    close = np.hypot(offset_m[..., 0], offset_m[..., 1]) <= settings.radius_m
+    alike = np.cos(heading_rad[:, None] - heading_rad) >= np.cos(settings.heading_rad)
+    near: Bool[NDArray[np.bool_], "n n"] = close & alike
+    return near
 
 
 def _hypothesis(

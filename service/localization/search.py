@@ -112,16 +112,18 @@ def _matches(
 def distinct_places(matches: ViewMatches, count: int) -> tuple[Neighbour, ...]:
     """The ``count`` most similar places, each by its best view."""
     _, first = np.unique(matches.place, return_index=True)
-    return tuple(_neighbour(matches, int(row)) for row in np.sort(first)[:count])
-
-
-def _neighbour(matches: ViewMatches, row: int) -> Neighbour:
-    similarity = float(matches.similarity[row])
-    return Neighbour(
-        place=int(matches.place[row]),
-        similarity=similarity,
-        distance=float(np.sqrt(max(0.0, 2.0 - 2.0 * similarity))),
-        street=int(matches.street[row]),
-        position_m=matches.T_map_place[row, :3, 3].copy(),
-        heading_rad=float(matches.heading_rad[row]),
+    rows = np.sort(first)[:count]
+    similarity = matches.similarity[rows]
+    columns = (
+        matches.place[rows], similarity, np.sqrt(np.maximum(0.0, 2.0 - 2.0 * similarity)), matches.street[rows],
+        matches.heading_rad[rows],
+    )  # fmt: skip
+    positions_m = matches.T_map_place[rows, :3, 3]
+    return tuple(
+        Neighbour(
+            place=place, similarity=alike, distance=apart, street=street, position_m=position_m, heading_rad=heading_rad
+        )
+        for place, alike, apart, street, heading_rad, position_m in zip(
+            *(column.tolist() for column in columns), positions_m, strict=True
+        )
     )

@@ -86,3 +86,18 @@ def test_descriptors_that_are_no_numbers_are_refused(tmp_path: Path, value: floa
     write_index(tmp_path / "i", descriptors)
     with pytest.raises(BundleError, match="not finite"):
         ViewIndex.open(tmp_path / "i")
+
+
+def test_the_coarse_copy_has_no_more_numbers_than_the_descriptors_need(tmp_path: Path) -> None:
+    few = (
+        np.random.default_rng(3).normal(size=(300, 5))
+        @ np.linalg.qr(np.random.default_rng(4).normal(size=(64, 5)))[0].T
+    )
+    descriptors = (few / np.linalg.norm(few, axis=1, keepdims=True)).astype(np.float32)
+    write_index(tmp_path / "few", descriptors)
+    write_index(tmp_path / "all", unit_vectors(300, 64))
+    index = ViewIndex.open(tmp_path / "few")
+    assert index.coarse_numbers == 16
+    assert ViewIndex.open(tmp_path / "all").coarse_numbers == 64
+    best = np.argsort(-(descriptors @ descriptors[7]))[:10]
+    assert set(best) <= set(index.shortlist(descriptors[7], 20).tolist())
