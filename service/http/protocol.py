@@ -27,7 +27,7 @@ class BoundedHttp(HttpToolsProtocol):
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
         self._in_head = False  # it has begun and is not here as a whole
-        self._body_bytes = self._other_bytes = 0
+        self._bodies_bytes = self._body_bytes = self._other_bytes = 0  # of all requests, and of this one
         self._head_timer: asyncio.TimerHandle | None = None
         self._unanswered: list[RequestResponseCycle] = []
 
@@ -48,11 +48,11 @@ class BoundedHttp(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse, then count what was no body."""
-        before = self._body_bytes
+        before = self._bodies_bytes
         super().data_received(data)
         if self.transport.is_closing():
             return
-        self._other_bytes += len(data) - (self._body_bytes - before)
+        self._other_bytes += len(data) - (self._bodies_bytes - before)
         if self._other_bytes > HEAD_BYTES + self._body_bytes // _FRAMES_SHARE:
             self._refuse()
         elif self._in_head and self._head_timer is None:
@@ -76,6 +76,7 @@ class BoundedHttp(HttpToolsProtocol):
 
     def on_body(self, body: bytes) -> None:
         """A piece of its body."""
+        self._bodies_bytes += len(body)
         self._body_bytes += len(body)
         super().on_body(body)
 

@@ -48,10 +48,10 @@ def decode_rgb(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> Rgb:
         )
     header = header_of(data, format_, field=field)
     require_pixels(header.height, header.width, limits, field=field)
-    bgr = opencv_decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, field=field)
-    if bgr.shape != (header.height, header.width, 3):
-        raise damaged(field, f"its pixels are {bgr.shape}, its header says {header.height}x{header.width}")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    rgb = opencv_decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION, field=field)
+    if rgb.shape != (header.height, header.width, 3):
+        raise damaged(field, f"its pixels are {rgb.shape}, its header says {header.height}x{header.width}")
+    return rgb.astype(np.uint8, copy=False)
 
 
 def decode_depth(

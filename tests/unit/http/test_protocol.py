@@ -83,7 +83,7 @@ def send_endlessly(connection: socket.socket, piece: bytes, times: int) -> None:
 
 def test_bodies_come_whole_and_connections_are_kept(connect: Connect) -> None:
     connection = connect()
-    for size in (0, 3, 300_000):
+    for size in (0, 3, 300_000, 200_000, 1, 0, 300_000):
         connection.sendall(b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % size + bytes(size))
         assert first(connection) == b"200 %d" % size
 
