@@ -205,7 +205,7 @@ def _answer(
     engine = Engine.open(settings, choices=choices)
     try:
         config = uvicorn.Config(
-            create_app(engine, keys), http=BoundedHttp, ws="none", log_config=None, access_log=False, lifespan="off",
+            create_app(engine, keys), http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False, lifespan="off",
             timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
         )  # fmt: skip
         with _grpc(engine, keys, tls) as (grpc_port, leave), _watching(engine):
