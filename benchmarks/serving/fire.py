@@ -163,14 +163,16 @@ def soak_rows(report: Report, site: Site, *, minutes: float, core: int | None) -
     threads = {} if core is None else {"threads": 1}
     with Server(site.bundle, core=core, **threads) as server:
         peak, _ = load(server, "rest", sent, closed(15, MANY))
-        at_s, resident = [], []
+        at_s, resident, anonymous = [], [], []
         over = threading.Event()
 
         def watch() -> None:
             began = time.monotonic()
             while not over.wait(5.0):
                 at_s.append(time.monotonic() - began)
-                resident.append(server.used.resident_mib)
+                used = server.used
+                resident.append(used.resident_mib)
+                anonymous.append(used.anonymous_mib)
 
         watcher = threading.Thread(target=watch)
         watcher.start()
@@ -179,7 +181,9 @@ def soak_rows(report: Report, site: Site, *, minutes: float, core: int | None) -
         over.set()
         watcher.join()
     late = np.array(at_s) >= 10 * minutes
-    slope = float(np.polyfit(np.array(at_s)[late] / 3600, np.array(resident)[late], 1)[0])
-    report.row("soak.slope_mib_per_hour", slope, "MiB/h", bar=5, better="lower", n=found.answers,
-               why=None if minutes >= 30 else f"of {minutes:g} minutes only")  # fmt: skip
+    hours = np.array(at_s)[late] / 3600
+    slope, own = (float(np.polyfit(hours, np.array(each)[late], 1)[0]) for each in (resident, anonymous))
+    why = None if minutes >= 30 else f"of {minutes:g} minutes only"
+    report.row("soak.slope_mib_per_hour", slope, "MiB/h", bar=5, better="lower", n=found.answers, why=why)
+    report.row("soak.anonymous_slope_mib_per_hour", own, "MiB/h", n=found.answers)  # less the pages of mapped files
     report.row("soak.failed_requests", sum(found.errors.values()), "count", n=found.answers)

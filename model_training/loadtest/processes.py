@@ -11,10 +11,11 @@ _TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Of a tree of processes: processor seconds, resident MiB."""
+    """Of a tree of processes: processor seconds, resident MiB, and so many of them that are no file's pages."""
 
     cpu_s: float
     resident_mib: float
+    anonymous_mib: float
 
 
 def usage(pid: int) -> Usage:
@@ -26,7 +27,8 @@ def usage(pid: int) -> Usage:
     table = _table()
     tree = _tree(table, pid)
     pages = sum(table[each][2] for each in tree)
-    return Usage(sum(table[each][1] for each in tree), pages * os.sysconf("SC_PAGE_SIZE") / 2**20)
+    page_mib = os.sysconf("SC_PAGE_SIZE") / 2**20
+    return Usage(sum(table[each][1] for each in tree), pages * page_mib, sum(_anonymous_mib(each) for each in tree))
 
 
 def descendants(pid: int) -> set[int]:
@@ -48,6 +50,14 @@ def _table() -> dict[int, tuple[int, float, int]]:
             continue
         found[int(folder.name)] = (int(fields[1]), (int(fields[11]) + int(fields[12])) / _TICKS, int(fields[21]))
     return found
+
+
+def _anonymous_mib(pid: int) -> float:
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:  # ended meanwhile
+        return 0.0
+    return sum(int(line.split()[1]) for line in lines if line.startswith("RssAnon:")) / 1024
 
 
 def _tree(table: dict[int, tuple[int, float, int]], pid: int) -> set[int]:

@@ -24,7 +24,7 @@ class DirectMiddleware:
     def __init__(self, app: ASGIApp, router: APIRouter) -> None:
         self._app = app
         routes = [route for route in router.routes if isinstance(route, APIRoute)]
-        self._routes = {(method, route.path): route for route in routes for method in route.methods}
+        self._routes = {(method, route.path): route for route in routes for method in route.methods or ()}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One ASGI call."""

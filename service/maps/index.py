@@ -49,7 +49,7 @@ class _Coarse:
             moment += vectors.T @ vectors
         self.is_finite = bool(np.isfinite(moment).all())
         self._axes = np.zeros((index.d, 0), np.float32)
-        self._numbers: faiss.Index = None
+        self._numbers: faiss.Index | None = None
         if not (self.is_finite and chunks):
             return
         self._axes = _principal_axes(moment)
@@ -73,6 +73,8 @@ class _Coarse:
         """Numbers of about the k most similar."""
         along = descriptor @ self._axes
         levels = np.float32(_LEVELS / max(float(np.abs(along).max()), 1e-9))  # the search is among whole numbers
+        if self._numbers is None:
+            return np.zeros(0, np.int64)
         found: NDArray[np.int64] = self._numbers.search(np.rint(along * levels)[None], k)[1][0]
         return found
 
