@@ -24,8 +24,8 @@ from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.messages import request_from, sequence_request_from
 from service.http.body import split_multipart
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb
-from service.imaging.depth_formats import write_raw16
 from service.imaging.depth_units import depth_from_values
+from service.imaging.raw16 import write_raw16
 from service.localization.localizer import Localizer
 from service.localization.query import Query
 from service.maps.manifest import FILE as MANIFEST_FILE

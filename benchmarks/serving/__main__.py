@@ -12,6 +12,7 @@ from pathlib import Path
 from benchmarks.plans import paper_plan
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs
+from benchmarks.serving.decoding import decoding_rows
 from benchmarks.serving.fire import overload_rows, sigterm_rows, soak_rows, swap_rows
 from benchmarks.serving.hostile import hostile_rows
 from benchmarks.serving.machines import LOADING_CORE, SERVED_CORE, pin
@@ -44,7 +45,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--soak-minutes", type=float, default=30.0)
     parser.add_argument(
-        "--only", nargs="+", help="parts: ratios tail overload swap sigterm sizes hostile both_cores peers soak"
+        "--only",
+        nargs="+",
+        help="parts: ratios decoding tail overload swap sigterm sizes hostile both_cores peers soak",
     )
     parser.add_argument("--peers", nargs="+", default=PEERS, choices=PEERS, help="who else hosts the pipeline")
     arguments = parser.parse_args()
@@ -63,6 +66,7 @@ def main() -> None:
     core, seconds = SERVED_CORE, arguments.seconds
     parts: dict[str, Callable[[], object]] = {
         "ratios": lambda: ratio_rows(report, site, seconds=seconds, rounds=arguments.rounds, core=core),
+        "decoding": lambda: decoding_rows(report, site, rounds=5 * arguments.rounds),
         "tail": lambda: tail_rows(report, site, seconds=seconds, core=core),
         "overload": lambda: overload_rows(report, site, seconds=6 * seconds, core=core),
         "swap": lambda: swap_rows(report, site, core=core),

@@ -18,8 +18,9 @@ from numpy.typing import NDArray  # noqa: E402  # after the pools' limits
 
 from model_training.datasets.dataset import Dataset, QueryFrame  # noqa: E402  # after the pools' limits
 from service.imaging.decode import decode_depth, decode_rgb  # noqa: E402
-from service.imaging.depth_formats import read_depth_values, write_raw16  # noqa: E402
+from service.imaging.depth_formats import read_depth_values  # noqa: E402
 from service.imaging.picture_headers import DEFAULT_LIMITS  # noqa: E402
+from service.imaging.raw16 import write_raw16  # noqa: E402
 from service.localization.encoder import Encoder  # noqa: E402
 from service.localization.localizer import Localizer  # noqa: E402
 from service.localization.query import Query  # noqa: E402
@@ -35,7 +36,7 @@ def main() -> None:
     frames = list(Dataset(Path(folder)).queries(queries))
     chosen = frames[:: max(1, len(frames) // int(pairs))][: int(pairs)]
     slow = [(each, each.rgb_path.read_bytes(), each.depth_path.read_bytes()) for each in chosen]
-    fast = [(each, rgb, write_raw16(_values(each))) for each, rgb, _ in slow]
+    fast = [(each, rgb, write_raw16(_values(each), "lz4")) for each, rgb, _ in slow]
     for refine in (True, False):
         for each in slow[:5]:
             ask(localizer, *each, refine=refine)

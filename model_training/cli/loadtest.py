@@ -39,7 +39,7 @@ def command(
     pairs: Annotated[int, typer.Option(help="different picture pairs, sent in turn", min=1)] = 50,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="full answers, or retrieval alone")] = True,
     cheap_depth: Annotated[
-        bool, typer.Option("--cheap-depth", help="send depth as raw16+zstd, the cheapest to decode")
+        bool, typer.Option("--cheap-depth", help="send depth as raw16+lz4, the cheapest to decode")
     ] = False,
     key: Annotated[
         str | None, typer.Option("--api-key", envvar="STREETFIX_API_KEY", help="where the service asks for one")

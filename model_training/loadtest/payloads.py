@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset, QueryFrame
 from service.errors import DatasetError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
-from service.imaging.depth_formats import read_depth_values, write_raw16
+from service.imaging.depth_formats import read_depth_values
 from service.imaging.picture_headers import DEFAULT_LIMITS
+from service.imaging.raw16 import write_raw16
 
 _KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
 
@@ -46,7 +47,7 @@ def payloads(
         map_name: which map to ask; None where the service has one.
         refine: whether to ask for registration.
         most: no more than this many, evenly spread.
-        cheap_depth: send depth as raw16+zstd, the cheapest to encode and to decode, instead of as the file is.
+        cheap_depth: send depth as raw16+lz4, the cheapest to encode and to decode, instead of as the file is.
 
     Raises:
         DatasetError: there is no such set, or it is empty.
@@ -100,7 +101,7 @@ def _as_raw16(depth: bytes, frame: QueryFrame) -> bytes:
     values = read_depth_values(depth, encoding=None, limits=DEFAULT_LIMITS)
     if values.dtype != np.uint16:
         raise DatasetError(
-            f"{frame.depth_path}: raw16+zstd holds 16-bit values, these are {values.dtype}; send depth as it is",
+            f"{frame.depth_path}: raw16 holds 16-bit values, these are {values.dtype}; send depth as it is",
             field="cheap_depth",
         )
-    return write_raw16(values)
+    return write_raw16(values, "lz4")

@@ -27,12 +27,23 @@ Depth = Float32[NDArray[np.float32], "H W"]
 #: How far the aspect ratio of a picture may lie from the camera's: rounding when resizing, not cropping.
 ASPECT_TOLERANCE = 0.01
 _RGB_FORMATS = ("JPEG", "PNG", "WebP")
+#: OpenCV's flags for a part of the size; the bit that says RGB goes with each.
+_REDUCED = {1: 0, 2: 16, 4: 32, 8: 64}
 
 
-def decode_rgb(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> Rgb:
+def decode_rgb(
+    data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS, camera: PinholeCamera | None = None, finest_rad: float = 0.0
+) -> Rgb:
     """Decode a colour picture: JPEG, PNG or WebP, in the stored orientation (an EXIF rotation is not applied).
 
     Grey pictures get three equal channels, alpha is dropped, 16 bits become 8.
+
+    Args:
+        data: the encoded picture.
+        limits: what it may cost.
+        camera: whose picture it is, at any scale.
+        finest_rad: a JPEG whose pixels are finer is decoded at a half, a quarter or an eighth of its size, as long as
+            its pixels stay finer; the decoder then leaves out the work, and pixels are means instead of samples.
 
     Raises:
         DecodeError: the bytes are damaged, cut off or missing.
@@ -48,10 +59,16 @@ def decode_rgb(data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS) -> Rgb:
         )
     header = header_of(data, format_, field=field)
     require_pixels(header.height, header.width, limits, field=field)
-    rgb = opencv_decode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION, field=field)
-    if rgb.shape != (header.height, header.width, 3):
+    by = _reduction(header.width, camera, finest_rad) if format_ == "JPEG" and camera is not None else 1
+    rgb = opencv_decode(data, cv2.IMREAD_COLOR_RGB | _REDUCED[by] | cv2.IMREAD_IGNORE_ORIENTATION, field=field)
+    if rgb.shape != (-(-header.height // by), -(-header.width // by), 3):
         raise damaged(field, f"its pixels are {rgb.shape}, its header says {header.height}x{header.width}")
     return rgb.astype(np.uint8, copy=False)
+
+
+def _reduction(width: int, camera: PinholeCamera, finest_rad: float) -> int:
+    focal_px = camera.fx * width / camera.width
+    return next((by for by in (8, 4, 2) if by <= finest_rad * focal_px), 1)
 
 
 def decode_depth(

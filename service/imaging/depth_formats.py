@@ -4,12 +4,10 @@ Every reader checks the size that the header states against the limits before it
 """
 
 import io
-import struct
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-import zstandard
 from jaxtyping import Shaped
 from numpy.typing import NDArray
 
@@ -17,6 +15,7 @@ from service.errors import UnsupportedFormatError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.imaging.picture_headers import ImageLimits, damaged, format_of, header_of, require_bytes, require_pixels
 from service.imaging.png16 import is_plain_grey16, read_grey16
+from service.imaging.raw16 import read_raw16
 from service.imaging.ros_depth import read_ros_depth
 
 #: ``auto`` (as None) tells by the first bytes; ``carla`` is CARLA's depth in the three channels of an 8-bit PNG;
@@ -28,7 +27,6 @@ Values = Shaped[NDArray[Any], "H W"]
 CARLA_FAR_VALUE = 2**24 - 1
 _MAX_NPY_HEADER_BYTES = 1024
 _NPY_DTYPES = frozenset({"f2", "f4", "f8", "u2"})
-_SFD1_HEADER = struct.Struct("<4sII")
 _FIELD = "depth"
 
 
@@ -37,8 +35,7 @@ def read_depth_values(data: bytes, *, encoding: DepthEncoding | None, limits: Im
 
     Args:
         data: a 16-bit grey PNG, an 8-bit colour PNG of CARLA's (``encoding="carla"``), a float TIFF, an NPY of float16,
-            float32, float64 or uint16, or raw16+zstd: ``SFD1``, width and height as little-endian uint32, and one
-            zstd frame of little-endian uint16 rows.
+            float32, float64 or uint16, or raw16 (``service.imaging.raw16``).
         encoding: how to read it where the first bytes do not tell, else None.
         limits: what the picture may cost.
 
@@ -64,7 +61,7 @@ def read_depth_values(data: bytes, *, encoding: DepthEncoding | None, limits: Im
         case "NPY":
             return _npy(data, limits)
         case "SFD1":
-            return _raw16_zstd(data, limits)
+            return read_raw16(data, limits, field=_FIELD)
         case _:
             raise _unsupported(f"a {format_} picture loses the depth it is given")
 
@@ -142,41 +139,6 @@ def _npy(data: bytes, limits: ImageLimits) -> Values:
         raise damaged(_FIELD, f"the NPY has {there} bytes of values where its shape {shape} needs {needed}")
     values = np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape, order="F" if is_fortran else "C")
     return values.astype(dtype.newbyteorder("="), copy=False)
-
-
-def _raw16_zstd(data: bytes, limits: ImageLimits) -> Values:
-    if len(data) < _SFD1_HEADER.size:
-        raise damaged(_FIELD, "its raw16+zstd header ends early")
-    _, width, height = _SFD1_HEADER.unpack_from(data)
-    if width < 1 or height < 1:
-        raise damaged(_FIELD, f"its raw16+zstd header says {width}x{height} pixels")
-    require_pixels(height, width, limits, field=_FIELD)
-    frame, needed = data[_SFD1_HEADER.size :], 2 * width * height
-    try:
-        stated = zstandard.get_frame_parameters(frame).content_size
-        if stated != needed:
-            raise damaged(_FIELD, f"its zstd frame states {stated} bytes where {width}x{height} pixels need {needed}")
-        raw = zstandard.ZstdDecompressor(max_window_size=2**27).decompress(
-            frame, max_output_size=needed, allow_extra_data=False
-        )
-    except zstandard.ZstdError as error:
-        raise damaged(_FIELD, "its zstd frame is damaged or cut off") from error
-    if len(raw) != needed:
-        raise damaged(_FIELD, f"its zstd frame holds {len(raw)} bytes where {width}x{height} pixels need {needed}")
-    return np.frombuffer(raw, "<u2").reshape(height, width).astype(np.uint16, copy=False)
-
-
-def write_raw16(values: Values) -> bytes:
-    """The cheapest depth encoding, to send and to read: raw16+zstd.
-
-    Args:
-        values: uint16, as a 16-bit PNG would hold them.
-    """
-    height, width = values.shape
-    frame = zstandard.ZstdCompressor(level=1, write_content_size=True).compress(
-        values.astype("<u2", copy=False).tobytes()
-    )
-    return _SFD1_HEADER.pack(b"SFD1", width, height) + frame
 
 
 def _of_size(values: NDArray[Any], height: int, width: int) -> Values:

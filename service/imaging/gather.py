@@ -20,6 +20,11 @@ SUB_RAYS = 3
 FEWEST_SAMPLES = 3
 
 
+def finest_rad(grid: ViewGrid) -> float:
+    """Angle between neighbouring rays: a picture whose pixels are finer says no more."""
+    return grid.column_rad / SUB_RAYS
+
+
 class _Picture(Structure):
     _fields_ = [("height", c_int64), ("width", c_int64), *((name, c_double) for name in ("fx", "fy", "cx", "cy"))]
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from service.errors import RequestError, StreetfixError, UnknownMapError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
+from service.imaging.gather import finest_rad
+from service.imaging.view_grid import ViewGrid
 from service.localization.answer import Answer
 from service.localization.frames import Frame
 from service.localization.localizer import Localizer
@@ -189,7 +191,7 @@ class Engine:
             StreetfixError: as ``localize``.
         """
         started = perf_counter()
-        query = replace(self._decode(encoded), prior=_prior_in(encoded, localizer.bundle))
+        query = replace(self._decode(encoded, localizer.bundle.grid), prior=_prior_in(encoded, localizer.bundle))
         decoded = perf_counter()
         return localizer.look_up(query), 1e3 * (decoded - started)
 
@@ -206,10 +208,10 @@ class Engine:
         """Let running work end and drop what waits."""
         self.admission.close()
 
-    def _decode(self, encoded: EncodedQuery) -> Query:
+    def _decode(self, encoded: EncodedQuery, grid: ViewGrid) -> Query:
         limits = self.settings.limits
         image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels)
-        rgb = decode_rgb(encoded.rgb, limits=image_limits)
+        rgb = decode_rgb(encoded.rgb, limits=image_limits, camera=encoded.camera, finest_rad=finest_rad(grid))
         depth_m = decode_depth(
             encoded.depth,
             camera=encoded.camera,

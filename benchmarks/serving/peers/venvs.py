@@ -29,7 +29,7 @@ REQUIREMENTS: dict[str, tuple[str, ...]] = {
 #: What the pipeline and the contract import, at the versions that run here, or the comparison would be of these. Not all that
 #: Streetfix needs: its gRPC face wants a newer protobuf than MLServer.
 PIPELINE = (
-    "deflate", "faiss-cpu", "jaxtyping", "numpy", "onnxruntime", "opencv-python-headless", "prometheus-client", "pydantic",
+    "deflate", "faiss-cpu", "jaxtyping", "lz4", "numpy", "onnxruntime", "opencv-python-headless", "prometheus-client", "pydantic",
     "pydantic-settings", "zstandard",
 )  # fmt: skip
 

@@ -35,7 +35,7 @@ LOCALIZE_BODY: dict[str, Any] = {
                     "depth": {
                         "type": "string",
                         "format": "binary",
-                        "description": "16-bit PNG, TIFF, NPY or raw16+zstd (SFD1, the cheapest); "
+                        "description": "16-bit PNG, TIFF, NPY or raw16 (SFD1: zstd or lz4, the cheapest); "
                         "CARLA's 24-bit PNG with depth.encoding = carla, ROS' compressedDepth with compressed_depth",
                     },
                     "request": {"$ref": "#/components/schemas/LocalizeRequest"},

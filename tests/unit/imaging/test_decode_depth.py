@@ -4,6 +4,7 @@ import pickle
 import struct
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
 import zstandard
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from service.errors import DecodeError, RequestError, StreetfixError, TooLargeError, UnsupportedFormatError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import ImageLimits, decode_depth
+from service.imaging.raw16 import write_raw16
 
 CAMERA = PinholeCamera(6, 4, 5.0, 5.0, 2.5, 1.5)
 
@@ -44,6 +46,12 @@ def sfd1(values, *, width=None, height=None, content_size=True):
     return b"SFD1" + struct.pack("<II", width or w, height or h) + frame
 
 
+def lz4_sfd1(values, *, width=None, store_size=True):
+    h, w = values.shape
+    frame = lz4.frame.compress(values.astype("<u2").tobytes(), store_size=store_size)
+    return b"SFD1" + struct.pack("<II", width or w, h) + frame
+
+
 def millimetres():
     return np.arange(24, dtype=np.uint16).reshape(4, 6) * 1000
 
@@ -52,7 +60,9 @@ def metres():
     return np.arange(24, dtype=np.float32).reshape(4, 6)
 
 
-@pytest.mark.parametrize("data", [encoded(".png", millimetres()), sfd1(millimetres()), npy(millimetres())])
+@pytest.mark.parametrize(
+    "data", [encoded(".png", millimetres()), sfd1(millimetres()), lz4_sfd1(millimetres()), npy(millimetres())]
+)
 def test_16_bit_values_are_millimetres_unless_a_scale_is_given(data):
     np.testing.assert_allclose(decode_depth(data, camera=CAMERA), metres())
     np.testing.assert_allclose(decode_depth(data, camera=CAMERA, scale_m=1 / 256), metres() * 1000 / 256, rtol=1e-6)
@@ -301,6 +311,12 @@ def test_png_beyond_the_limit_is_refused():
         sfd1(millimetres(), width=7),
         sfd1(millimetres(), content_size=False),
         sfd1(millimetres()) + b"more",
+        lz4_sfd1(millimetres(), width=7),
+        lz4_sfd1(millimetres(), width=5),
+        lz4_sfd1(millimetres()) + b"more",
+        lz4_sfd1(millimetres())[:-5],
+        lz4_sfd1(millimetres())[:30],
+        b"SFD1" + struct.pack("<II", 6, 4) + b"\x04\x22\x4d\x18",
         b"SFD1" + struct.pack("<II", 6, 4) + b"no zstd",
         b"SFD1" + bytes(8),
         b"SFD1",
@@ -308,6 +324,20 @@ def test_png_beyond_the_limit_is_refused():
 )
 def test_a_damaged_raw16_is_refused(data):
     with pytest.raises(DecodeError):
+        decode_depth(data, camera=CAMERA)
+
+
+@pytest.mark.parametrize("codec", ["zstd", "lz4"])
+def test_what_is_written_is_read(codec):
+    values = np.random.default_rng(1).integers(0, 2**16, (37, 53), np.uint16)
+    camera = PinholeCamera(53, 37, 30.0, 30.0, 26.0, 18.0)
+    np.testing.assert_array_equal(decode_depth(write_raw16(values, codec), camera=camera, scale_m=1.0), values)
+
+
+def test_an_lz4_frame_that_does_not_say_how_long_it_is_is_read_no_further_than_it_should():
+    endless = lz4_sfd1(np.zeros((4000, 4000), np.uint16), store_size=False)
+    data = b"SFD1" + struct.pack("<II", 6, 4) + endless[12:]
+    with pytest.raises(DecodeError, match="49 bytes where 6x4 pixels need 48"):
         decode_depth(data, camera=CAMERA)
 
 

@@ -192,3 +192,24 @@ def test_rgb_of_other_size_is_refused_with_both_sizes():
     with pytest.raises(ImageSizeError, match=r"480x640.*640x480") as caught:
         require_sizes(np.zeros((640, 480, 3), np.uint8), np.zeros((480, 640), np.float32), CAMERA)
     assert caught.value.field == "rgb"
+
+
+@pytest.mark.parametrize(
+    ("width", "finest_px", "by"), [(640, 0.0, 1), (640, 1.9, 1), (640, 2.0, 2), (641, 3.9, 2), (640, 4.0, 4), (637, 8.0, 8), (640, 99.0, 8)]
+)  # fmt: skip
+def test_a_jpeg_is_decoded_no_finer_than_is_wanted(width, finest_px, by):
+    """``finest_px``: how many of its pixels are as wide as what is wanted."""
+    v, u = np.mgrid[:120, :width]
+    picture = np.stack([u * 255 // width, v * 2, 0 * u], axis=-1).astype(np.uint8)
+    data = cv2.imencode(".jpg", picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 100))[1].tobytes()
+    camera = PinholeCamera(2 * width, 240, 400.0, 400.0, width - 0.5, 119.5)  # the picture is half of the camera's
+    found = decode_rgb(data, camera=camera, finest_rad=finest_px / 200.0)
+    assert found.shape == (-(-120 // by), -(-width // by), 3)
+    wanted = cv2.resize(picture, (found.shape[1], found.shape[0]), interpolation=cv2.INTER_AREA).astype(float)
+    assert np.abs(found - wanted)[1:-1, 1:-1].mean() < 2.5
+
+
+def test_only_a_jpeg_is_decoded_coarser():
+    data = cv2.imencode(".png", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+    assert decode_rgb(data, camera=camera, finest_rad=1.0).shape == (48, 64, 3)
