@@ -28,7 +28,7 @@ QUERIES, PAIRS = "drive1_precise", 50
 def site_from(arguments: argparse.Namespace) -> Site:
     """What is served: as told, else the paper's city."""
     if arguments.map is not None:
-        return Site(arguments.map, arguments.dataset, arguments.queries, PAIRS)
+        return Site(arguments.map.resolve(), arguments.dataset.resolve(), arguments.queries, PAIRS)
     runs = Runs(arguments.work, ENCODER)
     dataset = runs.dataset(paper_plan())
     return Site(runs.bundle(dataset).path, dataset.folder, arguments.queries, PAIRS)

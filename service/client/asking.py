@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from service.client.encode import encode_depth, encode_rgb
+from service.client.encode import Packing, encode_depth, encode_rgb
 from service.contract import schema
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
@@ -86,7 +86,7 @@ class Asked(Generic[D]):
     pictures: tuple[tuple[bytes, bytes], ...]
 
 
-def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, quality: int | None) -> Asked[schema.LocalizeRequest]:
+def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing) -> Asked[schema.LocalizeRequest]:
     """A single pair.
 
     Raises:
@@ -96,11 +96,11 @@ def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, quality: int | Non
     names = ("gravity", "depth_scale_m", "depth_kind", "max_range_m", "baseline_m")
     known = {name: about[name] for name in names if name in about}  # type: ignore[literal-required]  # names of About
     frame = Frame(rgb=rgb, depth=depth, camera=camera, **known)
-    said, pictures = _frame(frame, quality)
+    said, pictures = _frame(frame, packing)
     return Asked(_checked(lambda: schema.LocalizeRequest.model_validate(said | _of_all(about))), (pictures,))
 
 
-def several(frames: Sequence[Frame], about: AboutSequence, quality: int | None) -> Asked[schema.BatchRequest]:
+def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> Asked[schema.BatchRequest]:
     """Pairs that are each answered on their own; what is said beside them holds for each.
 
     Raises:
@@ -113,20 +113,20 @@ def several(frames: Sequence[Frame], about: AboutSequence, quality: int | None) 
                 f"frames.{number}.T_reference_camera: each pair of a batch stands alone; ask localize_sequence for one pose of all",
                 field=f"frames.{number}.T_reference_camera",
             )
-    said = [_frame(frame, quality, f"frames.{number}.") for number, frame in enumerate(frames)]
+    said = [_frame(frame, packing, f"frames.{number}.") for number, frame in enumerate(frames)]
     requests = [each | _of_all(about) for each, _ in said]
     document = _checked(lambda: schema.BatchRequest.model_validate({"requests": requests}))
     return Asked(document, tuple(pictures for _, pictures in said))
 
 
-def sequence(frames: Sequence[Frame], about: AboutSequence, quality: int | None) -> Asked[schema.SequenceRequest]:
+def sequence(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> Asked[schema.SequenceRequest]:
     """Frames that are answered as one, the reference first.
 
     Raises:
         RequestError: as ``one``.
     """
     _only_known(about, AboutSequence)
-    said = [_frame(frame, quality, f"frames.{number}.") for number, frame in enumerate(frames)]
+    said = [_frame(frame, packing, f"frames.{number}.") for number, frame in enumerate(frames)]
     content = [
         each | {"T_reference_camera": _transform(frame.T_reference_camera, f"frames.{number}.T_reference_camera")}
         for number, (frame, (each, _)) in enumerate(zip(frames, said, strict=True))
@@ -135,11 +135,11 @@ def sequence(frames: Sequence[Frame], about: AboutSequence, quality: int | None)
     return Asked(document, tuple(pictures for _, pictures in said))
 
 
-def _frame(frame: Frame, quality: int | None, where: str = "") -> tuple[dict[str, Any], tuple[bytes, bytes]]:
+def _frame(frame: Frame, packing: Packing, where: str = "") -> tuple[dict[str, Any], tuple[bytes, bytes]]:
     """What goes with one pair, and its pictures."""
     try:
-        depth = encode_depth(frame.depth, scale_m=frame.depth_scale_m)
-        pictures = (encode_rgb(frame.rgb, quality=quality), depth.data)
+        depth = encode_depth(frame.depth, scale_m=frame.depth_scale_m, codec=packing.depth_codec)
+        pictures = (encode_rgb(frame.rgb, quality=packing.quality), depth.data)
     except RequestError as error:
         raise RequestError(f"{where}{error.message}", field=f"{where}{error.field}") from error
     said = {

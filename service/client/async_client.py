@@ -11,10 +11,11 @@ import httpx
 
 from service.client import asking, rest
 from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
-from service.client.encode import JPEG_QUALITY
+from service.client.encode import JPEG_QUALITY, Packing
 from service.client.retry import Attempts, RetryPolicy
 from service.contract.schema import LocalizeAnswer, MapEntry
 from service.errors import RefusedError, StreetfixError
+from service.imaging.raw16 import Codec
 
 A = TypeVar("A")
 
@@ -27,13 +28,14 @@ class AsyncClient:
 
     def __init__(
         self, url: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
-        quality: int | None = JPEG_QUALITY, transport: httpx.AsyncBaseTransport | None = None,
+        quality: int | None = JPEG_QUALITY, depth_codec: Codec = "zstd",
+        transport: httpx.AsyncBaseTransport | None = None,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep, clock: Callable[[], float] = time.monotonic,
         draw: Callable[[], float] = random.random,
     ) -> None:  # fmt: skip
         how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s)
         self._url, self._timeout_s = url, timeout_s
-        self._quality = quality
+        self._packing = Packing(quality, depth_codec)
         self._policy = retry or RetryPolicy()
         self._sleep, self._clock, self._draw = sleep, clock, draw
         self._http = httpx.AsyncClient(**how, transport=transport)
@@ -54,19 +56,19 @@ class AsyncClient:
 
     async def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
         """As ``Client.localize``."""
-        asked = await asyncio.to_thread(asking.one, rgb, depth, camera, about, self._quality)
+        asked = await asyncio.to_thread(asking.one, rgb, depth, camera, about, self._packing)
         return await self.call(rest.localize(asked))
 
     async def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
         """As ``Client.localize_sequence``."""
-        asked = await asyncio.to_thread(asking.sequence, frames, about, self._quality)
+        asked = await asyncio.to_thread(asking.sequence, frames, about, self._packing)
         return await self.call(rest.localize_sequence(asked))
 
     async def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
     ) -> list[LocalizeAnswer | RefusedError]:
         """As ``Client.localize_batch``."""
-        asked = await asyncio.to_thread(asking.several, frames, about, self._quality)
+        asked = await asyncio.to_thread(asking.several, frames, about, self._packing)
         return await self.call(rest.localize_batch(asked))
 
     async def maps(self) -> list[MapEntry]:

@@ -81,6 +81,18 @@ def problem(status: int, **changed: Any) -> httpx.Response:
     return httpx.Response(status, json=content | changed)
 
 
+@pytest.mark.parametrize(("given", "frame"), [({}, b"\x28\xb5\x2f\xfd"), ({"depth_codec": "lz4"}, b"\x04\x22\x4d\x18")])
+def test_depth_goes_by_the_codec_that_was_chosen(ask: Asking, answer_json: Json, given: Any, frame: bytes) -> None:
+    seen: list[httpx.Request] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer_json())
+
+    ask(handler, "localize", RGB, DEPTH, CAMERA, given=given)
+    assert parts_of(seen[0])["depth"][12:16] == frame
+
+
 def test_the_parts_are_what_the_contract_asks_for(ask: Asking, answer_json: Json) -> None:
     seen: list[httpx.Request] = []
 
