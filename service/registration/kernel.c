@@ -434,3 +434,44 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
         }
     }
 }
+
+typedef struct {
+    double hit, fresh, gone, any;  /* shares of the beam model */
+    double rough, span;            /* m */
+    double certain, margin;        /* standard deviations, m */
+    double nothing;                /* m: how far an empty pixel is taken to be */
+    double scale, offset;          /* of the pose */
+} Beam;
+
+/* How points of a query agree with a picture of the map: at: pixel of each; z, sigma: depth along the axis and its deviation; q: as in
+ * Query. found: sum of the logarithms of the density, and numbers of points seen through, in front of, and off the map. */
+void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t count, const int32_t *at, const double *z,
+                     const double *sigma, const float *q, const Beam *o, double *found)
+{
+    double likelihood = 0, through = 0, front = 0, unmapped = 0;
+    for (int64_t i = 0; i < count; i++) {
+        const int64_t row = at[i] / width, column = at[i] % width;
+        const int64_t top = row > 0 ? row - 1 : 0, bottom = row + 1 < height ? row + 1 : row;
+        const int64_t left = column > 0 ? column - 1 : 0, right = column + 1 < width ? column + 1 : column;
+        float low = INFINITY, high = 0;
+        for (int64_t v = top; v <= bottom; v++)
+            for (int64_t u = left; u <= right; u++) {
+                const float d = drawn[v * width + u] > 0 ? drawn[v * width + u] : (float)o->nothing;
+                low = d < low ? d : low;
+                high = d > high ? d : high;
+            }
+        const double mapped = drawn[at[i]] > 0 ? (double)drawn[at[i]] : o->nothing;
+        const double seen = z[i] * o->scale / (1.0 + o->offset * q[i]), spread = sqrt(sigma[i] * sigma[i] + o->rough * o->rough);
+        const double off = (seen - mapped) / spread, hit = exp(-0.5 * off * off) / (2.5066282746310002 * spread);
+        const double fresh = seen < mapped ? o->fresh / (mapped > 2.0 ? mapped : 2.0) : 0.0;
+        likelihood += log(o->hit * hit + fresh + ((seen > mapped ? o->gone : 0.0) + o->any) / o->span);
+        const double beyond = o->certain * sigma[i] + o->margin;
+        if (low >= (float)o->nothing) unmapped++;
+        else if (seen > (double)high + beyond) through++;
+        else if (seen < (double)low - beyond) front++;
+    }
+    found[0] = likelihood;
+    found[1] = through;
+    found[2] = front;
+    found[3] = unmapped;
+}

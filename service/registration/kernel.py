@@ -2,7 +2,7 @@
 
 import ctypes
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,33 @@ class _Options(Structure):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class BeamModel:
+    """What a camera sees of a mapped scene that may have changed.
+
+    Attributes:
+        hit: share of the rays that meet the mapped surface.
+        new: share that something new stops before it.
+        gone: share that goes on behind it.
+        any: share that says nothing.
+        rough_m: roughness of surfaces.
+        span_m: over which what is gone, or says nothing, is spread.
+        certain: standard deviations, and
+        margin_m: metres beyond which a point lies off the surface.
+        nothing_m: how far a surface is taken to be where the map shows none.
+    """
+
+    hit: float
+    new: float
+    gone: float
+    any: float
+    rough_m: float
+    span_m: float
+    certain: float
+    margin_m: float
+    nothing_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SolverOptions:
     """One run of the solver; metres and radians. Names as in ``kernel.c``."""
 
@@ -64,6 +91,10 @@ class SolverOptions:
     free_offset: bool = False
 
 
+class _Beam(Structure):
+    _fields_ = [(name, c_double) for name in (*(field.name for field in fields(BeamModel)), "scale", "offset")]
+
+
 @cache
 def _library() -> ctypes.CDLL:
     library = load(LIBRARY)
@@ -72,6 +103,9 @@ def _library() -> ctypes.CDLL:
     ]  # fmt: skip
     library.streetfix_pulls.argtypes = [
         POINTER(_Grid), c_void_p, POINTER(_Query), POINTER(_Options), c_void_p, c_void_p, c_void_p,
+    ]  # fmt: skip
+    library.streetfix_agree.argtypes = [
+        c_void_p, c_int64, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p, POINTER(_Beam), c_void_p,
     ]  # fmt: skip
     library.streetfix_mark.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p]
     library.streetfix_fill.argtypes = [POINTER(_Grid), c_void_p, c_int64, c_double, c_void_p, c_void_p]
@@ -225,3 +259,42 @@ def render(
     )  # fmt: skip
     depth[depth > 1e8] = 0
     return depth
+
+
+def agree(
+    drawn: Float32[NDArray[np.float32], "H W"], pixel: Int32[NDArray[np.int32], " n"], z: Float64[NDArray[np.float64], " n"],
+    sigma: Float64[NDArray[np.float64], " n"], q: Float32[NDArray[np.float32], " n"], model: BeamModel, *, scale: float, offset: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
+    """How at least one point agrees with a picture of the map (``render``).
+
+    Args:
+        drawn: depth, metres; 0 where nothing is mapped.
+        pixel: of each point, row by row.
+        z: depth of each along the optical axis, metres.
+        sigma: its standard deviation, metres.
+        q: as in ``QueryPoints``.
+        model: of what is seen.
+        scale: of the depth, as registered.
+        offset: of the disparity, as registered.
+
+    Returns:
+        Mean logarithm of the density (1/m); shares of the points behind the surfaces around their pixels, before them, and where
+        nothing is mapped.
+    """
+    count = len(pixel)
+    if (
+        not count
+        or any(len(each) != count for each in (z, sigma, q))
+        or not 0 <= pixel.min() <= pixel.max() < drawn.size
+    ):
+        raise ValueError(f"{count} points do not lie on a picture of {drawn.shape}")
+    arrays = [np.ascontiguousarray(*given) for given in (
+        (drawn, np.float32), (pixel, np.int32), (z, np.float64), (sigma, np.float64), (q, np.float32),
+    )]  # fmt: skip
+    found = np.zeros(4)
+    _library().streetfix_agree(
+        arrays[0].ctypes.data, *drawn.shape, count, *(each.ctypes.data for each in arrays[1:]),
+        byref(_Beam(*astuple(model), scale, offset)), found.ctypes.data,
+    )  # fmt: skip
+    likelihood, through, front, unmapped = (found / count).tolist()
+    return likelihood, through, front, unmapped

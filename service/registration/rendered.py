@@ -7,24 +7,22 @@ looked through a wall. The share of inliers knows neither, since it asks only fo
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, transform_from
-from service.registration.kernel import QueryPoints, render
+from service.registration.kernel import BeamModel, QueryPoints, agree, render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
 
 WIDTH = 80  # of the picture drawn, pixels
 SURFEL_M = 0.4
 REACH_M = 45.0
-_NOTHING_M = 60.0  # where the map shows no surface, one is taken to be that far
-#: Shares of a beam model (Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 6.3): the mapped surface is hit, something
-#: new stands before it, something is gone, anything. Chosen on the watch cities.
-_HIT, _NEW, _GONE, _ANY = 0.6, 0.25, 0.02, 0.05
-_ROUGH_M, _SPAN_M = 0.15, 40.0
-_CERTAIN, _MARGIN_M = 3.0, 0.25  # standard deviations and metres beyond which a point lies off the surface
+#: Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 6.3. Chosen on the watch cities.
+_BEAM = BeamModel(
+    hit=0.6, new=0.25, gone=0.02, any=0.05, rough_m=0.15, span_m=40.0, certain=3.0, margin_m=0.25, nothing_m=60.0
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +54,7 @@ class Seen:
     Attributes:
         camera: of the small picture.
         R_level_camera: of the query's level.
-        row: of each point.
-        column: of each point.
+        pixel: of each point, row by row.
         z: depth of each, metres, as measured.
         sigma: its standard deviation, metres.
         q: as in ``QueryPoints``.
@@ -65,8 +62,7 @@ class Seen:
 
     camera: PinholeCamera
     R_level_camera: Rotation
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
+    pixel: Int32[NDArray[np.int32], " n"]
     z: Float64[NDArray[np.float64], " n"]
     sigma: Float64[NDArray[np.float64], " n"]
     q: Float32[NDArray[np.float32], " n"]
@@ -88,7 +84,9 @@ def seen_by(points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation
     z = optical[:, 2]
     column = np.rint(optical[:, 0] / z * small.fx + small.cx).astype(np.intp).clip(0, small.width - 1)
     row = np.rint(optical[:, 1] / z * small.fy + small.cy).astype(np.intp).clip(0, small.height - 1)
-    return Seen(small, R_level_camera, row, column, z, points.sigma * (points.ray @ R_level_camera[:, 2]), points.q)
+    pixel = (row * small.width + column).astype(np.int32)
+    sigma = (points.sigma * (points.ray @ R_level_camera[:, 2])).astype(np.float64)
+    return Seen(small, R_level_camera, pixel, z.astype(np.float64), sigma, points.q)
 
 
 def agreement(cloud: SurfelMap, seen: Seen, candidate: Registered) -> Agreement:
@@ -103,26 +101,7 @@ def agreement(cloud: SurfelMap, seen: Seen, candidate: Registered) -> Agreement:
     drawn = render(
         cloud.surfels, cloud.tiles, tile_m=TILE_M, T_map_camera=T, camera=seen.camera, size_m=SURFEL_M, reach_m=REACH_M
     )
-    z = seen.z * candidate.scale / (1.0 + candidate.offset * seen.q)
-    nearest, mapped, furthest = (each[seen.row, seen.column] for each in _around(drawn))
-    unmapped = nearest >= _NOTHING_M
-    spread = np.hypot(seen.sigma, _ROUGH_M)
-    hit = np.exp(-0.5 * ((z - mapped) / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
-    density = _HIT * hit + _NEW * (z < mapped) / np.maximum(mapped, 2.0) + (_GONE * (z > mapped) + _ANY) / _SPAN_M
-    off = _CERTAIN * seen.sigma + _MARGIN_M
-    return Agreement(
-        likelihood=float(np.log(density).mean()), through=float((~unmapped & (z > furthest + off)).mean()),
-        front=float((~unmapped & (z < nearest - off)).mean()), unmapped=float(unmapped.mean()),
-    )  # fmt: skip
-
-
-def _around(
-    drawn: Float32[NDArray[np.float32], "h w"],
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """At each pixel: the least depth of it and its eight neighbours, its own, the greatest."""
-    depth = np.pad(np.where(drawn > 0, drawn, np.float32(_NOTHING_M)), 1, mode="edge")
-    across = np.stack([depth[:, :-2], depth[:, 1:-1], depth[:, 2:]])
-    low, high = across.min(axis=0), across.max(axis=0)
-    low = np.minimum(np.minimum(low[:-2], low[1:-1]), low[2:])
-    high = np.maximum(np.maximum(high[:-2], high[1:-1]), high[2:])
-    return low, depth[1:-1, 1:-1], high
+    likelihood, through, front, unmapped = agree(
+        drawn, seen.pixel, seen.z, seen.sigma, seen.q, _BEAM, scale=candidate.scale, offset=candidate.offset
+    )
+    return Agreement(likelihood, through, front, unmapped)

@@ -2,12 +2,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z, transform_from
 from service.registration import rendered
+from service.registration.kernel import BeamModel, agree
 from service.registration.register import Registered
 from service.registration.rendered import Agreement, agreement, seen_by
 from service.registration.surfel_map import SurfelMap
@@ -22,9 +24,10 @@ WALL = ((10, -30, -30), (0, 60, 0), (0, 0, 60))  # 10 m ahead of the origin
 @pytest.fixture(autouse=True)
 def counted(monkeypatch):
     """What these tests count on."""
-    numbers = {"_HIT": 0.6, "_NEW": 0.25, "_GONE": 0.02, "_ANY": 0.05, "_ROUGH_M": 0.15, "_SPAN_M": 40.0, "_CERTAIN": 3.0,
-               "_MARGIN_M": 0.25, "WIDTH": 80, "SURFEL_M": 0.4, "REACH_M": 45.0}  # fmt: skip
-    for name, value in numbers.items():
+    beam = BeamModel(
+        hit=0.6, new=0.25, gone=0.02, any=0.05, rough_m=0.15, span_m=40.0, certain=3.0, margin_m=0.25, nothing_m=60.0
+    )
+    for name, value in {"_BEAM": beam, "WIDTH": 80, "SURFEL_M": 0.4, "REACH_M": 45.0}.items():
         monkeypatch.setattr(rendered, name, value)
 
 
@@ -252,7 +255,7 @@ def test_a_point_lies_in_the_pixel_of_the_small_picture_that_its_ray_meets(seein
     """50 px of focal length, the middle at (34.5, 32), whatever the depth."""
     seen = seen_by(seeing(z_m, [ray]), CAMERA, R_BODY_OPTICAL)
     assert (seen.camera.width, seen.camera.height, seen.camera.cx, seen.camera.cy) == (80, 60, 34.5, 32.0)
-    assert (seen.column.tolist(), seen.row.tolist()) == ([column], [row])
+    assert seen.pixel.tolist() == [row * 80 + column]
 
 
 def test_depth_and_deviation_are_told_along_the_cameras_axis_and_the_depth_as_it_was_measured(seeing):
@@ -281,3 +284,51 @@ def test_a_query_that_was_prepared_once_serves_every_candidate(wall, seeing):
 def test_the_mean_of_several_pictures():
     mean = Agreement.mean([Agreement(-1.0, 0.1, 0.2, 0.3), Agreement(-3.0, 0.3, 0.4, 0.9)])
     assert (mean.likelihood, mean.through, mean.front, mean.unmapped) == pytest.approx((-2.0, 0.2, 0.3, 0.6))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), shape=st.sampled_from([(60, 80), (1, 1), (1, 9), (7, 2)]), empty=st.floats(0, 1))
+def test_the_compiled_agreement_says_what_plain_numpy_says(seed, shape, empty):
+    rng = np.random.default_rng(seed)
+    model = BeamModel(
+        hit=0.5, new=0.3, gone=0.05, any=0.1, rough_m=0.2, span_m=30.0, certain=2.0, margin_m=0.3, nothing_m=60.0
+    )
+    drawn = rng.uniform(1, 45, shape).astype(np.float32) * (rng.random(shape) >= empty)
+    row, column = rng.integers(0, shape[0], 50), rng.integers(0, shape[1], 50)
+    z, sigma, q = rng.uniform(1, 50, 50), rng.uniform(0.01, 1, 50), rng.uniform(0, 0.5, 50).astype(np.float32)
+    found = agree(drawn, (row * shape[1] + column).astype(np.int32), z, sigma, q, model, scale=1.01, offset=0.2)
+
+    depth = np.pad(np.where(drawn > 0, drawn, 60.0), 1, mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(depth, (3, 3))[row, column].reshape(50, 9)
+    low, mapped, high = around.min(axis=1), around[:, 4], around.max(axis=1)
+    z = z * 1.01 / (1 + 0.2 * q)
+    spread, off = np.hypot(sigma, 0.2), 2.0 * sigma + 0.3
+    hit = np.exp(-0.5 * ((z - mapped) / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
+    density = 0.5 * hit + 0.3 * (z < mapped) / np.maximum(mapped, 2.0) + (0.05 * (z > mapped) + 0.1) / 30.0
+    off_map = low >= 60.0
+    expected = [
+        np.log(density).mean(),
+        (~off_map & (z > high + off)).mean(),
+        (~off_map & (z < low - off)).mean(),
+        off_map.mean(),
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("pixel", [[], [-1], [6], [0, 1]])
+def test_points_that_do_not_lie_on_the_picture_are_refused(pixel):
+    model = BeamModel(
+        hit=0.5, new=0.3, gone=0.05, any=0.1, rough_m=0.2, span_m=30.0, certain=2.0, margin_m=0.3, nothing_m=60.0
+    )
+    one = np.ones(1)
+    with pytest.raises((ValueError, TypeCheckError)):  # whichever looks first
+        agree(
+            np.ones((2, 3), np.float32),
+            np.array(pixel, np.int32),
+            one,
+            one,
+            one.astype(np.float32),
+            model,
+            scale=1.0,
+            offset=0.0,
+        )
