@@ -67,8 +67,8 @@ def main() -> None:
     parts: dict[str, Callable[[], object]] = {
         "ratios": lambda: ratio_rows(report, site, seconds=seconds, rounds=arguments.rounds, core=core),
         "decoding": lambda: decoding_rows(report, site, rounds=5 * arguments.rounds),
-        "tail": lambda: tail_rows(report, site, seconds=seconds, core=core),
-        "overload": lambda: overload_rows(report, site, seconds=6 * seconds, core=core),
+        "tail": lambda: tail_rows(report, site, seconds=seconds, rounds=arguments.rounds, core=core),
+        "overload": lambda: overload_rows(report, site, seconds=6 * seconds, rounds=arguments.rounds, core=core),
         "swap": lambda: swap_rows(report, site, core=core),
         "sigterm": lambda: sigterm_rows(report, site, core=core),
         "sizes": lambda: size_rows(report, site, core=core),
