@@ -1,7 +1,8 @@
 """Depth as it lies in memory, packed by a quick general codec: the cheapest to send and to read.
 
 ``SFD1``, width and height as little-endian uint32, then one frame of little-endian uint16 rows, of zstd or of lz4: which of the two
-says the frame itself. zstd is a little smaller than a PNG and takes half of its time to read; lz4 is a quarter larger than zstd and takes two thirds of that.
+says the frame itself. zstd is a little smaller than a PNG and takes half of its time to read; lz4 is a fifth larger than zstd and takes
+two thirds of that.
 """
 
 import struct
