@@ -64,7 +64,7 @@ def test_a_query_that_saw_nothing_is_like_nothing():
 
 def test_a_panorama_shows_the_wall_where_it_stands(street_frames):
     ranges = np.zeros_like(street_frames(1).panoramas[0])
-    ranges[15, 640:768] = 25.0  # from 45 to 90 degrees to the left, nearly level
+    ranges[15, 644:764] = 25.0  # from 45 to 90 degrees to the left and not up to the sector's edge, nearly level
     settings = ContextSettings(rings=4, sectors=8)
     found = context_of_panorama(ranges, 1.8, settings)
     assert np.argwhere(found).tolist() == [[2, 1]]
