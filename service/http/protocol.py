@@ -40,9 +40,8 @@ class BoundedHttp(HttpToolsProtocol):
         """The caller has gone."""
         self._head_came()
         super().connection_lost(exc)
-        for (
-            cycle
-        ) in self._unanswered:  # uvicorn tells the last one only; uvloop refuses what the others would still send
+        # uvicorn tells the last one only, and uvloop refuses what the others would still send.
+        for cycle in self._unanswered:
             cycle.disconnected = True
             cycle.message_event.set()
 
@@ -66,9 +65,8 @@ class BoundedHttp(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """Its head is here."""
         if len(self.pipeline) >= PIPELINED:
-            raise ValueError(
-                f"more than {PIPELINED} requests sent ahead"
-            )  # httptools makes it an error of the parser: 400
+            # httptools makes it an error of the parser, which is answered 400.
+            raise ValueError(f"more than {PIPELINED} requests sent ahead")
         self._in_head = False
         self._head_came()
         super().on_headers_complete()
