@@ -151,7 +151,8 @@ def _depth_seeds(depth: np.ndarray) -> list[bytes]:
     colour = np.dstack([depth & 255, depth >> 8, 0 * depth]).astype(np.uint8)
     good = [
         (b"\x00", _encoded(".png", depth)), (b"\x30", _encoded(".tiff", metres)), (b"\x01", npy + metres.tobytes()),
-        (b"\x02", write_raw16(depth)), (b"\x08", _encoded(".png", colour)), (b"\x40", bytes(12) + _encoded(".png", depth)),
+        (b"\x02", write_raw16(depth)), (b"\x02", write_raw16(depth, "lz4")),
+        (b"\x08", _encoded(".png", colour)), (b"\x40", bytes(12) + _encoded(".png", depth)),
         (b"\x40", bytes(12) + struct.pack("<ii", 64, 48) + b"\x00\x00\x86\x88"),
     ]  # fmt: skip
     return [how + data for how, data in good]

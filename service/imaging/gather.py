@@ -1,7 +1,7 @@
 """A picture pair onto the cells of a view grid, in compiled code: the dearest step of a query after decoding, otherwise."""
 
 import ctypes
-from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
+from ctypes import POINTER, byref, c_double, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation
+from service.imaging.as_c import CPicture, c_picture
 from service.imaging.view_grid import ViewGrid
 
 LIBRARY = Path(__file__).with_name("_gather.so")
@@ -25,15 +26,11 @@ def finest_rad(grid: ViewGrid) -> float:
     return grid.column_rad / SUB_RAYS
 
 
-class _Picture(Structure):
-    _fields_ = [("height", c_int64), ("width", c_int64), *((name, c_double) for name in ("fx", "fy", "cx", "cy"))]
-
-
 @cache
 def _library() -> ctypes.CDLL:
     library = load(LIBRARY)
     library.streetfix_gather.argtypes = [
-        c_void_p, c_int64, c_void_p, c_void_p, POINTER(_Picture), c_void_p, POINTER(_Picture), c_double, c_double, c_int64,
+        c_void_p, c_int64, c_void_p, c_void_p, POINTER(CPicture), c_void_p, POINTER(CPicture), c_double, c_double, c_int64,
         c_void_p, c_void_p, c_void_p,
     ]  # fmt: skip
     library.streetfix_gather.restype = None
@@ -74,18 +71,12 @@ def gather(
     ranges, colour = np.empty(cells, np.float32), np.empty((cells, 3), np.float32)
     seen = np.empty(cells, np.bool_)
     _library().streetfix_gather(
-        rays.ctypes.data, cells, R.ctypes.data, depth_m.ctypes.data, byref(_picture(camera, depth_m)), rgb.ctypes.data,
-        byref(_picture(camera, rgb)), grid.min_range_m, grid.max_range_m, FEWEST_SAMPLES, ranges.ctypes.data, colour.ctypes.data,
+        rays.ctypes.data, cells, R.ctypes.data, depth_m.ctypes.data, byref(c_picture(camera, depth_m)), rgb.ctypes.data,
+        byref(c_picture(camera, rgb)), grid.min_range_m, grid.max_range_m, FEWEST_SAMPLES, ranges.ctypes.data, colour.ctypes.data,
         seen.ctypes.data,
     )  # fmt: skip
     shape = (grid.rows, grid.columns)
     return ranges.reshape(shape), colour.reshape(*shape, 3), seen.reshape(shape)
-
-
-def _picture(camera: PinholeCamera, picture: NDArray[np.generic]) -> _Picture:
-    height, width = picture.shape[:2]
-    own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
-    return _Picture(height, width, own.fx, own.fy, own.cx, own.cy)
 
 
 @cache

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, Rotation, rotation_taking
+from service.imaging.as_c import CPicture, c_picture
 
 LIBRARY = Path(__file__).with_name("_level.so")
 STEP_PIXELS = 80  # the picture is read at about this many columns
@@ -77,10 +78,6 @@ def level_camera(
     return CameraLevel(R_level, float(-ground * normal[2]))
 
 
-class _Picture(Structure):
-    _fields_ = [("height", c_int64), ("width", c_int64), *((name, c_double) for name in ("fx", "fy", "cx", "cy"))]
-
-
 class _Ground(Structure):
     _fields_ = [(name, c_double) for name in (
         "near_m", "reach_m", "below_m", "height_m", "tilt_prior", "height_prior_m", "noise_m", "noise_per_m", "correlated",
@@ -91,7 +88,7 @@ class _Ground(Structure):
 def _library() -> ctypes.CDLL:
     library = load(LIBRARY)
     library.streetfix_fit_ground.argtypes = [
-        c_void_p, POINTER(_Picture), c_int64, c_void_p, POINTER(_Ground), c_void_p, c_int64, c_void_p, c_void_p,
+        c_void_p, POINTER(CPicture), c_int64, c_void_p, POINTER(_Ground), c_void_p, c_int64, c_void_p, c_void_p,
     ]  # fmt: skip
     library.streetfix_fit_ground.restype = None
     return library
@@ -105,11 +102,10 @@ def _fit_ground(
     height, width = depth_m.shape
     if R.shape != (3, 3):
         raise ValueError(f"R {R.shape} is no rotation")
-    own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
     step = max(1, width // STEP_PIXELS)
     found, points = np.empty(3), np.empty((-(-height // step) * -(-width // step), 5))
     _library().streetfix_fit_ground(
-        depth_m.ctypes.data, byref(_Picture(height, width, own.fx, own.fy, own.cx, own.cy)), step, R.ctypes.data,
+        depth_m.ctypes.data, byref(c_picture(camera, depth_m)), step, R.ctypes.data,
         byref(_Ground(
             NEAR_M, REACH_M, 0.3 * height_m, height_m, TILT_PRIOR_RAD, HEIGHT_PRIOR_M, NOISE_M, NOISE_PER_M, CORRELATED
         )),
