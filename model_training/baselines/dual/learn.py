@@ -163,7 +163,7 @@ def _learn(lesson: Lesson, settings: LearnSettings, folder: Path, budget_s: floa
         losses.clear()
 
     for batch in lesson.batches(settings, np.random.default_rng([settings.seed, 2, images])):
-        if training.ended is not None:
+        if (training.curve or losses) and training.ended is not None:  # a short budget buys a step too
             break
         set_rate(optimiser, settings.learning_rate * cosine_share(training.share_spent, warm_up=settings.warm_up_share))
         losses.append(step(towers.train(), optimiser, batch, settings))

@@ -142,7 +142,9 @@ class CnnTrainer:
         return ITERATIONS_AN_EPOCH * EPOCHS
 
     def _done(self, images: int, most: int | None) -> bool:
-        return images >= most if most is not None else self.training.ended is not None
+        if most is not None:
+            return images >= most
+        return images > 0 and self.training.ended is not None  # a short budget buys a step too
 
     def _step(self, batch: int) -> float:
         self.net.train()

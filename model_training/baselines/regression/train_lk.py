@@ -83,14 +83,14 @@ def train_lk(
         learner = _Learner(pairs, cloud, settings)
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
-        while training.ended is None:
+        while not training.curve or training.ended is None:  # a short budget buys a step too
             images, losses = 0, []
-            while images < settings.point_every and training.share_spent < 1.0:
-                losses.append(learner.step(shown, training.share_spent))
+            while not losses or (images < settings.point_every and training.share_spent < 1.0):
+                losses.append(learner.step(learner.draw(shown), training.share_spent))
                 images += settings.batch
                 report(NAME, int(1000 * training.share_spent), 1000)
             score = -learner.error_m(watched)
-            training.point(training.images + images, float(np.mean(losses or [np.nan])), score, learner.state())
+            training.point(training.images + images, float(np.mean(losses)), score, learner.state())
     return training
 
 
@@ -122,13 +122,17 @@ class _Learner:
         self._net = PointNet()
         self._optimiser = torch.optim.Adam(self._net.parameters(), lr=settings.learning_rate)
 
-    def step(self, shown: NDArray[np.int64], share_spent: float) -> float:
-        """Learn from a batch of some rows; the mean loss."""
-        settings = self._settings
-        set_rate(self._optimiser, settings.learning_rate * cosine_share(share_spent, warm_up=WARM_UP))
-        batch = self._batch(self._rng.choice(shown, settings.batch), self._rng)
+    def draw(self, shown: NDArray[np.int64]) -> _Batch:
+        """A batch of some rows, each from a wrong pose of its own."""
+        batch = self._batch(self._rng.choice(shown, self._settings.batch), self._rng)
         if batch is None:
             raise DatasetError("no pair's depth meets the map; are both of one city?", field="pairs")
+        return batch
+
+    def step(self, batch: _Batch, share_spent: float) -> float:
+        """Learn from a batch; the mean loss."""
+        settings = self._settings
+        set_rate(self._optimiser, settings.learning_rate * cosine_share(share_spent, warm_up=WARM_UP))
         found = aligned(self._net, batch.template, batch.source, iterations=settings.iterations)
         loss = alignment_loss(found, batch.T_template_source).mean()
         self._optimiser.zero_grad(set_to_none=True)

@@ -65,14 +65,14 @@ def train_pose(
         learner = _Learner(pairs, MapFrame.of(pairs.T_map_camera[shown, :3, 3]), settings)
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
-        while training.ended is None:
+        while not training.curve or training.ended is None:  # a short budget buys a step too
             images, losses = 0, []
-            while images < settings.point_every and training.share_spent < 1.0:
+            while not losses or (images < settings.point_every and training.share_spent < 1.0):
                 losses.append(learner.step(learner.draw(shown), training.share_spent))
                 images += settings.batch
                 report(NAME, int(1000 * training.share_spent), 1000)
             score = -float(np.median(learner.errors_m(kept_back)))
-            training.point(training.images + images, float(np.mean(losses or [np.nan])), score, learner.state())
+            training.point(training.images + images, float(np.mean(losses)), score, learner.state())
     return training
 
 

@@ -32,36 +32,39 @@ def test_a_few_pairs_are_learnt_by_heart(pairs_in_hall):
 
 @pytest.fixture(scope="module")
 def run_in_two_parts(pairs_in_hall, tmp_path_factory):
-    """A folder trained for 1 s and then, from its checkpoint, up to 2.5 s; the curve and steps after each part."""
+    """The pairs, and a folder trained for a second and then, from its checkpoint, for another."""
     folder, pairs = tmp_path_factory.mktemp("runs") / "googlenet", pairs_in_hall()
-    parts = []
-    for budget_s in (1.0, 2.5):
-        training = train_pose(pairs, folder, SMALL, budget_s=budget_s)
-        parts.append((training, training.checkpoint()))
-    return pairs, parts
+    first = train_pose(pairs, folder, SMALL, budget_s=1.0)
+    second = train_pose(pairs, folder, SMALL, budget_s=first.curve[-1].processor_s + 1.0)
+    return pairs, first, second
 
 
 def test_a_run_goes_on_where_it_stopped(run_in_two_parts):
-    _, [(first, _), (second, state)] = run_in_two_parts
+    _, first, second = run_in_two_parts
     assert second.curve[: len(first.curve)] == first.curve
     assert len(second.curve) > len(first.curve)
-    steps = int(state["optimiser"]["state"][0]["step"])
+    steps = int(second.checkpoint()["optimiser"]["state"][0]["step"])
     assert steps * SMALL.batch == second.images
 
 
 def test_a_run_ends_at_its_budget(run_in_two_parts):
-    for training, _ in run_in_two_parts[1]:
-        assert training.ended == "budget"
+    assert [training.ended for training in run_in_two_parts[1:]] == ["budget", "budget"]
+
+
+def test_a_budget_that_is_spent_before_the_first_step_still_leaves_a_network(pairs_in_hall, tmp_path):
+    training = train_pose(pairs_in_hall(), tmp_path / "run", SMALL, budget_s=1e-3)
+    assert (training.images, training.ended) == (SMALL.batch, "budget")
+    PoseRegressor.of(training)
 
 
 def test_a_run_that_has_ended_is_left_alone(run_in_two_parts):
-    pairs, [_, (second, _)] = run_in_two_parts
-    again = train_pose(pairs, second.folder, SMALL, budget_s=2.5)
+    pairs, _, second = run_in_two_parts
+    again = train_pose(pairs, second.folder, SMALL, budget_s=second.curve[-1].processor_s)
     assert again.curve == second.curve
 
 
 def test_the_best_network_answers_in_the_map(run_in_two_parts):
-    pairs, [_, (second, _)] = run_in_two_parts
+    pairs, _, second = run_in_two_parts
     T_map_camera = PoseRegressor.of(second).poses(pairs)
     assert T_map_camera.shape == (len(pairs), 4, 4)
     np.testing.assert_allclose(np.linalg.det(T_map_camera[:, :3, :3]), 1.0, atol=1e-6)
@@ -85,7 +88,7 @@ def test_what_was_saved_is_what_goes_on(pairs_in_hall):
 
 
 def test_a_run_of_other_settings_is_refused(run_in_two_parts):
-    pairs, [_, (second, _)] = run_in_two_parts
+    pairs, _, second = run_in_two_parts
     with pytest.raises(DatasetError, match="other settings"):
         train_pose(pairs, second.folder, PoseSettings(side=48), budget_s=2.5)
 
