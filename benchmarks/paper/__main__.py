@@ -1,8 +1,8 @@
 """``make paper``: the paper's method, its baseline and others beside ours, on the same data -> reports/paper.json, paper.md, figures.
 
 The full size takes some hours on two cores. Whatever is finished is kept under ``--work``: data by blocks, trainings by
-checkpoints, answers by method; the same command goes on after a stop. ``--only`` runs some methods, ``--tables`` none: it writes
-the report from what is kept.
+checkpoints; the same command goes on after a stop. What each method answered is kept beside the report, so that ``--only`` runs some
+methods, ``--tables`` none, and the report is written from all that were ever run.
 """
 
 import argparse
@@ -57,18 +57,20 @@ def main() -> None:
         size, minutes = REDUCED, REDUCED_MINUTES
         work, out = ROOT / "data" / "paper-reduced", ROOT / "out" / "paper"
     work, out = arguments.work or work, arguments.out or out
-    bench = Bench(PaperData(work, size), 60 * minutes)
+    bench = Bench(PaperData(work, size), 60 * minutes, out / "paper" / "answers")
+    done = work / "done"
+    done.mkdir(parents=True, exist_ok=True)
     report = Report(
         "paper", "make paper" + (' ARGS="' + " ".join(sys.argv[1:]) + '"' if sys.argv[1:] else ""), folder=out
     )
     wanted = [] if arguments.tables else arguments.only or list(RUNS)
     for name in wanted:
-        if not arguments.anew and (bench.kept / f"{name}.done").exists():
+        if not arguments.anew and (done / name).exists():
             continue
         print(f"--- {name}", flush=True)
         for result in RUNS[name](bench):
             result.save(bench.kept)
-        (bench.kept / f"{name}.done").touch()
+        (done / name).touch()
     results = kept_results(bench)
     missing = dict.fromkeys((*METHODS, "cnn_knn"), "not run yet")
     figures = all_rows(report, results, bench.data.tests, missing)

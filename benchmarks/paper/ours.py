@@ -1,12 +1,13 @@
 """Our method in the comparison: an encoder trained from nothing on the same data, and the one that is shipped.
 
-The encoder of ``streetfix`` sees as many images as the paper's 84 iterations show its CNN, of the same frames and pairs. The
-one of ``streetfix_stock`` has never seen this city. Both maps are built as any user builds one; every answer counts, accepted
-or not.
+The encoder of ``streetfix`` is trained for the budget that every learned method has, that of ``streetfix_as_paper`` sees as many
+images as the paper's 84 iterations show its CNN; both of the same frames and pairs. The one of ``streetfix_stock`` has never
+seen this city. Every map is built as any user builds one; every answer counts, accepted or not.
 """
 
 import json
 import os
+import tempfile
 import time
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from model_training.stock import ENCODER
 from model_training.training.export import export
 from model_training.training.loop import Progress, TrainingConfig, load_run, train
 from model_training.training.packs import rows_seen_by
+from model_training.training.precision import native_precision
 from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
@@ -31,10 +33,26 @@ from service.maps.reader import MapBundle
 PAPER_IMAGES_SHARE = 4 * 0.7  # four epochs over 70 % of the frames
 
 
-def config_for(size: Size) -> TrainingConfig:
+PILOT_STEPS, PILOT_LEFT_OUT = 24, 8  # the first steps read the pack from disk
+SPARED = 0.07  # of a budget: a full memory of descriptors and checkpoints cost more than the pilot's steps
+
+
+def config_as_paper(size: Size) -> TrainingConfig:
     """As many optimiser steps as show the images that the paper's iterations show its CNN; small sizes have small batches."""
     together = min(TrainingConfig().pairs, size.pairs // 4)
-    return TrainingConfig(pairs=together, steps=max(1, round(PAPER_IMAGES_SHARE * size.frames / (2 * together))))
+    steps = max(1, round(PAPER_IMAGES_SHARE * size.frames / (2 * together)))
+    return TrainingConfig(pairs=together, steps=steps, precision=native_precision())
+
+
+def config_within(budget_s: float, pack: Path, config: TrainingConfig, run: Path) -> TrainingConfig:
+    """As many steps as a budget of processor time buys, told by a pilot; a run that has begun keeps its own number."""
+    if (run / "config.json").exists():
+        return TrainingConfig.model_validate_json((run / "config.json").read_bytes())
+    pilot, seen = config.model_copy(update={"steps": PILOT_STEPS, "memory_after": 2}), []
+    with tempfile.TemporaryDirectory() as folder, one_thread():
+        train([pack], Path(folder), pilot, device="cpu", report=lambda _: seen.append(time.process_time()))
+    each = (seen[-1] - seen[PILOT_LEFT_OUT]) / (PILOT_STEPS - 1 - PILOT_LEFT_OUT)
+    return config.model_copy(update={"steps": max(1, int((1 - SPARED) * budget_s / each))})
 
 
 def pack_of(data: PaperData) -> Path:
@@ -56,10 +74,13 @@ def pack_of(data: PaperData) -> Path:
     return folder
 
 
-def streetfix(data: PaperData) -> MethodResult:
-    """Train on the comparison's data, build the map, answer both tests."""
-    run, curve = data.work / "runs" / "streetfix", []
-    config = config_for(data.size)
+def streetfix(data: PaperData, budget_s: float | None) -> MethodResult:
+    """Train on the comparison's data within a budget, None: on the paper's number of images; build the map, answer both tests."""
+    method = "streetfix_as_paper" if budget_s is None else "streetfix"
+    run, curve, pack = data.work / "runs" / method, list[CurvePoint](), pack_of(data)
+    config = config_as_paper(data.size)
+    if budget_s is not None:
+        config = config_within(budget_s, pack, config, run)
     spent = run / "processor_s.json"
     before: float = json.loads(spent.read_text()) if spent.exists() else 0.0
     began = time.process_time()
@@ -70,7 +91,6 @@ def streetfix(data: PaperData) -> MethodResult:
             curve.append(CurvePoint(images, before + time.process_time() - began, progress.loss, progress.accuracy))
         show("training", progress.step, progress.steps)
 
-    pack = pack_of(data)
     try:
         with one_thread(), bars() as show:
             train([pack], run, config, device="cpu", report=note)
@@ -82,7 +102,7 @@ def streetfix(data: PaperData) -> MethodResult:
         export(load_run(run), encoder)
     training_s: float = json.loads(spent.read_text())
     return MethodResult(
-        "streetfix", _answers(data, encoder), training_s, config.steps * 2 * config.pairs, data.size.frames + data.size.pairs,
+        method, _answers(data, encoder), training_s, config.steps * 2 * config.pairs, data.size.frames + data.size.pairs,
         f"{config.steps} steps", curve,
     )  # fmt: skip
 

@@ -21,6 +21,7 @@ PAPER_MEDIAN, PAPER_MSE, PAPER_MED_M, PAPER_ACCURACY = 0.0489, 0.057568, 0.804, 
 DRIVES = {"same_drive": "the survey's own drive", "other_drive": "another drive"}
 TITLES = {
     "streetfix": "Streetfix, trained on these frames and pairs",
+    "streetfix_as_paper": "the same, on as many images as the paper's CNN",
     "streetfix_stock": "Streetfix as shipped (never saw this city)",
     "cnn_knn": "CNN + K-NN",
     "cnn_softmax": "CNN, its own softmax",

@@ -27,6 +27,9 @@ def command(
         float, typer.Option(min=0, max=180, help="largest turn between a query and its map view, degrees")
     ] = 9.0,
     seed: Annotated[int, typer.Option(help="of everything that is drawn", min=0)] = 0,
+    precision: Annotated[
+        str, typer.Option(help="float32, or bfloat16: twice as fast on processors that have it, and on GPUs")
+    ] = "float32",
     start_from: Annotated[Path | None, typer.Option(help="run whose weights to start from")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
     workers: Annotated[int | None, typer.Option(help="processes that simulate [default: one a core]", min=1)] = None,
@@ -41,9 +44,19 @@ def command(
         raise DatasetError(f"recipe: {recipe!r} is neither 'stock' nor 'paper'", field="recipe")
     if optimiser not in ("adamw", "sgdm"):
         raise DatasetError(f"optimiser: {optimiser!r} is neither 'adamw' nor 'sgdm'", field="optimiser")
+    if precision not in ("float32", "bfloat16"):
+        raise DatasetError(f"precision: {precision!r} is neither 'float32' nor 'bfloat16'", field="precision")
     device_of(device)  # said before an hour of simulation, not after it
     config = TrainingConfig.model_validate(
-        {"steps": steps, "pairs": pairs, "optimiser": optimiser, "learning_rate": rate, "seed": seed, "turn_deg": turn}
+        {
+            "steps": steps,
+            "pairs": pairs,
+            "optimiser": optimiser,
+            "learning_rate": rate,
+            "seed": seed,
+            "turn_deg": turn,
+            "precision": precision,
+        }
         | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network no longer drift fast
     )
     plans = paper_plans() if recipe == "paper" else stock_plans(cities)

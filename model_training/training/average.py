@@ -81,7 +81,7 @@ def _renew_statistics(
     with torch.no_grad():
         for step in range(batches):
             batch = cities[int(rng.integers(len(cities)))].draw(config.pairs, rng)
-            net(*views_of(batch, augment, place))
+            net.of_both(views_of(batch, augment, place), len(batch.query_xy))
             report(step + 1)
     for norm in norms:
         norm.momentum = 0.1

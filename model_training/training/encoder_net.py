@@ -11,6 +11,8 @@ Most of the work is done on a quarter of the grid and below: for the same time a
 that lingers at half the grid, and learns faster (decision log).
 """
 
+from typing import cast
+
 import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
@@ -56,7 +58,20 @@ class EncoderNet(nn.Module):
         """Descriptors (B, D) of planes (B, 6, rows, columns); ``side`` (B) is 0 for survey views, 1 for queries."""
         x = normalised(planes)
         query = side.reshape(-1, 1, 1, 1)
-        x = self.conv1(torch.cat([x * (1 - query), x * query], dim=1))
+        return self._after_conv1(self.conv1(torch.cat([x * (1 - query), x * query], dim=1)))
+
+    def of_both(self, planes: Tensor, queries: int) -> Tensor:
+        """What ``forward`` gives for a batch whose first ``queries`` rows are queries; without its zeros, a tenth faster."""
+        x = normalised(planes)
+        convolution, norm, activation = self.conv1
+        weight = cast("Tensor", convolution.weight)
+        sides = [
+            functional.conv2d(part, filters, stride=(2, 2), padding=1)
+            for part, filters in ((x[:queries], weight[:, CHANNELS:]), (x[queries:], weight[:, :CHANNELS]))
+        ]
+        return self._after_conv1(activation(norm(torch.cat(sides))))
+
+    def _after_conv1(self, x: Tensor) -> Tensor:
         x = self.conv2(x)
         x = x + self.conv4(self.conv3(x))
         x = x + self.conv6(self.conv5(x))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +19,7 @@ from model_training.baselines.dual.towers import Tower, Towers
 from model_training.baselines.gallery import thinned
 from model_training.baselines.learning import Report, Training, cosine_share, one_thread, set_rate
 from model_training.training.losses import Side, paired_info_nce
+from model_training.training.precision import Precision, forward_in, native_precision
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 from service.imaging.view_grid import ViewGrid
@@ -59,6 +60,7 @@ class LearnSettings:
     widths: tuple[int, ...] = (48, 96, 160)
     descriptor: int = 256
     points: int = 12  # of the curve
+    precision: Precision = field(default_factory=native_precision)
     seed: int = 0
 
 
@@ -182,7 +184,9 @@ def step(
     """One step down the symmetric loss (CLIP's), places within 6 m of each other left out; returns it before the step."""
     planes, xy, views, views_xy = batch
     scale = towers.log_scale.exp().clamp(max=settings.largest_scale)
-    each, _ = paired_info_nce(Side(towers.camera(planes), xy), Side(towers.lidar(views), views_xy), scale=scale)
+    with forward_in(settings.precision):
+        pictures, places = towers.camera(planes), towers.lidar(views)
+    each, _ = paired_info_nce(Side(pictures.float(), xy), Side(places.float(), views_xy), scale=scale)
     loss = each.mean()
     optimiser.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped

@@ -1,7 +1,7 @@
 """Training the paper's CNN: as the paper says (84 iterations), and until it stops gaining."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from model_training.baselines.paper.cnn import PaperCnn
 from model_training.baselines.paper.pictures import LidarPictures, Pictures, Space, fused_pictures
 from model_training.baselines.paper_data.frames import Frames
 from model_training.baselines.paper_data.pairs import Pairs
+from model_training.training.precision import Precision, forward_in, native_precision
 
 LEARNT_SHARE = 0.7  # of the frames, at random: the paper's split
 ITERATIONS_AN_EPOCH, EPOCHS = 21, 4  # the paper's
@@ -32,6 +33,7 @@ class CnnPlan:
         as_paper: SGDM, rate 3e-4, 84 iterations of a 21st of the training frames; else SGDM at ``rate`` in batches of ``batch``
             until it stops gaining or its budget is spent, the rate falling with the budget along half a cosine.
         pairs_too: a third of each batch are fused RGB-D pairs of the training drives, in the same image space.
+        precision: of the forward pass.
     """
 
     space: Space
@@ -41,6 +43,7 @@ class CnnPlan:
     batch: int = 128
     momentum: float = 0.9
     weight_decay: float = 1e-4  # MATLAB's default L2 regularisation
+    precision: Precision = field(default_factory=native_precision)
 
 
 AS_PAPER_RATE = 3e-4
@@ -152,7 +155,9 @@ class CnnTrainer:
         total = 0.0
         for first in range(0, batch, CHUNK):
             pictures, street = self._drawn(min(CHUNK, batch - first))
-            loss = functional.cross_entropy(self.net(as_input(pictures)), torch.from_numpy(street))
+            with forward_in(self.plan.precision):
+                scores = self.net(as_input(pictures))
+            loss = functional.cross_entropy(scores.float(), torch.from_numpy(street))
             share = len(street) / batch
             (loss * share).backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped
             total += float(loss.detach()) * share

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from model_training.training.precision import forward_in
+
 PLANES = 4  # red, green, blue, depth
 AUXILIARY_CELLS = 4  # a side; what an auxiliary head sees of the picture
 
@@ -61,8 +63,9 @@ class PoseHead(nn.Module):
 
     def forward(self, features: Tensor) -> Pose:
         """(B, inputs) to a pose."""
-        hidden = self.hidden(features)
-        return Pose(self.position(hidden), functional.normalize(self.quaternion(hidden), dim=1))
+        hidden = self.hidden(features).float()
+        with forward_in("float32"):  # eight bits would tell a city's width in steps of a metre
+            return Pose(self.position(hidden), functional.normalize(self.quaternion(hidden), dim=1))
 
 
 class AuxiliaryHead(nn.Module):

@@ -84,7 +84,7 @@ def train_lk(
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
         while not training.curve or training.ended is None:  # a short budget buys a step too
-            images, losses = 0, []
+            images, losses = 0, list[float]()
             while not losses or (images < settings.point_every and training.share_spent < 1.0):
                 losses.append(learner.step(learner.draw(shown), training.share_spent))
                 images += settings.batch

@@ -28,6 +28,7 @@ from model_training.baselines.regression.pictures import (
     watched_rows,
 )
 from model_training.baselines.regression.pose_loss import PoseLoss
+from model_training.training.precision import Precision, forward_in, native_precision
 
 NAME = "GoogLeNet"
 EVALUATED = 64  # pictures at once
@@ -45,6 +46,7 @@ class PoseSettings:
     dropout: float = 0.0
     point_every: int = 7600  # pictures
     seed: int = 0
+    precision: Precision = field(default_factory=native_precision)
     jitter: Jitter = field(default_factory=Jitter)
 
 
@@ -66,7 +68,7 @@ def train_pose(
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
         while not training.curve or training.ended is None:  # a short budget buys a step too
-            images, losses = 0, []
+            images, losses = 0, list[float]()
             while not losses or (images < settings.point_every and training.share_spent < 1.0):
                 losses.append(learner.step(learner.draw(shown), training.share_spent))
                 images += settings.batch
@@ -136,7 +138,8 @@ class _Learner:
         set_rate(self._optimiser, settings.learning_rate * cosine_share(share_spent, warm_up=WARM_UP))
         self._net.train()
         planes = planes_of(self._pairs, rows, settings.side, jitter=settings.jitter, rng=self._rng)
-        heads = self._net(planes.contiguous(memory_format=torch.channels_last))
+        with forward_in(settings.precision):
+            heads = self._net(planes.contiguous(memory_format=torch.channels_last))
         loss = self._loss(heads, Pose(self._true.position[rows], self._true.quaternion[rows])).mean()
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()

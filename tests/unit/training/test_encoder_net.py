@@ -53,6 +53,14 @@ def test_the_two_sides_read_one_view_differently(net, shape):
     assert float((survey - query).abs().max()) > 1e-3
 
 
+@pytest.mark.parametrize("mode", ["train", "eval"])
+def test_a_batch_of_both_sides_is_read_as_each_side_is(net, shape, mode):
+    getattr(net, mode)()
+    planes, side = planes_of(shape, 5), torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0])
+    with torch.no_grad():
+        torch.testing.assert_close(net.of_both(planes, 2), net(planes, side), atol=1e-5, rtol=1e-4)
+
+
 def test_a_view_does_not_depend_on_its_batch(net, shape):
     planes, side = planes_of(shape, 4), torch.tensor([0.0, 1.0, 1.0, 0.0])
     with torch.no_grad():

@@ -111,3 +111,11 @@ def test_a_run_is_logged_for_tensorboard(pack_folder, tmp_path, config):
 def test_unknown_settings_are_refused():
     with pytest.raises(ValueError, match="stepps"):
         TrainingConfig.model_validate({"stepps": 3})
+
+
+def test_half_precision_learns_as_well_and_leaves_float32_weights(pack_folder, tmp_path, config):
+    losses = []
+    changed = config.model_copy(update={"precision": "bfloat16", "memory_after": 100, "turn_deg": 2.0, "steps": 30})
+    net = run_of(pack_folder, tmp_path / "run", changed, report=lambda progress: losses.append(progress.loss))
+    assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])
+    assert {parameter.dtype for parameter in net.parameters()} == {torch.float32}
