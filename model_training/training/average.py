@@ -6,18 +6,15 @@ neither mean, so they are taken anew over augmented training batches (Izmailov e
 
 import json
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from model_training.training.augment import Augmenter
-from model_training.training.batches import City
+from model_training.training.draws import augmented_batches
 from model_training.training.encoder_net import EncoderNet
-from model_training.training.loop import TrainingConfig, load_run, views_of
-from model_training.training.packs import Pack
+from model_training.training.loop import TrainingConfig, load_run
 from service.errors import DatasetError
-from service.imaging.view_grid import ViewGrid
 
 BATCHES = 150
 
@@ -73,16 +70,11 @@ def _renew_statistics(
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None  # a plain average
-    grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
-    rng, place = np.random.default_rng(seed), torch.device("cpu")
-    augment = Augmenter(config.augmentation, grid, torch.Generator().manual_seed(seed), place)
-    cities = [City(Pack.open(folder), grid, turn_deg=config.turn_deg) for folder in packs]
     net.train()
     with torch.no_grad():
-        for step in range(batches):
-            batch = cities[int(rng.integers(len(cities)))].draw(config.pairs, rng)
-            net.of_both(views_of(batch, augment, place), len(batch.query_xy))
-            report(step + 1)
+        for step, (planes, queries) in enumerate(islice(augmented_batches(packs, config, seed=seed), batches), 1):
+            net.of_both(planes, queries)
+            report(step)
     for norm in norms:
         norm.momentum = 0.1
     net.eval()

@@ -32,6 +32,7 @@ _KNOWN = {
     "train": ("Train an encoder on simulated cities.", "training"),
     "average": ("Average the weights of two training runs.", "training"),
     "export": ("Make an ONNX encoder from a training's checkpoint.", "training"),
+    "quantize": ("Write an encoder in eight bits: smaller, faster, nearly the same.", "training"),
 }
 
 

@@ -38,9 +38,10 @@ HTTPServer(("127.0.0.1", int(sys.argv[-1])), Handler).serve_forever()
 """
 
 
-def figures(retrieval, full, ms, cpu_ms=10.0):
+def figures(retrieval, full, p99_ms, cpu_ms=10.0):
     return Figures(
-        {"retrieval": retrieval, "full": full}, {"retrieval": [cpu_ms] * len(retrieval), "full": [cpu_ms] * len(full)}, ms
+        {"retrieval": retrieval, "full": full}, {"retrieval": [cpu_ms] * len(retrieval), "full": [cpu_ms] * len(full)}, p99_ms,
+        asked=100 * len(p99_ms),
     )  # fmt: skip
 
 
@@ -94,12 +95,12 @@ def test_a_package_that_cannot_be_installed_is_told(monkeypatch):
 
 
 def test_the_best_is_another_one_for_each_row():
-    """Retrieval: A has 50, the median of own/A is 60/50; full: B has 25; p99: A."""
+    """Retrieval: A has 50, the median of own/A is 60/50; full: B has 25; p99: A, of 90/100, 300/100 and 80/100 the middle one."""
     rows = rows_of(
         {
-            "streetfix": figures([60, 66, 54], [26, 26, 26], [90.0] * 10),
-            "litserve": figures([50, 50, 50], [20, 20, 20], [100.0] * 10),
-            "bentoml": figures([40, 40, 90], [25, 26, 25], [120.0] * 10),
+            "streetfix": figures([60, 66, 54], [26, 26, 26], [90.0, 300.0, 80.0]),
+            "litserve": figures([50, 50, 50], [20, 20, 20], [100.0] * 3),
+            "bentoml": figures([40, 40, 90], [25, 26, 25], [120.0] * 3),
         },
         {},
     )
@@ -112,11 +113,13 @@ def test_the_best_is_another_one_for_each_row():
     assert rows["peers.bentoml.answers_per_s.retrieval"]["value"] == 40
     assert rows["peers.streetfix.cpu_ms.full"]["value"] == 10
     assert rows["peers.litserve.p99_ms"]["value"] == 100
+    assert rows["peers.streetfix.p99_ms"]["value"] == 90
+    assert rows["peers.streetfix.p99_ms"]["n"] == 300
 
 
 def test_a_peer_that_never_ran_has_its_rows_with_the_reason_and_is_not_the_best():
     rows = rows_of(
-        {"streetfix": figures([60] * 3, [26] * 3, [90.0]), "bentoml": figures([40] * 3, [25] * 3, [120.0])},
+        {"streetfix": figures([60] * 3, [26] * 3, [90.0] * 3), "bentoml": figures([40] * 3, [25] * 3, [120.0] * 3)},
         {"ray": "it ended with code 1"},
     )
     own = {name: row for name, row in rows.items() if name.startswith("peers.ray.")}
@@ -127,7 +130,7 @@ def test_a_peer_that_never_ran_has_its_rows_with_the_reason_and_is_not_the_best(
 
 def test_what_was_measured_before_a_peer_failed_counts_as_far_as_it_is_whole():
     rows = rows_of(
-        {"streetfix": figures([60] * 3, [26] * 3, [90.0]), "ray": figures([80] * 3, [30] * 2, [1.0])},
+        {"streetfix": figures([60] * 3, [26] * 3, [90.0] * 3), "ray": figures([80] * 3, [30] * 2, [1.0])},
         {"ray": "it hung"},
     )
     assert rows["peers.throughput_over_best.retrieval"]["value"] == pytest.approx(0.75)
@@ -137,7 +140,7 @@ def test_what_was_measured_before_a_peer_failed_counts_as_far_as_it_is_whole():
 
 
 def test_no_rows_hold_where_no_peer_ran():
-    rows = rows_of({"streetfix": figures([60] * 3, [26] * 3, [90.0])}, {"ray": "no wheel"})
+    rows = rows_of({"streetfix": figures([60] * 3, [26] * 3, [90.0] * 3)}, {"ray": "no wheel"})
     barred = [row for row in rows.values() if "bar" in row]
     assert len(barred) == 3
     assert not any(row["holds"] for row in barred)
@@ -197,7 +200,8 @@ def test_all_are_asked_the_same_rate_and_the_same_arrivals(loaded):
     assert failed == {}
     assert rate == pytest.approx(0.7 * 10)
     assert found["mlserver"].per_s == {"retrieval": [25.0] * 2, "full": [10.0] * 2}
-    assert found["mlserver"].ms == pytest.approx([30.0] * 2)  # the shot of the warm-up does not count
+    assert found["mlserver"].p99_ms == pytest.approx([30.0] * 2)
+    assert found["mlserver"].asked == 2  # the shot of the warm-up does not count
     assert [each for each in loaded if each[2]] == [
         ("streetfix", "full", rate, 0), ("mlserver", "full", rate, 0), ("mlserver", "full", rate, 1), ("streetfix", "full", rate, 1),
     ]  # fmt: skip
@@ -211,7 +215,7 @@ def test_peers_that_do_not_start_err_or_end_are_left_out_with_their_reasons(load
         "litserve": "it ended with code 2", "bentoml": "retrieval, saturated: {'timeout': 1}, 0 inconsistent answers",
         "ray": "it is gone",
     }  # fmt: skip
-    assert found["mlserver"].ms
+    assert found["mlserver"].p99_ms
     assert sum(name == "bentoml" for name, *_ in loaded) == 1
 
 

@@ -1,0 +1,52 @@
+"""``streetfix quantize``."""
+
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from model_training.cli.progress import bars
+from model_training.training.draws import augmented_batches
+from model_training.training.encoder_net import EncoderShape
+from model_training.training.loop import TrainingConfig
+from model_training.training.packs import make_packs
+from model_training.training.quantise import Views, quantise
+from model_training.training.recipe import stock_plans
+from service.imaging.view_grid import ViewGrid
+from service.localization.encoder import Encoder
+
+RANGES, CHECKS = 8, 4  # batches
+
+
+def command(
+    encoder: Annotated[Path, typer.Argument(help="ONNX file of `streetfix export`")],
+    out: Annotated[Path, typer.Option(help="ONNX file to write")],
+    packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
+    cities: Annotated[int, typer.Option(help="of them to take views from; made where missing", min=1, max=1000)] = 2,
+    pairs: Annotated[int, typer.Option(help="pairs of views a batch", min=2, max=2048)] = 128,
+    seed: Annotated[int, typer.Option(help="of the views", min=0)] = 0,
+) -> None:
+    """Write an encoder in eight bits: a quarter of the size, less than half of the time, checked against the original.
+
+    \b
+    Example:
+      streetfix quantize runs/stock/encoder.onnx --out encoder.onnx
+    """
+    read = Encoder.open(encoder)  # said before cities are simulated, not after it
+    config = TrainingConfig(pairs=pairs, encoder=EncoderShape(rows=read.rows, columns=read.columns))
+    with bars() as report:
+        grid = ViewGrid(rows=read.rows, columns=read.columns)
+        folders = make_packs(stock_plans(cities), packs, grid, report=report)
+        drawn = (
+            Views(np.ascontiguousarray(planes.numpy()), queries)
+            for planes, queries in augmented_batches(folders, config, seed=seed)
+        )
+        # Views of the checks come after those of the ranges, of the same cities.
+        agreement = quantise(encoder, out, islice(drawn, RANGES), islice(drawn, CHECKS))
+    Console().print(
+        f"{out}: {out.stat().st_size / 1e6:.1f} MB; cosine to float32's descriptors {agreement.mean:.4f} in the mean, "
+        f"{agreement.of_hundred:.4f} of the worst hundredth of {agreement.views} views"
+    )

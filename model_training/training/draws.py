@@ -1,0 +1,25 @@
+"""Augmented batches for other ends than a step of training."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model_training.training.augment import Augmenter
+from model_training.training.batches import City
+from model_training.training.loop import TrainingConfig, views_of
+from model_training.training.packs import Pack
+from service.imaging.view_grid import ViewGrid
+
+
+def augmented_batches(packs: list[Path], config: TrainingConfig, *, seed: int) -> Iterator[tuple[Tensor, int]]:
+    """For ever: planes (B, 6, rows, columns) of a city drawn by chance, and how many of them, the first, are queries."""
+    grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
+    rng, place = np.random.default_rng(seed), torch.device("cpu")
+    augment = Augmenter(config.augmentation, grid, torch.Generator().manual_seed(seed), place)
+    cities = [City(Pack.open(folder), grid, turn_deg=config.turn_deg) for folder in packs]
+    while True:
+        batch = cities[int(rng.integers(len(cities)))].draw(config.pairs, rng)
+        yield views_of(batch, augment, place), len(batch.query_xy)
