@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from service.geometry.rigid import Transform, transform_from
 from service.localization.frames import Frame
 from service.localization.prior import Prior
-from service.localization.similar import similarity_at
-from service.localization.starts import StartSettings, level_from, starts_from
+from service.localization.similar import similarities_at
+from service.localization.starts import Likeness, StartSettings, level_from, starts_from
 from service.maps.reader import MapBundle
 from service.registration.covariance import covariance_of
 from service.registration.kernel import QueryPoints
@@ -120,9 +120,12 @@ def refine(
     ]
     if len(merged) < settings.fewest_points:
         return None
-    starts = starts_from(frames, prior, lidar_height_m=bundle.manifest.lidar_height_m, settings=settings.starts)
+    starts = starts_from(
+        frames, prior, lidar_height_m=bundle.manifest.lidar_height_m, settings=settings.starts,
+        likeness=None if len(frames) == 1 else _likeness(bundle, frames),
+    )  # fmt: skip
     found = register(cloud, merged, starts, reference.views.height_m, settings.registration)
-    candidates = [_candidate(bundle, cloud, frames, seen, pose, prior, settings.support) for pose in found]
+    candidates = _candidates(bundle, cloud, frames, seen, found, prior, settings.support)
     noise = float(np.median([frame.noise for frame in frames]))
     candidates.sort(key=lambda candidate: -candidate.support)
     best = candidates[0].registered
@@ -154,27 +157,49 @@ def _merged(frames: tuple[Frame, ...], each: list[QueryPoints]) -> QueryPoints:
     return QueryPoints(np.concatenate(xyz), np.concatenate(ray), *rest)
 
 
-def _candidate(
-    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], seen: list[Seen], pose: Registered,
+def _likeness(bundle: MapBundle, frames: tuple[Frame, ...]) -> Likeness:
+    """Mean similarity of the frames where each of them stood."""
+
+    def likeness(T_map_level: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = []
+        for frame in frames:
+            T = T_map_level @ level_from(frame.T_reference_camera, frame.R_level_camera, frames[0].R_level_camera)
+            found.append(similarities_at(bundle, frame.descriptors, R_map_level=T[:, :3, :3], camera_m=T[:, :3, 3])[0])
+        mean: NDArray[np.float64] = np.mean(found, axis=0)
+        return mean
+
+    return likeness
+
+
+def _candidates(
+    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], seen: list[Seen], found: tuple[Registered, ...],
     prior: Prior | None, weights: SupportWeights,
-) -> Candidate:  # fmt: skip
-    similarities, places_m, agreements = [], [], []
+) -> list[Candidate]:  # fmt: skip
+    similarities, places_m, agreements = [], [], list[list[Agreement]]()
     for frame, points in zip(frames, seen, strict=True):
-        own = pose if frame is frames[0] else _seen_from(frame, frames[0], pose)
-        similarity, place_m = similarity_at(
-            bundle, frame.descriptors, R_map_level=own.R_map_level, camera_m=own.camera_m
-        )
+        own = [pose if frame is frames[0] else _seen_from(frame, frames[0], pose) for pose in found]
+        similarity, place_m = similarities_at(
+            bundle, frame.descriptors, R_map_level=np.stack([pose.R_map_level for pose in own]),
+            camera_m=np.stack([pose.camera_m for pose in own]),
+        )  # fmt: skip
         similarities.append(similarity)
         places_m.append(place_m)
         if len(points):
-            agreements.append(agreement(cloud, points, own))
-    similarity, agreed = float(np.mean(similarities)), Agreement.mean(agreements)
-    support = weights.inliers * pose.inliers + weights.similarity * similarity + weights.likelihood * agreed.likelihood
-    if prior is not None:
-        heading = np.arctan2(pose.R_map_level[1, 0], pose.R_map_level[0, 0])
-        support += float(prior.log_weight(pose.camera_m[None, :2], np.array([heading]))[0])
-    T_map_camera = transform_from(pose.R_map_level @ frames[0].R_level_camera, pose.camera_m)
-    return Candidate(T_map_camera, pose, similarity, float(np.mean(places_m)), agreed, support)
+            agreements.append([agreement(cloud, points, pose) for pose in own])
+    candidates = []
+    for k, (pose, similarity, place_m) in enumerate(
+        zip(found, np.mean(similarities, axis=0), np.mean(places_m, axis=0), strict=True)
+    ):
+        agreed = Agreement.mean([each[k] for each in agreements])
+        support = (
+            weights.inliers * pose.inliers + weights.similarity * similarity + weights.likelihood * agreed.likelihood
+        )
+        if prior is not None:
+            heading = np.arctan2(pose.R_map_level[1, 0], pose.R_map_level[0, 0])
+            support += float(prior.log_weight(pose.camera_m[None, :2], np.array([heading]))[0])
+        T_map_camera = transform_from(pose.R_map_level @ frames[0].R_level_camera, pose.camera_m)
+        candidates.append(Candidate(T_map_camera, pose, float(similarity), float(place_m), agreed, float(support)))
+    return candidates
 
 
 def _seen_from(frame: Frame, reference: Frame, pose: Registered) -> Registered:

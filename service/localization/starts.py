@@ -1,5 +1,6 @@
 """From similar views to the poses that registration starts from: distinct in place and heading."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ class StartSettings:
         apart_m: of two starts of one heading.
         apart_rad: of two starts of one place.
         temperature: similarity that a prior's logarithm is worth; near the one that training ends at.
+        pooled: of several frames, so many at most are compared by what all frames say there.
     """
 
     most: int = 16
@@ -29,11 +31,17 @@ class StartSettings:
     apart_m: float = 2.2
     apart_rad: float = float(np.deg2rad(20.0))
     temperature: float = 0.02
+    pooled: int = 64
+
+
+#: How similar all frames are, in the mean, to the map where the reference's level frame is said to stand (n, 4, 4).
+Likeness = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def starts_from(
-    frames: tuple[Frame, ...], prior: Prior | None, *, lidar_height_m: float, settings: StartSettings
-) -> list[Start]:
+    frames: tuple[Frame, ...], prior: Prior | None, *, lidar_height_m: float, settings: StartSettings,
+    likeness: Likeness | None = None,
+) -> list[Start]:  # fmt: skip
     """Level poses of the reference camera at the most similar views that are distinct.
 
     Args:
@@ -41,9 +49,22 @@ def starts_from(
         prior: moves what fits it forward; half of the starts are taken without it, since it may be wrong.
         lidar_height_m: of the places above their ground.
         settings: how many.
+        likeness: ranks the starts of several frames; what a single one resembles can else crowd out what all of them do.
     """
     poses = np.concatenate([_poses(frame, frames[0], lidar_height_m) for frame in frames])
     similarity = np.concatenate([frame.matches.similarity for frame in frames])
+    kept = _chosen(poses, similarity, prior, settings, settings.most if likeness is None else settings.pooled)
+    if likeness is not None:
+        poses, similarity = poses[kept], likeness(poses[kept])
+        kept = _chosen(poses, similarity, prior, settings, settings.most)
+    # Without the prior: it is weighed at the end, when rivals have been registered too.
+    return [Start(poses[k, :3, :3], poses[k, :3, 3], number, float(similarity[k])) for number, k in enumerate(kept)]
+
+
+def _chosen(
+    poses: NDArray[np.float64], similarity: NDArray[np.float64], prior: Prior | None, settings: StartSettings, most: int
+) -> list[int]:
+    """Rows of the most similar poses that are distinct; with a prior, half of them by it and half without it."""
     heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     allowed = similarity >= similarity.max() - settings.less_similar
     rank = similarity
@@ -51,13 +72,12 @@ def starts_from(
         rank = similarity + settings.temperature * prior.log_weight(poses[:, :2, 3], heading)
         allowed |= rank >= rank.max() - settings.less_similar
     order = np.argsort(-rank, kind="stable")
-    first = settings.most if prior is None else (settings.most + 1) // 2
+    first = most if prior is None else (most + 1) // 2
     kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, [], first, settings)
     if prior is not None:
         order = np.argsort(-similarity, kind="stable")
-        kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, kept, settings.most, settings)
-    # Without the prior: it is weighed at the end, when rivals have been registered too.
-    return [Start(poses[k, :3, :3], poses[k, :3, 3], number, float(similarity[k])) for number, k in enumerate(kept)]
+        kept = _distinct(order[allowed[order]], poses[:, :2, 3], heading, kept, most, settings)
+    return kept
 
 
 def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ _NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, 
 _REMEDY = "copy or build the bundle again"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class MapBundle:
     """An open map; all arrays are read-only and memory-mapped, safe to share between threads."""
 
@@ -81,6 +82,11 @@ class MapBundle:
         """Levelled pose of each place."""
         poses: Float64[NDArray[np.float64], "P 4 4"] = self.places["T_map_place"]
         return poses
+
+    @cached_property
+    def places_xy(self) -> Float64[NDArray[np.float64], "2 P"]:
+        """Where the places lie on the ground, in memory: x of all, y of all."""
+        return np.ascontiguousarray(self.T_map_place[:, :2, 3].T)
 
     @property
     def place_street(self) -> Int32[NDArray[np.int32], " P"]:

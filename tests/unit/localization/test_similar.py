@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_y, rotation_z
 from service.localization import similar
-from service.localization.similar import similarity_at
+from service.localization.similar import similarities_at
 
 FAN_DEG = [0.0, 90.0, 180.0, 270.0]
 
@@ -43,10 +43,11 @@ def asked(bundle, *given, **named):
 
 
 def found_at(bundle, x_m, heading_deg, descriptors=((1.0, 0.0, 0.0),), *, y_m=0.0, R=None):
-    return similarity_at(
-        bundle, np.array(descriptors, np.float32), R_map_level=rotation_z(np.deg2rad(heading_deg)) if R is None else R,
-        camera_m=np.array([x_m, y_m, 500.0]),
-    )  # fmt: skip
+    R = rotation_z(np.deg2rad(heading_deg)) if R is None else R
+    similarity, place_m = similarities_at(
+        bundle, np.array(descriptors, np.float32), R_map_level=R[None], camera_m=np.array([[x_m, y_m, 500.0]])
+    )
+    return float(similarity[0]), float(place_m[0])
 
 
 @pytest.mark.parametrize(("x_m", "expected"), [(31, 0.3), (40, 0.4), (-100, 0.2), (70, 0.5), (34, 0.3), (36, 0.4)])
@@ -195,3 +196,15 @@ def test_the_wider_the_curve_the_more_the_further_places_count(row, x_m, y_m, wi
             distances.append(place_m)
     assert away[0] - 1e-6 <= distances[0] <= distances[1] + 1e-6
     assert distances[1] <= away.mean() + 1e-6
+
+
+def test_several_poses_are_told_as_one_by_one(street):
+    poses = [(31.0, 40.0), (-100.0, 0.0), (36.0, 100.0), (34.0, 270.0)]
+    similarity, place_m = similarities_at(
+        street, np.array([[1.0, 0.0, 0.0]], np.float32),
+        R_map_level=np.stack([rotation_z(np.deg2rad(heading)) for _, heading in poses]),
+        camera_m=np.array([[x, 0.0, 500.0] for x, _ in poses]),
+    )  # fmt: skip
+    expected = [found_at(street, x, heading) for x, heading in poses]
+    np.testing.assert_allclose(np.stack([similarity, place_m], axis=1), expected, atol=1e-6)
+    assert len({round(each, 3) for each, _ in expected}) > 1

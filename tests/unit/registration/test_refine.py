@@ -301,3 +301,18 @@ def test_the_focal_length_is_that_of_the_depth_picture(here, seen_in, width, foc
     frame = seen_in(np.ones((60, 80), np.float32), here)
     depth_m = np.ones((width * 3 // 4, width), np.float32)
     assert replace(frame, query=replace(frame.query, depth_m=depth_m)).focal_px == focal_px
+
+
+def test_starts_of_several_frames_are_asked_where_each_frame_stood(bundle_at, frame_with, matches_at, monkeypatch):
+    """Place k, at x = 10 k, is 0.1 k similar; the second frame stood 10 m ahead: the mean of places k and k + 1."""
+    monkeypatch.setattr(similar, "PLACES", 1)
+    bundle = bundle_at(
+        [(10.0 * k, 0.0, 2.0) for k in range(8)], [0.0], [(0.1 * k, np.sqrt(1 - 0.01 * k * k)) for k in range(8)]
+    )
+    matches = matches_at([(0, 0, 2)], [0], [0.9])
+    ahead = transform_from(np.eye(3), np.array([0.0, 0.0, 10.0]))  # optical: z is forward
+    likeness = refining._likeness(bundle, (frame_with(matches), frame_with(matches, T_reference_camera=ahead)))
+    T_map_level = np.stack([transform_from(np.eye(3), np.array([x, 0.0, 1.4])) for x in (1.0, 29.0)])
+    np.testing.assert_allclose(likeness(T_map_level), [0.05, 0.35], atol=1e-6)
+    turned = transform_from(rotation_z(np.pi), np.array([30.0, 0.0, 1.4]))[None]  # ahead is now at x = 20
+    np.testing.assert_allclose(likeness(turned), [0.25], atol=1e-6)

@@ -199,6 +199,46 @@ def test_the_most_similar_match_comes_first_whichever_frame_found_it(matches_at,
     ) == [10, 50]
 
 
+def test_starts_of_several_frames_are_ranked_by_what_all_of_them_say(matches_at, frame_with):
+    """Look-alikes of single frames at 50 and 80 crowd out 10, which all frames resemble, but none of them most."""
+    asked = []
+
+    def likeness(T_map_level):
+        asked.append(T_map_level[:, 0, 3])
+        return np.where(np.abs(T_map_level[:, 0, 3] - 10) < 1, 0.85, 0.3)
+
+    reference = frame_with(matches_at([(50, 0, 2), (10, 0, 2)], [0, 0], [0.95, 0.85]))
+    ahead = frame_with(matches_at([(83, 0, 2), (13, 0, 2)], [0, 0], [0.96, 0.84]), T_reference_camera=AHEAD_3_M)
+
+    def found(**options):
+        chosen = StartSettings(most=2, less_similar=ANY_SIMILARITY, **options)
+        return starts_from((reference, ahead), None, lidar_height_m=1.8, settings=chosen, likeness=likeness)
+
+    assert x_of(found()) == [10, 80]
+    assert found()[0].similarity == pytest.approx(0.85)
+    assert sorted(asked[0]) == [10, 50, 80]  # one start of the two that agree
+    assert x_of(found(pooled=2)) == [80, 50]  # what is not in the pool is not compared
+
+
+def test_starts_that_all_frames_find_less_like_the_map_than_the_best_start_nothing(matches_at, frame_with):
+    reference = frame_with(matches_at([(50, 0, 2), (10, 0, 2)], [0, 0], [0.9, 0.85]))
+    found = starts_from(
+        (reference, reference), None, lidar_height_m=1.8, settings=StartSettings(less_similar=0.1),
+        likeness=lambda T: np.where(T[:, 0, 3] < 30, 0.8, 0.69),
+    )  # fmt: skip
+    assert x_of(found) == [10]
+
+
+def test_a_prior_moves_starts_of_several_frames_forward_too(matches_at, frame_with):
+    reference = frame_with(matches_at([(0, 0, 2), (50, 0, 2), (100, 0, 2)], [0, 0, 0], [0.9, 0.9, 0.9]))
+    prior = Prior(position_m=np.array([100.0, 0.0]), position_std_m=5.0)
+    found = starts_from(
+        (reference, reference), prior, lidar_height_m=1.8, settings=StartSettings(most=2, less_similar=ANY_SIMILARITY),
+        likeness=lambda T: np.where(T[:, 0, 3] == 50, 0.9, 0.8),
+    )  # fmt: skip
+    assert x_of(found) == [100, 50]
+
+
 angle = st.floats(-0.3, 0.3)
 
 
