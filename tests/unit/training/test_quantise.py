@@ -6,7 +6,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training import quantise as module  # noqa: E402  # after the skip
+from model_training.cli import quantize as cli  # noqa: E402  # after the skip
+from model_training.training import quantise as module  # noqa: E402
 from model_training.training.draws import augmented_batches  # noqa: E402
 from model_training.training.encoder_net import EncoderNet  # noqa: E402
 from model_training.training.export import export  # noqa: E402
@@ -68,3 +69,18 @@ def test_an_encoder_in_eight_bits_is_not_quantised_again(encoder, views, tmp_pat
     quantise(encoder, tmp_path / "eight.onnx", views[:2], views[2:])
     with pytest.raises(EncoderError, match="in eight bits already"):
         quantise(tmp_path / "eight.onnx", tmp_path / "again.onnx", views[:2], views[2:])
+
+
+def test_the_command_writes_a_file_and_says_how_near_it_is(encoder, pack_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "make_packs", lambda plans, *_, **__: [pack_folder] * len(plans))
+    cli.command(encoder, tmp_path / "eight.onnx", packs=tmp_path, cities=1, pairs=8, seed=3)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "cosine to float32's descriptors 0.99" in said or "cosine to float32's descriptors 1.00" in said
+    assert Encoder.open(tmp_path / "eight.onnx").sha256 != Encoder.open(encoder).sha256
+
+
+def test_the_command_refuses_what_is_no_encoder_before_cities_are_simulated(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "make_packs", lambda *_, **__: pytest.fail("simulated"))
+    (tmp_path / "text.onnx").write_text("none")
+    with pytest.raises(EncoderError, match="no ONNX model"):
+        cli.command(tmp_path / "text.onnx", tmp_path / "eight.onnx")
