@@ -34,7 +34,7 @@ PAPER_IMAGES_SHARE = 4 * 0.7  # four epochs over 70 % of the frames
 
 
 PILOT_STEPS, PILOT_LEFT_OUT = 24, 8  # the first steps read the pack from disk
-SPARED = 0.07  # of a budget: a full memory of descriptors and checkpoints cost more than the pilot's steps
+SPARED = 0.12  # of a budget: a full memory of descriptors and checkpoints cost more than the pilot's steps (0.07 went over by 4 %)
 
 
 def config_as_paper(size: Size) -> TrainingConfig:
