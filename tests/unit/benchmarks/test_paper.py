@@ -1,4 +1,5 @@
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,9 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.paper import ours
 from benchmarks.paper.data import Size, lidar_above
 from benchmarks.paper.kept import MethodResult
-from benchmarks.paper.ours import config_for
+from benchmarks.paper.ours import config_as_paper, config_within
 from benchmarks.paper.rows import METHODS, PAPER_IMAGES, all_rows, errors_of, figures_of, minutes_for_paper_images
 from benchmarks.paper.tables import PAPER_MED_M, PAPER_MEDIAN, PAPER_MSE, TABLE_II
 from benchmarks.report import Report
@@ -16,6 +18,7 @@ from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.learning import CurvePoint
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.baselines.paper_data.plan import TEST_TRAVERSAL, TRAINING_TRAVERSAL, pairs_plan
+from model_training.training.loop import TrainingConfig
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_body, heading_of_camera, rotation_z
 
@@ -148,11 +151,34 @@ def test_nothing_learns_from_the_other_drive() -> None:
 
 
 def test_our_encoder_is_shown_as_many_images_as_the_paper_s_network() -> None:
-    config = config_for(Size())
+    config = config_as_paper(Size())
 
     assert config.pairs == 128
     assert abs(config.steps * 256 - PAPER_IMAGES) <= 128
-    assert config_for(Size(frames=640, pairs=320)).pairs == 80
+    assert config_as_paper(Size(frames=640, pairs=320)).pairs == 80
+
+
+def test_a_budget_buys_as_many_steps_as_a_pilot_says_and_a_run_that_began_keeps_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps of 0.5 s: 200 fit 100 s, less what is spared."""
+    clock = {"s": 0.0}
+
+    def train(
+        packs: list[Path], run: Path, config: TrainingConfig, *, report: Callable[[None], None], **_: object
+    ) -> None:
+        for _step in range(config.steps):
+            clock["s"] += 0.5
+            report(None)
+
+    monkeypatch.setattr(ours, "train", train)
+    monkeypatch.setattr(ours.time, "process_time", lambda: clock["s"])
+    config = config_within(100.0, tmp_path / "pack", TrainingConfig(), tmp_path / "run")
+    assert config == TrainingConfig(steps=int((1 - ours.SPARED) * 200))
+
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text(config.model_dump_json())
+    assert config_within(1e6, tmp_path / "pack", TrainingConfig(), tmp_path / "run") == config
 
 
 def test_a_lidar_above_the_camera_looks_where_it_looks() -> None:
