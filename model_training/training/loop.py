@@ -41,7 +41,9 @@ class TrainingConfig(BaseModel):
     largest_scale: float = 60.0
     seed: int = 0
     turn_deg: float = 9.0  # between a query and its map view, at most: a fan of 24 headings is off by up to 7.5
-    memory_after: int = 300  # steps before descriptors of earlier batches are used: at first they drift too fast
+    memory_after: int | None = (
+        300  # steps before earlier batches' descriptors are used, which drift too fast at first; None: never
+    )
     memory_steps: int = 400  # a descriptor older than this is no longer a negative
     alike_seeds: int = 8  # pairs of a batch whose look-alikes are drawn with them
     alike_each: int = 7
@@ -132,7 +134,8 @@ def train(
             _set_rate(optimiser, config, step)
             number = int(rng.integers(len(cities)))
             memory, wanted = memories[number], None
-            known = memory.recent(step, config.memory_steps) if step >= config.memory_after else np.zeros(0, np.int64)
+            remembers = config.memory_after is not None and step >= config.memory_after
+            known = memory.recent(step, config.memory_steps) if remembers else np.zeros(0, np.int64)
             if len(known) > config.pairs:
                 seeds = rng.choice(known, config.alike_seeds, replace=False)
                 wanted = memory.alike(seeds, known, config.alike_each)

@@ -155,6 +155,7 @@ def test_our_encoder_is_shown_as_many_images_as_the_paper_s_network() -> None:
 
     assert config.pairs == 128
     assert abs(config.steps * 256 - PAPER_IMAGES) <= 128
+    assert config.memory_after is None
     assert config_as_paper(Size(frames=640, pairs=320)).pairs == 80
 
 

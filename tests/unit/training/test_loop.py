@@ -8,6 +8,7 @@ torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
 from model_training.training.augment import Augmentation  # noqa: E402  # after the skip
 from model_training.training.loop import TrainingConfig, load_run, train  # noqa: E402
+from model_training.training.memory import DescriptorMemory  # noqa: E402
 from service.errors import DatasetError  # noqa: E402
 
 GENTLE = Augmentation(
@@ -119,3 +120,13 @@ def test_half_precision_learns_as_well_and_leaves_float32_weights(pack_folder, t
     net = run_of(pack_folder, tmp_path / "run", changed, report=lambda progress: losses.append(progress.loss))
     assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])
     assert {parameter.dtype for parameter in net.parameters()} == {torch.float32}
+
+
+def test_without_a_memory_no_earlier_descriptor_is_asked_for(pack_folder, tmp_path, config, monkeypatch):
+    asked = []
+    recent = DescriptorMemory.recent
+    monkeypatch.setattr(DescriptorMemory, "recent", lambda *given: asked.append(given) or recent(*given))
+    run_of(pack_folder, tmp_path / "never", config.model_copy(update={"memory_after": None}))
+    assert asked == []
+    run_of(pack_folder, tmp_path / "later", config)
+    assert len(asked) == config.steps - config.memory_after
