@@ -1,8 +1,7 @@
 """Open a map bundle: check everything, then map it into memory."""
 
 import json
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ _NEEDED = (parts.ENCODER_FILE, index.FILE, parts.PLACES_FILE, parts.VIEWS_FILE, 
 _REMEDY = "copy or build the bundle again"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class MapBundle:
     """An open map; all arrays are read-only and memory-mapped, safe to share between threads."""
 
@@ -41,6 +40,11 @@ class MapBundle:
     streets: Streets | None
     calibration: Calibration | None
     cloud: SurfelMap | None
+    #: Where the places lie on the ground, in memory: x of all, y of all.
+    places_xy: Float64[NDArray[np.float64], "2 P"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "places_xy", np.ascontiguousarray(self.T_map_place[:, :2, 3].T))
 
     @classmethod
     def open(cls, path: Path, *, verify: bool = True) -> "MapBundle":
@@ -82,11 +86,6 @@ class MapBundle:
         """Levelled pose of each place."""
         poses: Float64[NDArray[np.float64], "P 4 4"] = self.places["T_map_place"]
         return poses
-
-    @cached_property
-    def places_xy(self) -> Float64[NDArray[np.float64], "2 P"]:
-        """Where the places lie on the ground, in memory: x of all, y of all."""
-        return np.ascontiguousarray(self.T_map_place[:, :2, 3].T)
 
     @property
     def place_street(self) -> Int32[NDArray[np.int32], " P"]:
