@@ -61,7 +61,7 @@ class EncoderNet(nn.Module):
         return self._after_conv1(self.conv1(torch.cat([x * (1 - query), x * query], dim=1)))
 
     def of_both(self, planes: Tensor, queries: int) -> Tensor:
-        """What ``forward`` gives for a batch whose first ``queries`` rows are queries; without its zeros, a tenth faster."""
+        """What ``forward`` gives for a batch whose first ``queries`` rows are queries; without the zeros of the side that is not asked."""
         x = normalised(planes)
         convolution, norm, activation = self.conv1
         weight = cast("Tensor", convolution.weight)

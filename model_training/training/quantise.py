@@ -2,7 +2,7 @@
 
 Weights are whole numbers a filter, activations a tensor; normalisation at the front and the unit vector at the end stay float32
 (Jacob et al., CVPR 2018). Weights keep to seven bits: on processors without VNNI the sum of two products of eight would
-overflow its sixteen bits, and one encoder must say the same everywhere.
+overflow its sixteen bits, and descriptors would depend on the processor.
 """
 
 import tempfile
