@@ -26,7 +26,7 @@ class StartSettings:
         pooled: of several frames, so many at most are compared by what all frames say there.
     """
 
-    most: int = 16
+    most: int = 32
     less_similar: float = 0.05
     apart_m: float = 2.2
     apart_rad: float = float(np.deg2rad(20.0))

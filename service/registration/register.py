@@ -51,7 +51,7 @@ class RegistrationSettings:
     kept: int = 16
     kept_of_each: tuple[int, int] = (2, 5)
     middle_points: int = 400
-    refined: int = 4
+    refined: int = 6
     similarity_weight: float = 8.0
     apart_m: float = 0.5
     fine_weight: float = 1.0
