@@ -13,12 +13,14 @@ from model_training.simulation.simulate import simulate
 from service.maps.reader import MapBundle
 
 BUILD = "from service.cli.main import main; main()"
-#: The same, with Ctrl-C pressed as soon as the first part of the places is kept.
+#: The same, with Ctrl-C pressed as soon as the first part of the places is kept; heard even where tests run in the background, whose
+#: processes are born deaf to it.
 INTERRUPTED = (
     """
 import os, signal
 from model_training.mapping import work
 
+signal.signal(signal.SIGINT, signal.default_int_handler)
 keep = work._write
 
 def kept(path, arrays):
