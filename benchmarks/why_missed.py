@@ -25,7 +25,7 @@ _PEERS = (
 WHY_MISSED: dict[str, str] = {
     "paper.streetfix.minutes_for_paper_images": (
         "two threads beside other work, which spend processor time on waiting for each other; the others had one thread. Alike, one "
-        "thread each in half precision, it is 6.7 minutes against 3.7 of the encoder with a field of view, whose 4 x 4 patches are less "
+        "thread each in half precision, it is 5.8 minutes against 3.7 of the encoder with a field of view, whose 4 x 4 patches are less "
         "work a picture than our trunk"
     ),
     "raw.unseen.precise.recall_at_1_5m": (
@@ -70,7 +70,7 @@ WHY_MISSED: dict[str, str] = {
     "doubt.covariance_95_coverage": (
         "the worst of the four above; errors have heavier tails than one factor for all answers covers: answers that slid 0.3 "
         "to 1 m; tried: patches that disagree (helped), figures of the query, the spread of nearby candidates (widens right "
-        "answers as much); the stereo answers' coverage fell from 0.881 when more of those that slid were accepted"
+        "answers as much); 0.881 before 32 starts and six candidates, which was not looked into"
     ),
     "full.condition.night.within_1_m": (
         "night's noise in colour and depth is no part of the training; 3.7 % are wrong when forced"
@@ -124,7 +124,7 @@ WHY_MISSED: dict[str, str] = {
     "throughput_over_bare": _OVER_BARE,
     "retrieval.cpu_ms": (
         "9.3 ms of it are the bare pipeline, of which decoding takes 2.8, gathering and levelling 1.7, lists and comparisons 1.7; brought "
-        "from 14.5 by httptools, shared views, compiled loops, principal axes and libdeflate, and from 12.4 by eight-bit weights (decision "
+        "from 14.5 by httptools, shared views, compiled loops, principal axes and libdeflate; 12.4 before the encoder had eight bits (decision "
         "log)"
     ),
     "retrieval.cpu_ms_fast_depth": (
@@ -139,8 +139,8 @@ WHY_MISSED: dict[str, str] = {
         "faster service is offered more to refuse (165 a second instead of 111); tried: a shorter switch interval of Python's lock"
     ),
     "overload.refusal_p99_ms": (
-        "runs gave 22 to 153 ms; half of the refusals take 6 ms, and health is told within 10 at the same time, so it is not the loop "
-        "that is late; tried: a shorter switch interval of Python's lock (22 and 30 against 29 and 22), worker threads that give way to "
+        "runs gave 22 to 153 ms; half of the refusals take 6 ms, and health is told within 10 at the same time, which speaks against "
+        "a loop that is late; tried: a shorter switch interval of Python's lock (22 and 30 against 29 and 22), worker threads that give way to "
         "the loop by niceness (59 to 83 ms without, 39 to 85 with); next: tell what the load generator's own core adds"
     ),
     "peers.throughput_over_best.retrieval": _PEERS,
