@@ -124,8 +124,8 @@ WHY_MISSED: dict[str, str] = {
     "throughput_over_bare": _OVER_BARE,
     "retrieval.cpu_ms": (
         "9.3 ms of it are the bare pipeline, of which decoding takes 2.8, gathering and levelling 1.7, lists and comparisons 1.7; brought "
-        "from 14.5 by httptools, shared views, compiled loops, principal axes and libdeflate; 12.4 before the encoder had eight bits (decision "
-        "log)"
+        "from 14.5 by httptools, shared views, compiled loops, principal axes and libdeflate; 12.4 before the encoder had "
+        "eight bits (decision log)"
     ),
     "retrieval.cpu_ms_fast_depth": (
         "as retrieval.cpu_ms; depth now costs 1.5 ms as PNG and 0.35 as raw16+lz4, so no more than that is left to win"
@@ -140,8 +140,8 @@ WHY_MISSED: dict[str, str] = {
     ),
     "overload.refusal_p99_ms": (
         "runs gave 22 to 153 ms; half of the refusals take 6 ms, and health is told within 10 at the same time, which speaks against "
-        "a loop that is late; tried: a shorter switch interval of Python's lock (22 and 30 against 29 and 22), worker threads that give way to "
-        "the loop by niceness (59 to 83 ms without, 39 to 85 with); next: tell what the load generator's own core adds"
+        "a loop that is late; tried: a shorter switch interval of Python's lock (22 and 30 against 29 and 22), worker threads that give "
+        "way to the loop by niceness (59 to 83 ms without, 39 to 85 with); next: tell what the load generator's own core adds"
     ),
     "peers.throughput_over_best.retrieval": _PEERS,
     "peers.throughput_over_best.full": _PEERS,
