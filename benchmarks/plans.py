@@ -5,7 +5,8 @@ from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import EVALUATION_SEEDS
 
 BOTH = ("precise", "stereo")
-HARD_COUNT, SEQUENCES, SEQUENCE = 300, 120, 5
+HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
+REPEATING_SEQUENCES = 480  # one in six passes a landmark
 
 
 def paper_plan() -> SimulationPlan:
@@ -52,5 +53,7 @@ def lidar_16_plan() -> SimulationPlan:
 
 def repeating_plan() -> SimulationPlan:
     """A street of blocks that are all alike but for a landmark every few of them; sequences all along it."""
-    queries = (QueryPlan(name="sequences", traversal=1, count=SEQUENCES, sequence=SEQUENCE, step_m=3.0, aside_m=1.5),)
+    queries = (
+        QueryPlan(name="sequences", traversal=1, count=REPEATING_SEQUENCES, sequence=SEQUENCE, step_m=3.0, aside_m=1.5),
+    )
     return SimulationPlan(name="repeating", city="repeating", seed=EVALUATION_SEEDS[21], queries=queries)

@@ -19,6 +19,8 @@ from model_training.loadtest.summary import Summary, summarise
 from model_training.loadtest.targets import Grpc, Rest, Target
 from service.errors import RequestError, UnreachableError
 
+LATE_MS = 10.0  # a generator that is later than that to send, at p99, is told of
+
 
 def command(
     dataset: Annotated[Path, typer.Option(help="dataset whose query pairs are sent")],
@@ -129,4 +131,9 @@ def table_of(found: list[Summary]) -> Table:
         )  # fmt: skip
     if wrong := sum(each.inconsistent for each in found):
         table.caption = f"{table.caption}; {wrong} answers differ from another answer to the same request"
+    if (late_ms := max(each.late_ms.get("p99", 0.0) for each in found)) > LATE_MS:
+        table.caption = (
+            f"{table.caption}; this generator was itself late to send (p99 {late_ms:.0f} ms, in all latencies): "
+            "give it a core of its own, or less to send"
+        )
     return table

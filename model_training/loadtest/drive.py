@@ -19,12 +19,14 @@ class Shot:
     Attributes:
         due_s: when it was to be sent, from the run's beginning; latency counts from here, so that a generator or a service that falls
             behind does not hide it (Tene's coordinated omission).
+        sent_s: when the generator came to send it; what lies between is the generator's own lateness.
         done_s: when its outcome was known.
         payload: number of the request sent.
         reply: what came back.
     """
 
     due_s: float
+    sent_s: float
     done_s: float
     payload: int
     reply: Reply
@@ -69,13 +71,13 @@ async def drive(
         return time.perf_counter() - began
 
     async def send(due_s: float) -> None:
-        number = next(turn) % len(payloads)
+        number, sent_s = next(turn) % len(payloads), now()
         try:
             async with asyncio.timeout(load.timeout_s):
                 reply = await target.ask(payloads[number], load.timeout_s)
         except TimeoutError:
             reply = Reply("timeout")
-        shots.append(Shot(due_s, now(), number, reply))
+        shots.append(Shot(due_s, sent_s, now(), number, reply))
 
     async def client() -> None:
         while now() < total:

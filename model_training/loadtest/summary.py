@@ -23,6 +23,7 @@ class Summary:
         answered_per_s: answers that came within the counted seconds, a second.
         answered_ms: percentiles of the answered ones' latency: p50, p90, p95, p99, max; empty without any.
         refused_ms: of the others'.
+        late_ms: by which the generator itself was late to send, of all; part of every latency here.
         errors: others by what became of them.
         localized: share of the answers that are LOCALIZED.
         right: share of those within 1 m of the truth; None without truth.
@@ -37,6 +38,7 @@ class Summary:
     answered_per_s: float
     answered_ms: dict[str, float]
     refused_ms: dict[str, float]
+    late_ms: dict[str, float]
     errors: dict[str, int]
     answers: int
     localized: float | None
@@ -83,7 +85,9 @@ def summarise(
     used = None if before is None or after is None else after.cpu_s - before.cpu_s
     return Summary(
         rate=load.rate, concurrency=load.concurrency, offered_per_s=len(counted) / load.duration_s,
-        answered_per_s=in_time / load.duration_s, answered_ms=_percentiles(answered), refused_ms=_percentiles(refused),
+        answered_per_s=in_time / load.duration_s, answered_ms=_percentiles([shot.done_s - shot.due_s for shot in answered]),
+        refused_ms=_percentiles([shot.done_s - shot.due_s for shot in refused]),
+        late_ms=_percentiles([shot.sent_s - shot.due_s for shot in counted]),
         errors=dict(Counter(shot.reply.code for shot in refused)), answers=len(answered),
         localized=len(localized) / len(answered) if answered else None,
         right=float(np.mean(np.array(distances) <= RIGHT_M)) if distances else None, inconsistent=inconsistent,
@@ -92,9 +96,9 @@ def summarise(
     )  # fmt: skip
 
 
-def _percentiles(shots: list[Shot]) -> dict[str, float]:
-    if not shots:
+def _percentiles(seconds: list[float]) -> dict[str, float]:
+    if not seconds:
         return {}
-    ms = np.array([1e3 * (shot.done_s - shot.due_s) for shot in shots])
+    ms = 1e3 * np.array(seconds)
     found = {f"p{p}": float(np.percentile(ms, p)) for p in (50, 90, 95, 99)}
     return found | {"max": float(ms.max())}

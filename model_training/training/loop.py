@@ -44,7 +44,10 @@ class TrainingConfig(BaseModel):
     memory_after: int | None = (
         300  # steps before earlier batches' descriptors are used, which drift too fast at first; None: never
     )
-    memory_steps: int = 400  # a descriptor older than this is no longer a negative
+    memory_steps: int = 400  # a descriptor older than this is forgotten
+    stale_negatives: bool = (
+        True  # whether remembered descriptors are negatives too; otherwise they choose look-alikes alone
+    )
     alike_seeds: int = 8  # pairs of a batch whose look-alikes are drawn with them
     alike_each: int = 7
     precision: Precision = "float32"  # of the forward pass; bfloat16 takes half the time where the processor has it
@@ -148,7 +151,9 @@ def train(
             scale = log_scale.exp().clamp(max=config.largest_scale)
             q = Side(descriptors[:count], batch.query_xy.to(place))
             m = Side(descriptors[count:], batch.survey_xy.to(place))
-            earlier = torch.from_numpy(np.setdiff1d(known, batch.pairs)).to(place)
+            earlier = torch.from_numpy(np.setdiff1d(known, batch.pairs) if config.stale_negatives else known[:0]).to(
+                place
+            )
             losses, first_ones = paired_info_nce(
                 q, m, scale=scale,
                 more_queries=Side(memory.queries[earlier], memory.queries_xy[earlier]),

@@ -177,7 +177,10 @@ def loaded(monkeypatch):
             answered_per_s={"full": 20.0, "retrieval": 50.0}[kind] / (2 if server.name == "mlserver" else 1),
             cpu_ms_per_answer=9.0, errors={"timeout": 1} if server.name == "bentoml" else {}, inconsistent=0,
         )  # fmt: skip
-        shots = [Shot(0.0, 9.0, 0, Reply("ok")), Shot(how.warm_up_s, how.warm_up_s + 0.03, 0, Reply("ok"))]
+        shots = [
+            Shot(0.0, 0.0, 9.0, 0, Reply("ok")),
+            Shot(how.warm_up_s, how.warm_up_s, how.warm_up_s + 0.03, 0, Reply("ok")),
+        ]
         return summary, shots
 
     monkeypatch.setattr(measure, "load", load)

@@ -4,7 +4,8 @@ import time
 import numpy as np
 import pytest
 
-from model_training.loadtest.drive import Load, arrivals, drive
+from model_training.cli.loadtest import table_of
+from model_training.loadtest.drive import Load, Shot, arrivals, drive
 from model_training.loadtest.payloads import Payload
 from model_training.loadtest.summary import summarise
 from model_training.loadtest.targets import Reply
@@ -71,10 +72,22 @@ def test_latency_counts_from_when_a_request_was_due():
                 time.sleep(0.3)  # the very thing
             return await super().ask(payload, timeout_s)
 
-    shots = asyncio.run(drive(Stops(), PAYLOADS, Load(rate=100, warm_up_s=0, duration_s=0.4)))
+    load = Load(rate=100, warm_up_s=0, duration_s=0.4)
+    shots = asyncio.run(drive(Stops(), PAYLOADS, load))
     late = [shot.done_s - shot.due_s for shot in shots if shot.due_s < 0.2]
     assert len(late) > 5
     assert min(late) > 0.09
+    found = summarise(shots, PAYLOADS, load, None, None)
+    assert found.late_ms["max"] > 200  # told apart: it was not the target that was slow to answer
+    assert "was itself late" in str(table_of([found]).caption)
+
+
+def test_a_generator_that_keeps_up_says_nothing_of_itself():
+    load = Load(rate=20, warm_up_s=0, duration_s=0.3)
+    shots = [Shot(due_s, due_s + 0.001, due_s + 0.5, 0, Reply("ok", "LOCALIZED")) for due_s in arrivals(20, 0.3, 0)]
+    found = summarise(shots, PAYLOADS, load, None, None)
+    assert found.late_ms["max"] == pytest.approx(1)
+    assert "late" not in str(table_of([found]).caption)
 
 
 def test_the_summary_counts_what_came_of_it():
