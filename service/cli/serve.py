@@ -1,5 +1,6 @@
 """``streetfix serve``: open the maps, listen, answer until told to stop."""
 
+import gc
 import math
 import os
 import signal
@@ -202,23 +203,41 @@ def _answer(
     set_up(style=settings.log_style, level=settings.log_level)
     keys = None if settings.api_keys is None else KeyRing.open(settings.api_keys)
     tls = None if settings.tls_certificate is None else Certificates.read(settings)
-    engine = Engine.open(settings, choices=choices)
+    if settings.grpc_port is not None:
+        import service.grpc.server  # noqa: F401  # so that it is among what stays
+    with _settled():
+        engine = Engine.open(settings, choices=choices)
+        try:
+            config = uvicorn.Config(
+                create_app(engine, keys), http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False,
+                lifespan="off", timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
+            )  # fmt: skip
+            with _grpc(engine, keys, tls) as (grpc_port, leave), _watching(engine):
+                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave)
+                # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
+                for number in (signal.SIGINT, signal.SIGTERM):
+                    signal.signal(number, server.handle_exit)
+                ready()
+                if says_where:
+                    _say_where(engine, listener, grpc_port, "http" if tls is None else "https")
+                server.run(sockets=[listener])
+        finally:
+            engine.close()
+
+
+@contextmanager
+def _settled() -> Iterator[None]:
+    """Garbage collection passes over what is here now, the hundred thousand objects of all that was imported.
+
+    To look through them took a full collection 100 ms now and then, in which nobody was answered (decision log). Maps are opened
+    inside, so one that is replaced is still collected.
+    """
+    gc.collect()
+    gc.freeze()
     try:
-        config = uvicorn.Config(
-            create_app(engine, keys), http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False, lifespan="off",
-            timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
-        )  # fmt: skip
-        with _grpc(engine, keys, tls) as (grpc_port, leave), _watching(engine):
-            server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave)
-            # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, server.handle_exit)
-            ready()
-            if says_where:
-                _say_where(engine, listener, grpc_port, "http" if tls is None else "https")
-            server.run(sockets=[listener])
+        yield
     finally:
-        engine.close()
+        gc.unfreeze()
 
 
 @contextmanager
