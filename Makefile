@@ -32,7 +32,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check console check-console test-console format generate release-proto lock evaluate evaluate-real paper bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test check console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -101,6 +101,9 @@ evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json
 
 evaluate-real: .venv/.torch ## measure on real recordings and round trips -> reports/real_data.json
 	$(BIN)/python -m benchmarks.real $(ARGS)
+
+choices: .venv/.torch ## what each design choice brings, in a watch city -> reports/choices.json; hours
+	$(BIN)/python -m benchmarks.choices $(ARGS)
 
 paper: .venv/.torch ## the paper's method, its baseline and others beside ours -> reports/paper.json, paper.md; hours; ARGS=--reduced: minutes
 	$(BIN)/python -m benchmarks.paper $(ARGS)

@@ -24,7 +24,7 @@ from service.maps.calibration import read_calibration
 
 RIGHT_M = 1.0
 #: Cities whose maps are built once more with every second street left out.
-PARTIAL = (0, 1)
+PARTIAL = (0, 1, 2)
 #: Draws one picture: depth (z, m, 0 for none) and grey.
 Picture = Callable[[np.random.Generator], tuple[NDArray[np.float64], NDArray[np.float64]]]
 FALSE_BARS = {("other_city", "precise"): 0.003, ("removed_streets", "precise"): 0.005,

@@ -22,4 +22,4 @@ def augmented_batches(packs: list[Path], config: TrainingConfig, *, seed: int) -
     cities = [City(Pack.open(folder), grid, turn_deg=config.turn_deg) for folder in packs]
     while True:
         batch = cities[int(rng.integers(len(cities)))].draw(config.pairs, rng)
-        yield views_of(batch, augment, place), len(batch.query_xy)
+        yield views_of(batch, augment, place, blind=config.blind), len(batch.query_xy)

@@ -17,12 +17,14 @@ from torch.utils.tensorboard import SummaryWriter
 from model_training.training.augment import Augmentation, Augmenter
 from model_training.training.batches import Batch, City
 from model_training.training.encoder_net import EncoderNet, EncoderShape
-from model_training.training.losses import Side, paired_info_nce
+from model_training.training.losses import Side, hardest_triplet, paired_info_nce
 from model_training.training.memory import DescriptorMemory
 from model_training.training.packs import Pack
 from model_training.training.precision import Precision, forward_in
 from service.errors import DatasetError
-from service.imaging.view_grid import ViewGrid
+from service.imaging.view_grid import PLANES, ViewGrid
+
+_LOSSES = {"info_nce": paired_info_nce, "triplet": hardest_triplet}
 
 
 class TrainingConfig(BaseModel):
@@ -50,6 +52,8 @@ class TrainingConfig(BaseModel):
     )
     alike_seeds: int = 8  # pairs of a batch whose look-alikes are drawn with them
     alike_each: int = 7
+    loss: Literal["info_nce", "triplet"] = "info_nce"
+    blind: tuple[str, ...] = ()  # planes (``service.imaging.view_grid.PLANES``) that queries are trained without
     precision: Precision = "float32"  # of the forward pass; bfloat16 takes half the time where the processor has it
     encoder: EncoderShape = EncoderShape()
     augmentation: Augmentation = Augmentation()
@@ -143,7 +147,7 @@ def train(
                 seeds = rng.choice(known, config.alike_seeds, replace=False)
                 wanted = memory.alike(seeds, known, config.alike_each)
             batch = cities[number].draw(config.pairs, rng, wanted)
-            planes = views_of(batch, augment, place)
+            planes = views_of(batch, augment, place, blind=config.blind)
             count = len(batch.query_xy)
             with forward_in(config.precision, place.type):
                 descriptors = net.of_both(planes, count)
@@ -154,7 +158,7 @@ def train(
             earlier = torch.from_numpy(np.setdiff1d(known, batch.pairs) if config.stale_negatives else known[:0]).to(
                 place
             )
-            losses, first_ones = paired_info_nce(
+            losses, first_ones = _LOSSES[config.loss](
                 q, m, scale=scale,
                 more_queries=Side(memory.queries[earlier], memory.queries_xy[earlier]),
                 more_surveys=Side(memory.surveys[earlier], memory.surveys_xy[earlier]),
@@ -187,8 +191,8 @@ def train(
     return trained
 
 
-def views_of(batch: Batch, augment: Augmenter, place: torch.device) -> torch.Tensor:
-    """A batch as the network sees it: augmented planes, queries before survey views."""
+def views_of(batch: Batch, augment: Augmenter, place: torch.device, *, blind: tuple[str, ...] = ()) -> torch.Tensor:
+    """A batch as the network sees it: augmented planes, queries before survey views; queries without the planes in ``blind``."""
     count = len(batch.query_xy)
     rows_seen = augment.cut_rows(batch.rows_seen.to(place), count)
     surveys = augment.survey(
@@ -197,6 +201,7 @@ def views_of(batch: Batch, augment: Augmenter, place: torch.device) -> torch.Ten
     queries = augment.query(
         batch.query_ranges.to(place), batch.query_rgb.to(place), batch.query_height_m.to(place), rows_seen
     )
+    queries[:, [PLANES.index(name) for name in blind]] = 0.0
     return torch.cat([queries, surveys]).contiguous(memory_format=torch.channels_last)
 
 

@@ -42,6 +42,24 @@ def paired_info_nce(
     return loss, forward.argmax(dim=1) == own
 
 
+def hardest_triplet(
+    queries: Side, surveys: Side, *, scale: Tensor, more_queries: Side | None = None, more_surveys: Side | None = None
+) -> tuple[Tensor, Tensor]:
+    """The soft-margin triplet loss of each pair's hardest negative, both ways (Hermans et al., 2017), instead of all of them.
+
+    Arguments and result as ``paired_info_nce`` has them.
+    """
+    forward = _logits(queries, surveys, scale, more_surveys)
+    backward = _logits(surveys, queries, scale, more_queries)
+    own = torch.arange(len(queries.descriptors), device=queries.descriptors.device)
+
+    def one_way(logits: Tensor) -> Tensor:
+        hardest = logits.scatter(1, own[:, None], -torch.inf).max(dim=1).values
+        return functional.softplus(hardest - logits[own, own])
+
+    return 0.5 * (one_way(forward) + one_way(backward)), forward.argmax(dim=1) == own
+
+
 def _logits(asked: Side, answers: Side, scale: Tensor, more: Side | None) -> Tensor:
     """Scaled similarities (B, B + N) of what is asked to its answers and to further negatives."""
     near = torch.cdist(asked.xy, answers.xy) < SAME_PLACE_M

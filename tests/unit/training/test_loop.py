@@ -6,10 +6,13 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training.augment import Augmentation  # noqa: E402  # after the skip
-from model_training.training.loop import TrainingConfig, load_run, train  # noqa: E402
+from model_training.training.augment import Augmentation, Augmenter  # noqa: E402  # after the skip
+from model_training.training.batches import City  # noqa: E402
+from model_training.training.loop import TrainingConfig, load_run, train, views_of  # noqa: E402
 from model_training.training.memory import DescriptorMemory  # noqa: E402
+from model_training.training.packs import Pack  # noqa: E402
 from service.errors import DatasetError  # noqa: E402
+from service.imaging.view_grid import PLANES, ViewGrid  # noqa: E402
 
 GENTLE = Augmentation(
     blocked=0,
@@ -130,3 +133,33 @@ def test_without_a_memory_no_earlier_descriptor_is_asked_for(pack_folder, tmp_pa
     assert asked == []
     run_of(pack_folder, tmp_path / "later", config)
     assert len(asked) == config.steps - config.memory_after
+
+
+def test_look_alikes_may_be_chosen_without_being_stale_negatives(pack_folder, tmp_path, config, monkeypatch):
+    """The same batches, fewer negatives: lower losses once the memory is asked."""
+    found = {}
+    for stale in (True, False):
+        losses = found[stale] = []
+        changed = config.model_copy(update={"stale_negatives": stale, "learning_rate": 0.0})
+        run_of(pack_folder, tmp_path / str(stale), changed, report=lambda progress, to=losses: to.append(progress.loss))
+    first = config.memory_after
+    np.testing.assert_allclose(found[True][:first], found[False][:first])
+    assert all(few < many for many, few in zip(found[True][first:], found[False][first:], strict=True))
+
+
+def test_blind_planes_are_zero_in_queries_alone(pack_folder, shape):
+    grid = ViewGrid(rows=shape.rows, columns=shape.columns)
+    batch = City(Pack.open(pack_folder), grid, turn_deg=2.0).draw(8, np.random.default_rng(0))
+
+    def views(blind):
+        augment = Augmenter(Augmentation(), grid, torch.Generator().manual_seed(0), torch.device("cpu"))
+        return views_of(batch, augment, torch.device("cpu"), blind=blind)
+
+    count, blind = len(batch.query_xy), ("range_m", "height_m")
+    all_planes, found = views(()), views(blind)
+    rows = [PLANES.index(name) for name in blind]
+    assert (all_planes[:count, rows] != 0).any()
+    assert (found[:count, rows] == 0).all()
+    others = [k for k in range(len(PLANES)) if k not in rows]
+    torch.testing.assert_close(found[:count, others], all_planes[:count, others])
+    torch.testing.assert_close(found[count:], all_planes[count:])

@@ -3,7 +3,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training.losses import Side, paired_info_nce  # noqa: E402  # after the skip
+from model_training.training.losses import Side, hardest_triplet, paired_info_nce  # noqa: E402  # after the skip
 
 
 def pairs(count=7, seed=0, spread_m=100.0):
@@ -90,3 +90,25 @@ def test_perfect_descriptors_have_almost_no_loss():
     losses, first = loss_of(np.eye(8), np.eye(8), far, far, scale=60.0)
     assert losses.max() < 1e-9
     assert first.all()
+
+
+@pytest.mark.parametrize("spread_m", [30.0, 300.0])
+def test_the_triplet_loss_is_that_of_the_hardest_rival_that_is_far_enough(spread_m):
+    queries, surveys, at_q, at_s = given = pairs(spread_m=spread_m)
+    found, first = (
+        each.numpy()
+        for each in hardest_triplet(
+            side(queries, at_q), side(surveys, at_s), scale=torch.tensor(10.0, dtype=torch.float64)
+        )
+    )
+    for k in range(len(queries)):
+        ways = []
+        for own, at, answers, places in ((queries[k], at_q[k], surveys, at_s), (surveys[k], at_s[k], queries, at_q)):
+            rivals = [
+                own @ answer
+                for j, (answer, place) in enumerate(zip(answers, places, strict=True))
+                if j != k and np.linalg.norm(at - place) >= 6.0
+            ]
+            ways.append(np.log1p(np.exp(10.0 * (max(rivals) - own @ answers[k]))))
+        assert found[k] == pytest.approx(np.mean(ways))
+    np.testing.assert_array_equal(first, loss_of(*given)[1])

@@ -1,0 +1,1 @@
+"""Design choices, each measured against its alternatives in a watch city -> ``reports/choices.json``."""

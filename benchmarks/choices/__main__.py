@@ -1,0 +1,124 @@
+"""``make choices``: what each design choice brings, in a city that no training and no bar has seen -> ``reports/choices.json``.
+
+Encoders are trained alike for a few hundred steps, each with one thing changed: figures compare with each other, not with the
+stock encoder's. Runs are kept under ``--work``; the same command goes on after a stop.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.choices.registration import registration_rows
+from benchmarks.choices.trainings import VARIATIONS, trained
+from benchmarks.choices.watch import Seen, WatchCity, watch_plan
+from benchmarks.report import ROOT, Report
+from benchmarks.runs import Runs
+from model_training.cli.progress import bars
+from model_training.stock import ENCODER
+from service.imaging.view_grid import ViewGrid
+from service.localization.encoder import Encoder
+from service.localization.hypotheses import ClusterSettings, similarity_weights
+
+STEPS = 1000
+KS = (1, 3, 5, 9, 15, 21)
+#: Views of a place, of the fan's 24.
+FANS = (24, 12, 8, 4, 2)
+
+
+def encoder_rows(report: Report, city: WatchCity, seen: dict[str, Seen]) -> None:
+    """R@1 and R@10 of every variation."""
+    for name, each in seen.items():
+        for queries in city.sets:
+            preset, likeness = queries.rpartition("_")[2], each.likeness(queries)
+            report.share(f"choices.{name}.{preset}.recall_at_1_5m", city.right(queries, likeness))
+            report.share(f"choices.{name}.{preset}.recall_at_10_5m", city.right(queries, likeness, first=10))
+
+
+def fan_rows(report: Report, city: WatchCity, stock: Seen) -> None:
+    """Fewer views a place: from the principal heading by PCA on, or from map x on."""
+    places, headings, size = stock.views.shape
+    turns = np.arange(headings)
+    for count in FANS:
+        from_pca = np.broadcast_to(turns % (headings // count) == 0, (places, headings))
+        fans = {"pca": from_pca}
+        if count < headings:
+            fans["fixed"] = _nearest_to_fixed(city.headings_rad, count)
+        for kind, allowed in fans.items():
+            row = f"choices.headings.{count}_{kind}"
+            report.row(f"{row}.index_mib", places * count * size * 4 / 2**20, "MiB", better="lower", n=places * count)
+            for queries in city.sets:
+                right = city.right(queries, stock.likeness(queries, allowed))
+                report.share(f"{row}.{queries.rpartition('_')[2]}.recall_at_1_5m", right)
+
+
+def _nearest_to_fixed(headings_rad: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
+    """(P, headings) the view of each place that is nearest to each of ``count`` headings of the map frame."""
+    wanted = 2 * np.pi * np.arange(count) / count
+    away = np.abs(np.angle(np.exp(1j * (headings_rad[:, :, None] - wanted))))
+    allowed = np.zeros(headings_rad.shape, bool)
+    np.put_along_axis(allowed, away.argmin(axis=1), values=True, axis=1)
+    return allowed
+
+
+def neighbour_rows(report: Report, city: WatchCity, stock: Seen) -> None:
+    """Street by the vote of the k most similar places, as the service counts it: weighed by similarity."""
+    place_street, true_street = city.streets()
+    for queries in city.sets:
+        likeness = stock.likeness(queries)
+        ranked = np.argsort(-likeness, axis=1, kind="stable")
+        known = true_street[queries] >= 0
+        for k in KS:
+            voted = np.array([
+                _vote(place_street[places[:k]], of[places[:k]]) for places, of in zip(ranked, likeness, strict=True)
+            ])  # fmt: skip
+            right = (voted == true_street[queries])[known]
+            report.share(f"choices.k.{k}.{queries.rpartition('_')[2]}.street_accuracy", right)
+
+
+def _vote(streets: NDArray[np.int64], likeness: NDArray[np.float32]) -> int:
+    weights = similarity_weights(likeness.astype(np.float64), ClusterSettings().temperature)
+    return int(np.argmax(np.bincount(streets + 1, weights))) - 1
+
+
+def main() -> None:
+    """Parse, train, ask, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "choices")
+    parser.add_argument("--steps", type=int, default=STEPS, help="of each training")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help=f"variations of: {' '.join(VARIATIONS)}")
+    parser.add_argument(
+        "--train", action="store_true", help="train and stop: so, two lots of --only can run side by side"
+    )
+    arguments = parser.parse_args()
+    if unknown := set(arguments.only or ()) - set(VARIATIONS):
+        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(VARIATIONS)}")
+    told = " ".join(sys.argv[1:])
+    report = Report("choices", "make choices" + (f' ARGS="{told}"' if told else ""))
+    if arguments.only:
+        report.keep_others()
+    runs, names = Runs(arguments.work, ENCODER), arguments.only or list(VARIATIONS)
+    with bars() as show:
+        files = {name: trained(name, arguments.work, arguments.steps, show) for name in names}
+    if arguments.train:
+        return
+    dataset = runs.dataset(watch_plan())
+    city = WatchCity(dataset, ViewGrid())
+    encoders = {name: (Encoder.open(file), VARIATIONS[name].blind) for name, file in files.items()}
+    with bars() as show:
+        seen = city.seen_by(encoders | {"stock": (Encoder.open(ENCODER), ())}, show)
+    encoder_rows(report, city, seen)
+    fan_rows(report, city, seen["stock"])
+    neighbour_rows(report, city, seen["stock"])
+    registration_rows(report, runs, dataset)
+    report.notes["trainings"] = (
+        f"{arguments.steps} steps of 128 pairs each, in half precision where the processor has it, one round; the watch city's "
+        f"{len(city.kept)} places with {city.settings.headings} views; `stock` is the shipped encoder."
+    )
+    print(f"written: {report.write()}")
+
+
+if __name__ == "__main__":
+    main()

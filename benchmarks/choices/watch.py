@@ -1,0 +1,126 @@
+"""A watch city, looked at by several encoders at once: which places are most like each query."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import fan, fan_views, kept_scans, levelled_scans, rows_seen_by
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.training.recipe import WATCH_SEEDS
+from service.geometry.rigid import heading_of_body
+from service.imaging.query_view import query_views
+from service.imaging.view_grid import PLANES, ViewGrid, survey_planes
+from service.localization.encoder import Encoder
+from service.localization.localizer import turns_on
+from service.maps.streets import Streets
+
+REACH_M = 5.0
+
+
+def watch_plan() -> SimulationPlan:
+    """A city that no training and no bar has seen."""
+    drive = QueryPlan(name="drive1", traversal=1, count=500, depths=("precise", "stereo"))
+    return SimulationPlan(name="watch", seed=WATCH_SEEDS[1], queries=(drive,))
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What an encoder makes of the city.
+
+    Attributes:
+        views: descriptors of the map's views (P, headings, D).
+        queries: of each set's queries, at each turn (Q, T, D).
+    """
+
+    views: NDArray[np.float32]
+    queries: dict[str, NDArray[np.float32]]
+
+    def likeness(self, name: str, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """Similarity of each query's best turn to each place's best view (Q, P); of the views that are allowed (P, headings)."""
+        places, headings, size = self.views.shape
+        flat = self.views.reshape(-1, size)
+        best = np.empty((len(self.queries[name]), places), np.float32)
+        for k, turns in enumerate(self.queries[name]):
+            likeness = (turns @ flat.T).max(axis=0).reshape(places, headings)
+            best[k] = (likeness if allowed is None else np.where(allowed, likeness, -2.0)).max(axis=1)
+        return best
+
+
+class WatchCity:
+    """The city's places and queries, cut into views once for all encoders."""
+
+    def __init__(self, dataset: Dataset, grid: ViewGrid) -> None:
+        self.dataset, self.grid = dataset, grid
+        self.settings = BuildSettings(name="watch", calibration=None)
+        self.poses, self.kept = kept_scans(dataset, self.settings)
+        self.rows_seen = rows_seen_by(dataset, self.kept, grid, self.settings)
+        self.sets = dataset.query_sets(with_truth=True)
+
+    @cached_property
+    def xy(self) -> NDArray[np.float64]:
+        """Of the places (P, 2)."""
+        return np.asarray(self.poses[self.kept][:, :2, 3])
+
+    @cached_property
+    def true_xy(self) -> dict[str, NDArray[np.float64]]:
+        """Of each set's queries (Q, 2)."""
+        truths = {name: [frame.T_map_camera for frame in self.dataset.queries(name)] for name in self.sets}
+        return {name: np.array([T[:2, 3] for T in each if T is not None]) for name, each in truths.items()}
+
+    @cached_property
+    def headings_rad(self) -> NDArray[np.float64]:
+        """Of the views (P, headings), map frame; the first is the place's principal heading."""
+        turns = fan(self.settings.headings)
+        scans = levelled_scans(self.dataset, self.kept, self.settings)
+        rows = [heading_of_body(scan.T_map_level(self.poses[scan.number])) + scan.start_rad + turns for scan in scans]
+        return np.stack(rows)
+
+    def streets(self) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
+        """Number of each place's street, and of each query's by set; -1 for none."""
+        polygons = Streets.from_geojson(self.dataset.streets() or {"type": "FeatureCollection", "features": []})
+
+        def of(xy: NDArray[np.float64]) -> NDArray[np.int64]:
+            return np.array([polygons.index_at(each) for each in xy], np.int64)
+
+        return of(self.xy), {name: of(xy) for name, xy in self.true_xy.items()}
+
+    def seen_by(
+        self, encoders: dict[str, tuple[Encoder, tuple[str, ...]]], report: Callable[[str, int, int], None]
+    ) -> dict[str, Seen]:
+        """What each encoder makes of the map and of the queries, the latter without the planes that it was trained without."""
+        turns, views = fan(self.settings.headings), {name: list[NDArray[np.float32]]() for name in encoders}
+        for k, scan in enumerate(levelled_scans(self.dataset, self.kept, self.settings), 1):
+            planes = np.stack([
+                survey_planes(view, sensor_height_m=scan.level.height_m, rows_seen=self.rows_seen, grid=self.grid)
+                for view in fan_views(scan, turns, self.grid)
+            ])  # fmt: skip
+            for name, (encoder, _) in encoders.items():
+                views[name].append(encoder.encode(planes, "survey"))
+            report("places", k, len(self.kept))
+        queries = {name: {each: list[NDArray[np.float32]]() for each in self.sets} for name in encoders}
+        for each in self.sets:
+            for k, frame in enumerate(self.dataset.queries(each), 1):
+                asked = query_views(
+                    frame.rgb(), frame.depth_m(), frame.camera.pinhole(), grid=self.grid, rows_seen=self.rows_seen,
+                    turns=turns_on(self.grid),
+                )  # fmt: skip
+                for name, (encoder, blind) in encoders.items():
+                    planes = asked.planes.copy()
+                    planes[:, [PLANES.index(plane) for plane in blind]] = 0.0
+                    queries[name][each].append(encoder.encode(planes, "query"))
+                report(f"queries {each}", k, len(self.true_xy[each]))
+        return {
+            name: Seen(np.stack(views[name]), {each: np.stack(of) for each, of in queries[name].items()})
+            for name in encoders
+        }
+
+    def right(self, name: str, likeness: NDArray[np.float32], *, first: int = 1) -> NDArray[np.bool_]:
+        """(Q) whether one of the ``first`` most similar places lies within 5 m of the query."""
+        ranked = np.argsort(-likeness, axis=1, kind="stable")[:, :first]
+        away = np.linalg.norm(self.xy[ranked] - self.true_xy[name][:, None], axis=2)
+        return np.asarray((away <= REACH_M).any(axis=1))
