@@ -139,8 +139,8 @@ pictures: .venv/.torch ## the pictures of README and docs
 	$(BIN)/python -m benchmarks.pictures $(ARGS)
 
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
-	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS)
-	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --start-from runs/stock
+	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS) --negatives memory
+	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --negatives memory --start-from runs/stock
 	$(BIN)/streetfix export runs/second --out runs/second/encoder.onnx
 	$(BIN)/streetfix quantize runs/second/encoder.onnx --out model_training/stock/encoder.onnx
 

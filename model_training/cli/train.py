@@ -31,6 +31,13 @@ def command(
         str, typer.Option(help="float32, or bfloat16: twice as fast on processors that have it, and on GPUs")
     ] = "float32",
     start_from: Annotated[Path | None, typer.Option(help="run whose weights to start from")] = None,
+    negatives: Annotated[
+        str,
+        typer.Option(
+            help="batch: a batch's own pairs; look-alikes: half of it drawn from look-alikes; memory: and descriptors of earlier "
+            "batches, which undo a training on a single city"
+        ),
+    ] = "look-alikes",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
     workers: Annotated[int | None, typer.Option(help="processes that simulate [default: one a core]", min=1)] = None,
 ) -> None:
@@ -46,6 +53,8 @@ def command(
         raise DatasetError(f"optimiser: {optimiser!r} is neither 'adamw' nor 'sgdm'", field="optimiser")
     if precision not in ("float32", "bfloat16"):
         raise DatasetError(f"precision: {precision!r} is neither 'float32' nor 'bfloat16'", field="precision")
+    if negatives not in ("batch", "look-alikes", "memory"):
+        raise DatasetError(f"negatives: {negatives!r} is not batch, look-alikes or memory", field="negatives")
     device_of(device)  # said before an hour of simulation, not after it
     config = TrainingConfig.model_validate(
         {
@@ -56,8 +65,10 @@ def command(
             "seed": seed,
             "turn_deg": turn,
             "precision": precision,
+            "stale_negatives": negatives == "memory",
         }
         | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network no longer drift fast
+        | ({"memory_after": None} if negatives == "batch" else {})
     )
     plans = paper_plans() if recipe == "paper" else stock_plans(cities)
     grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)

@@ -248,7 +248,10 @@ def test_train_refuses_a_recipe_that_is_not_there(tmp_path: Path, capsys: pytest
     assert "'soup'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("option", "value"), [("--device", "foo"), ("--optimiser", "lion"), ("--precision", "int4")])
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--device", "foo"), ("--optimiser", "lion"), ("--precision", "int4"), ("--negatives", "hard")],
+)
 def test_train_refuses_what_it_does_not_know_before_it_simulates(
     option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
