@@ -13,6 +13,7 @@ from service.contract import schema
 from service.errors import NotYetSupportedError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import (
+    covariance_at,
     heading_of_body,
     heading_of_camera,
     quaternion_xyzw_from,
@@ -154,9 +155,7 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         confidence=answer.confidence,
         street=_street(answer, bundle),
         pose=_pose(answer.T_map_camera, heading_of_camera(answer.T_map_camera), answer.covariance),
-        vehicle_pose=None
-        if answer.T_map_vehicle is None
-        else _pose(answer.T_map_vehicle, heading_of_body(answer.T_map_vehicle), None),
+        vehicle_pose=_vehicle_pose(answer),
         geopose=geopose_of(answer.T_map_camera if answer.T_map_vehicle is None else answer.T_map_vehicle, bundle),
         hypotheses=_hypotheses(answer),
         neighbours=[_neighbour(each, bundle) for each in answer.neighbours],
@@ -327,6 +326,15 @@ def _street(answer: Answer, bundle: MapBundle) -> schema.Street | None:
         class_index=street.class_index,
         vote=min(1.0, voted),
     )
+
+
+def _vehicle_pose(answer: Answer) -> schema.Pose | None:
+    T = answer.T_map_vehicle
+    if T is None:
+        return None
+    about_camera, camera_m = answer.covariance, answer.T_map_camera[:3, 3]
+    covariance = None if about_camera is None else covariance_at(about_camera, camera_m, T[:3, 3])
+    return _pose(T, heading_of_body(T), covariance)
 
 
 def _pose(T: NDArray[np.float64], heading_rad: float, covariance: NDArray[np.float64] | None) -> schema.Pose:

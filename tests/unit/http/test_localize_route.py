@@ -94,6 +94,12 @@ def test_the_vehicles_pose_is_answered_where_asked_for(client: httpx.Client, par
     assert vehicle["heading_deg"] == pytest.approx(camera["heading_deg"], abs=1e-6)
     assert vehicle["position"]["y"] == pytest.approx(camera["position"]["y"] - 1, abs=0.05)
     assert vehicle["position"]["z"] == pytest.approx(camera["position"]["z"] - 0.5, abs=0.05)
+    known = [np.array(pose["covariance"]).reshape(6, 6) for pose in (camera, vehicle)]
+    np.testing.assert_allclose(known[1][3:, 3:], known[0][3:, 3:])
+    # Heading is along y here, so a metre behind the camera: what is not known of the heading is a metre's swing along x.
+    swing = known[0][0, 0] + 2 * known[0][0, 5] + known[0][5, 5]
+    assert known[1][0, 0] == pytest.approx(swing, rel=0.2)
+    assert known[1][0, 0] != known[0][0, 0]
 
 
 @pytest.mark.parametrize("part", ["rgb", "depth", "request"])
