@@ -117,7 +117,8 @@ class Options(_Strict):
     )
     false_accept_rate: float | None = Field(
         None, gt=0, lt=1,
-        description="share of the queries taken outside the map that one can live with being LOCALIZED; default: the service's setting",
+        description="share of the queries taken outside the map that one can live with being LOCALIZED; less than the map's calibration "
+        "measured is refused; default: the service's setting",
     )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ class Answer:
         candidates: the registered poses, the best supported first; None where nothing was registered.
         T_map_vehicle: pose of the vehicle, where the query said how the camera sits on it.
         neighbours: the k most similar distinct places, the best first.
-        hypotheses: all clusters of the most similar views, the heaviest first.
+        hypotheses: all clusters of the most similar views, the heaviest first; with a prior, what it believes most.
         measured_share: share of the view grid's cells with a measurement.
         height_m: of the camera above the ground.
     """

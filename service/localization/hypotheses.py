@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float64
 from numpy.typing import NDArray
 
 from service.geometry.rigid import Rotation
+from service.localization.prior import Prior
 from service.localization.search import ViewMatches
 
 
@@ -87,6 +88,15 @@ def cluster(matches: ViewMatches, settings: ClusterSettings) -> tuple[Hypothesis
         left &= ~members
         found.append(_hypothesis(np.flatnonzero(members), matches, weights))
     return tuple(sorted(found, key=lambda hypothesis: -hypothesis.weight))
+
+
+def believed(hypotheses: tuple[Hypothesis, ...], prior: Prior | None) -> tuple[Hypothesis, ...]:
+    """The same clusters, those first that their weight and the prior together speak for."""
+    if prior is None:
+        return hypotheses
+    xy, heading = np.array([each.position_m[:2] for each in hypotheses]), np.array([h.heading_rad for h in hypotheses])
+    support = np.log([max(each.weight, 1e-12) for each in hypotheses]) + prior.log_weight(xy, heading)
+    return tuple(hypotheses[k] for k in np.argsort(-support, kind="stable"))
 
 
 def _near(matches: ViewMatches, count: int, settings: ClusterSettings) -> Bool[NDArray[np.bool_], "n n"]:

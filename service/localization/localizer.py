@@ -5,7 +5,7 @@ from time import perf_counter
 
 import numpy as np
 
-from service.errors import BundleError
+from service.errors import BundleError, RequestError
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews, query_views
 from service.imaging.view_grid import ViewGrid
@@ -14,7 +14,8 @@ from service.localization.decide import decide
 from service.localization.encoder import Encoder, Provider
 from service.localization.evidence import evidence_of
 from service.localization.frames import Frame
-from service.localization.hypotheses import ClusterSettings, Hypothesis, cluster
+from service.localization.hypotheses import ClusterSettings, Hypothesis, believed, cluster
+from service.localization.prior import Prior
 from service.localization.query import Query
 from service.localization.refine import RefineSettings, refine
 from service.localization.search import distinct_places, search_views
@@ -120,12 +121,16 @@ class Localizer:
 
         Args:
             frames: the reference first, as in ``localize_frames``.
+
+        Raises:
+            RequestError: fewer false accepts are wanted than the map's calibration can promise.
         """
         started = perf_counter()
         query, matches = frames[0].query, frames[0].matches
+        self._require_promise(query)
         wanted = _places_of(query)
         neighbours = distinct_places(matches, wanted)
-        hypotheses = cluster(matches, self.clusters)
+        hypotheses = believed(cluster(matches, self.clusters), query.prior)
         streets = (
             None if self.bundle.streets is None else vote(neighbours[: query.neighbours], self.clusters.temperature)
         )
@@ -150,7 +155,7 @@ class Localizer:
         return Answer(
             status="LOCALIZED" if decision is None else decision.status,
             confidence=None if decision is None else decision.confidence,
-            street=self._street_of(T_map_camera, streets, registered=refined is not None),
+            street=self._street_of(T_map_camera, streets, hypotheses[0], query.prior, registered=refined is not None),
             vote=streets,
             T_map_camera=T_map_camera,
             covariance=None if refined is None else refined.covariance,
@@ -170,11 +175,27 @@ class Localizer:
             ),
         )
 
-    def _street_of(self, T_map_camera: Transform, voted: StreetVote | None, *, registered: bool) -> int:
-        """A metric position says which street it lies in; a cluster of places does not know better than their vote."""
+    def _require_promise(self, query: Query) -> None:
+        calibration = self.bundle.calibration
+        if not query.refine or calibration is None:
+            return
+        least = calibration.least_false_accept_rate
+        if query.false_accept_rate < least:
+            raise RequestError(
+                f"false_accept_rate: {query.false_accept_rate:g} is less than this map's calibration can promise; "
+                f"ask for {least:g} or more",
+                field="options.false_accept_rate",
+            )
+
+    def _street_of(
+        self, T_map_camera: Transform, voted: StreetVote | None, heaviest: Hypothesis, prior: Prior | None, *, registered: bool
+    ) -> int:  # fmt: skip
+        """A metric position says which street it lies in; a cluster of places does not know better than their vote, unless by a prior."""
         if self.bundle.streets is None or voted is None:
             return -1
-        return self.bundle.streets.index_at(T_map_camera[:2, 3]) if registered else voted.street
+        if registered:
+            return self.bundle.streets.index_at(T_map_camera[:2, 3])
+        return voted.street if prior is None else heaviest.street
 
     def _pose_of(self, hypothesis: Hypothesis, view: QueryViews) -> Transform:
         """The camera stands at the hypothesis, at its own height above the ground under the places' LiDAR."""

@@ -119,8 +119,16 @@ class Calibration(_Frozen):
             odds = np.asarray(odds + self.site.offset)
         return probability(odds)
 
+    @property
+    def least_false_accept_rate(self) -> float:
+        """The least that was measured: nothing less can be promised."""
+        return self.thresholds[0].false_accept_rate
+
     def threshold(self, false_accept_rate: float) -> float:
-        """The confidence from which on answers are accepted, for a rate of false accepts that one can live with."""
+        """The confidence from which on answers are accepted, for a rate of false accepts that one can live with.
+
+        Below ``least_false_accept_rate`` it is that one's.
+        """
         fitting = [each.confidence for each in self.thresholds if each.false_accept_rate <= false_accept_rate]
         return fitting[-1] if fitting else self.thresholds[0].confidence
 

@@ -16,6 +16,12 @@ from typer.main import get_command
 
 from benchmarks.docs_blocks import PAGES, Block, blocks_of, commands_of, pages
 from service.cli.main import app_for
+from service.localization.hypotheses import ClusterSettings
+from service.localization.query import FALSE_ACCEPT_RATE
+from service.localization.refine import SupportWeights
+from service.localization.starts import StartSettings
+from service.registration.points import PointSettings
+from service.registration.register import RegistrationSettings
 
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -141,3 +147,20 @@ def test_what_lies_outside_docs_is_linked_as_a_copy_and_a_folder_by_name() -> No
     assert hooks["on_page_markdown"](text) == (
         "[card](repository/stock/CARD.md.txt) [api](repository/openapi/openapi.json) `deploy/` [here](maps.md)"
     )
+
+
+def test_how_it_works_tells_the_numbers_that_are_set() -> None:
+    """Settings change, and so must the page that tells of them."""
+    told = " ".join((ROOT / "docs" / "how_it_works.md").read_text().split())
+    registration, support = RegistrationSettings(), SupportWeights()
+    words = {3: "three", 4: "four", 5: "five", 6: "six", 8: "eight"}
+    for text in (
+        f"Up to {StartSettings().most} hypotheses with {words[len(registration.offsets_m)]} starts each",
+        f"a coarse stage of {registration.coarse_points} points",
+        f"a middle one of {registration.middle_points}, the {words[registration.refined]} most promising",
+        f"thinned to {PointSettings().points:,} points",
+        f"{support.inliers:g} inliers + {support.similarity:g} similarity + {support.likelihood:g} log likelihood",
+        f"exp((s_v - s_max) / {ClusterSettings().temperature:g})",
+        f"{100 * FALSE_ACCEPT_RATE:g} % by default",
+    ):
+        assert text in told

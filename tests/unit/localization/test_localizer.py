@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.errors import BundleError, NoDepthError
+from service.errors import BundleError, NoDepthError, RequestError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import heading_of_camera, transform_from
 from service.localization.encoder import Encoder
@@ -211,6 +211,24 @@ def test_a_calibrated_map_says_how_sure_it_is_and_accepts_by_the_rate_asked_for(
     assert (retrieved.status, retrieved.confidence) == ("LOCALIZED", None)
 
 
+def test_fewer_false_accepts_than_calibration_measured_are_not_promised(
+    content_of: Callable[..., BundleContent],
+    calibration_json: Callable[..., dict[str, Any]],
+    tmp_path: Path,
+    query: Query,
+) -> None:
+    write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
+    localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
+    assert localizer.bundle.calibration is not None
+    least = localizer.bundle.calibration.least_false_accept_rate
+    with pytest.raises(RequestError, match=rf"ask for {least:g} or more") as caught:
+        localizer.localize(replace(query, false_accept_rate=0.5 * least))
+    assert caught.value.field == "options.false_accept_rate"
+    assert localizer.localize(replace(query, false_accept_rate=least)).confidence is not None
+    # Without registration there is no confidence, so nothing is promised.
+    assert localizer.localize(replace(query, false_accept_rate=0.5 * least, refine=False)).confidence is None
+
+
 def test_a_calibrated_map_believes_nothing_of_a_picture_that_is_too_empty_to_register(
     content_of: Callable[..., BundleContent],
     calibration_json: Callable[..., dict[str, Any]],
@@ -266,6 +284,24 @@ def test_a_prior_decides_between_streets_that_nothing_else_tells_apart(twin_map:
     known = Prior(position_m=np.array([15.0, y + 5.0]), position_std_m=10.0)
     answer = localizer.localize(replace(query, prior=known))
     np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, y, 1.7], atol=0.3)
+
+
+@pytest.mark.parametrize("y", [0.0, 90.0])
+def test_a_prior_decides_without_registration_too(twin_map: Path, query: Query, y: float) -> None:
+    localizer = Localizer.open(MapBundle.open(twin_map))
+    known = Prior(position_m=np.array([15.0, y + 5.0]), position_std_m=10.0)
+    answer = localizer.localize(replace(query, prior=known, refine=False))
+    np.testing.assert_allclose(answer.T_map_camera[:2, 3], [20, y], atol=0.3)
+    assert answer.street == answer.hypotheses[0].street
+    apart = np.linalg.norm(answer.hypotheses[0].position_m[:2] - [20, y])
+    assert apart < 1.0
+
+
+def test_a_prior_far_from_everything_leaves_retrieval_as_it_was(localizer: Localizer, query: Query) -> None:
+    alone = localizer.localize(replace(query, refine=False))
+    lost = Prior(position_m=np.array([-1e6, 1e6]), position_std_m=0.1)
+    answer = localizer.localize(replace(query, refine=False, prior=lost))
+    np.testing.assert_array_equal(answer.T_map_camera, alone.T_map_camera)
 
 
 @pytest.mark.parametrize("seed", [4, 6, 8, 10])
