@@ -14,6 +14,7 @@ from benchmarks.full import full_paper_rows, full_unseen_rows
 from benchmarks.kitti_registration import kitti_registration_rows
 from benchmarks.kitti_retrieval import retrieve
 from benchmarks.plans import BOTH, paper_plan, unseen_plan
+from benchmarks.priors import prior_rows
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs, share
 from benchmarks.sequences import sequence_rows
@@ -156,6 +157,7 @@ def main() -> None:
         "doubt": lambda: doubt_rows(report, runs),
         "conditions": lambda: condition_rows(report, runs),
         "sequences": lambda: sequence_rows(report, runs),
+        "priors": lambda: prior_rows(report, runs),
         "unseen": lambda: unseen_rows(report, runs),
         "paper": lambda: paper_rows(report, runs, "retrieval", barred=True),
         "weather": lambda: weather_rows(report, runs),

@@ -6,7 +6,7 @@ from model_training.training.recipe import EVALUATION_SEEDS
 
 BOTH = ("precise", "stereo")
 HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
-REPEATING_SEQUENCES = 480  # one in six passes a landmark
+REPEATING_DRIVES = 4  # of 120 sequences each, a sixth of which pass a landmark
 
 
 def paper_plan() -> SimulationPlan:
@@ -53,7 +53,8 @@ def lidar_16_plan() -> SimulationPlan:
 
 def repeating_plan() -> SimulationPlan:
     """A street of blocks that are all alike but for a landmark every few of them; sequences all along it."""
-    queries = (
-        QueryPlan(name="sequences", traversal=1, count=REPEATING_SEQUENCES, sequence=SEQUENCE, step_m=3.0, aside_m=1.5),
+    queries = tuple(
+        QueryPlan(name=f"drive{k}", traversal=k, count=120, sequence=SEQUENCE, step_m=3.0, aside_m=1.5)
+        for k in range(1, REPEATING_DRIVES + 1)
     )
     return SimulationPlan(name="repeating", city="repeating", seed=EVALUATION_SEEDS[21], queries=queries)

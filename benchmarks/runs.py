@@ -19,7 +19,7 @@ from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.evaluation.measures import measure, recall_at
-from model_training.evaluation.predict import Predictions, joined, predict
+from model_training.evaluation.predict import Predictions, PriorOf, joined, predict
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.plan import SimulationPlan
 from model_training.simulation.simulate import simulate
@@ -85,17 +85,25 @@ class Runs:
         return measure(joined(list(found.values())), classes) | {"predictions": found}
 
     def predictions(
-        self, bundle: MapBundle, dataset: Dataset, name: str, *, refine: bool = True, frames_each: int = 1
-    ) -> Predictions:
-        """Answers to a query set, or to its sequences of so many frames."""
+        self, bundle: MapBundle, dataset: Dataset, name: str, *, refine: bool = True, frames_each: int = 1,
+        prior: tuple[str, PriorOf] | None = None,
+    ) -> Predictions:  # fmt: skip
+        """Answers to a query set, or to its sequences of so many frames; with a prior, which bears a name that says what it is."""
         mode = ("full" if refine else "retrieval") + (f"-{frames_each}" if frames_each > 1 else "")
+        mode += "" if prior is None else f"-{prior[0]}"
         folder = self.work / "predictions" / f"{mode}-{code_hash(*ANSWERING)}" / bundle.path.name / dataset.folder.name
         folder.mkdir(parents=True, exist_ok=True)
         kept = folder / f"{name}.npz"
         if not kept.exists():
             with bars() as report:
                 asked = predict(
-                    Localizer.open(bundle), dataset, name, refine=refine, frames_each=frames_each, report=report
+                    Localizer.open(bundle),
+                    dataset,
+                    name,
+                    refine=refine,
+                    frames_each=frames_each,
+                    report=report,
+                    prior_of=None if prior is None else prior[1],
                 )
             asked.save(kept)
         return Predictions.load(kept)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import TypeVar
@@ -14,15 +14,18 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.evaluation.odometry import as_query
 from service.errors import DatasetError, NoDepthError
-from service.geometry.rigid import heading_of_camera
+from service.geometry.rigid import Transform, heading_of_camera
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
+from service.localization.prior import Prior
 from service.maps.calibration import FEATURES
 
 RANKED = 10
 #: Of an answer's clusters and of its registered poses so many are kept.
 HYPOTHESES, CANDIDATES = 8, 4
 Report = Callable[[str, int, int], None]
+#: What a robot believes, from T_map_camera as it is and from chance.
+PriorOf = Callable[[Transform, np.random.Generator], Prior]
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -65,6 +68,10 @@ class Predictions:
         """(n) whether the answer was accepted."""
         return np.asarray(self.status == "LOCALIZED")
 
+    def of(self, rows: NDArray[np.bool_]) -> "Predictions":
+        """Those of some queries (n)."""
+        return Predictions(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
+
     def save(self, path: Path) -> None:
         """Keep them as NPZ, without pickle."""
         part = path.with_suffix(".part.npz")
@@ -97,11 +104,12 @@ def joined(parts: list[Predictions]) -> Predictions:
 
 def predict(
     localizer: Localizer, dataset: Dataset, name: str, *, refine: bool = True, workers: int = 2, frames_each: int = 1,
-    report: Report = lambda *_: None,
+    prior_of: PriorOf | None = None, report: Report = lambda *_: None,
 ) -> Predictions:  # fmt: skip
     """Ask every query of a set that has truth; ``refine=False`` asks retrieval alone.
 
-    ``frames_each`` takes so many frames in a row as one question about the last of them, with an odometry that errs.
+    ``frames_each`` takes so many frames in a row as one question about the last of them, with an odometry that errs;
+    ``prior_of`` says what the robot believes beforehand of a query's pose, with chance of its own.
 
     Raises:
         DatasetError: the set has no truth or no frames.
@@ -116,7 +124,10 @@ def predict(
     with ThreadPoolExecutor(workers) as pool:
         for done, answer in enumerate(
             _in_order(
-                pool, lambda k: _ask(localizer, groups[k], k, refine=refine), range(len(groups)), ahead=4 * workers
+                pool,
+                lambda k: _ask(localizer, groups[k], k, refine=refine, prior_of=prior_of),
+                range(len(groups)),
+                ahead=4 * workers,
             ),
             1,
         ):
@@ -134,9 +145,15 @@ def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[
         waiting += [pool.submit(work, item) for item in islice(rest, 1)]
 
 
-def _ask(localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool) -> tuple[Answer | None, float]:
+def _ask(
+    localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool, prior_of: PriorOf | None
+) -> tuple[Answer | None, float]:
     began = time.perf_counter()
     queries, poses = as_query(frames, np.random.default_rng([77, number]), ranked=RANKED, refine=refine)
+    T_map_camera = frames[-1].T_map_camera
+    if prior_of is not None and T_map_camera is not None:
+        prior = prior_of(T_map_camera, np.random.default_rng([78, number]))
+        queries = (replace(queries[0], prior=prior), *queries[1:])
     try:
         answer: Answer | None = localizer.localize_frames(queries, poses)
     except NoDepthError:

@@ -50,14 +50,15 @@ def test_a_thousand_queries_of_each_unseen_city_and_both_plans_are_of_one_city()
 def test_every_hard_condition_stands_beside_a_clear_day():
     plan = hard_plan()
     assert [query.name for query in plan.queries] == ["clear", *HARD, "depth_15m_sequence5"]
-    assert {query.count for query in plan.queries[:-1]} == {300}
+    assert {query.count for query in plan.queries[:-1]} == {500}
     assert plan.queries[-1].sequence == SEQUENCE
     assert lidar_16_plan().queries[0] == plan.queries[0]
 
 
 def test_the_repeating_street_has_room_for_its_sequences():
     plan = repeating_plan()
-    assert plan.queries[0].sequence == SEQUENCE
+    assert {query.sequence for query in plan.queries} == {SEQUENCE}
+    assert len({query.traversal for query in plan.queries}) == len(plan.queries)  # other people on every drive
     assert len(driven(_city(plan), plan, plan.spacing_m)) > 5 * plan.queries[0].count
 
 

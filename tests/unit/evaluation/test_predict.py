@@ -8,6 +8,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.evaluation.predict import RANKED, predict
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
+from service.localization.prior import Prior
 from service.localization.query import Query
 from service.maps.calibration import FEATURES
 from service.maps.reader import MapBundle
@@ -86,3 +87,37 @@ def test_progress_is_told_for_every_query(localizer, small_dataset):
     told = []
     predict(localizer, small_dataset, NAME, report=lambda *event: told.append(event))
     assert told == [(f"queries {NAME}", k, 5) for k in range(1, 6)]
+
+
+def test_a_prior_is_drawn_from_each_querys_truth_with_chance_of_its_own(localizer, small_dataset):
+    told = []
+
+    def prior_of(T_map_camera, rng):
+        told.append((T_map_camera[:2, 3].copy(), rng.normal()))
+        return Prior(position_m=T_map_camera[:2, 3])
+
+    asked = []
+
+    class Listening:
+        bundle = localizer.bundle
+
+        def localize_frames(self, queries, poses):
+            asked.append(queries[0].prior.position_m)
+            return localizer.localize_frames(queries, poses)
+
+    found = predict(Listening(), small_dataset, NAME, refine=False, workers=1, prior_of=prior_of)
+    np.testing.assert_allclose(asked, found.T_true[:, :2, 3])
+    np.testing.assert_allclose([xy for xy, _ in told], found.T_true[:, :2, 3])
+    assert len({chance for _, chance in told}) == len(told)
+    again = list(told)
+    told.clear()
+    predict(Listening(), small_dataset, NAME, refine=False, workers=2, prior_of=prior_of)
+    assert sorted(chance for _, chance in told) == sorted(chance for _, chance in again)
+
+
+def test_some_of_the_answers(localizer, small_dataset):
+    found = predict(localizer, small_dataset, NAME, refine=False)
+    rows = np.array([True, False, True, False, False])
+    some = found.of(rows)
+    np.testing.assert_array_equal(some.T_answer, found.T_answer[[0, 2]])
+    np.testing.assert_array_equal(some.status, found.status[[0, 2]])

@@ -286,6 +286,30 @@ def test_a_prior_decides_between_streets_that_nothing_else_tells_apart(twin_map:
     np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, y, 1.7], atol=0.3)
 
 
+def test_a_prior_that_is_wrong_lends_a_wrong_pose_no_confidence(
+    content_of: Callable[..., BundleContent],
+    calibration_json: Callable[..., dict[str, Any]],
+    tmp_path: Path,
+    query: Query,
+) -> None:
+    """Confidence that rises with the margin over rivals: a prior elsewhere leaves the answer right and no surer than before."""
+    margin = FEATURES.index("margin")
+    document = calibration_json()
+    for part in ("right", "known"):
+        document[part]["weights"][margin] = 3.0
+    write_bundle(tmp_path / "m", content_of(calibration=document))
+    localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
+    alone = localizer.localize(query)
+    assert alone.confidence is not None
+    for position in ([20.0, 0.0], [60.0, 100.0], [-1e6, 1e6]):
+        wrong = Prior(position_m=np.array(position), position_std_m=1.0, heading_rad=-np.pi / 2, heading_std_rad=0.1)
+        answer = localizer.localize(replace(query, prior=wrong))
+        np.testing.assert_allclose(answer.T_map_camera, alone.T_map_camera, atol=1e-9)
+        assert answer.confidence is not None
+        assert answer.confidence <= alone.confidence
+        assert answer.status in (alone.status, "AMBIGUOUS", "OUT_OF_MAP")
+
+
 @pytest.mark.parametrize("y", [0.0, 90.0])
 def test_a_prior_decides_without_registration_too(twin_map: Path, query: Query, y: float) -> None:
     localizer = Localizer.open(MapBundle.open(twin_map))

@@ -1,0 +1,61 @@
+"""What a prior brings where it is right, and what it costs where it is wrong."""
+
+import numpy as np
+
+from benchmarks.plans import BOTH, unseen_plan
+from benchmarks.report import Report
+from benchmarks.runs import Runs, accepted_within
+from benchmarks.sequences import between_landmarks, repeating_answers
+from model_training.evaluation.predict import Predictions, PriorOf
+from model_training.simulation.repeating import BLOCK_M
+from service.geometry.rigid import Transform
+from service.localization.prior import Prior
+
+STD_M = 5.0
+
+
+def right(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
+    """As far off as it says."""
+    return Prior(position_m=T_map_camera[:2, 3] + rng.normal(0, STD_M, 2), position_std_m=STD_M)
+
+
+def aside(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
+    """Wrong by 10 to 25 m, two to five times what it says: within the same street, mostly."""
+    towards = rng.uniform(0, 2 * np.pi)
+    away = rng.uniform(10, 25) * np.array([np.cos(towards), np.sin(towards)])
+    return Prior(position_m=T_map_camera[:2, 3] + away, position_std_m=STD_M)
+
+
+def elsewhere(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
+    """Wrong by 60 to 120 m: of another street."""
+    towards = rng.uniform(0, 2 * np.pi)
+    away = rng.uniform(60, 120) * np.array([np.cos(towards), np.sin(towards)])
+    return Prior(position_m=T_map_camera[:2, 3] + away, position_std_m=STD_M)
+
+
+def next_block(T_map_camera: Transform, _rng: np.random.Generator) -> Prior:
+    """In the street of repeating blocks the same spot of the next one: nothing but the prior tells them apart."""
+    return Prior(position_m=T_map_camera[:2, 3] + [BLOCK_M, 0.0], position_std_m=STD_M)
+
+
+PRIORS: dict[str, PriorOf] = {"right": right, "aside": aside, "elsewhere": elsewhere}
+
+
+def prior_rows(report: Report, runs: Runs) -> None:
+    """Accepted and right, accepted and wrong: without a prior, with a right one, with wrong ones."""
+    dataset = runs.dataset(unseen_plan(0))
+    bundle = runs.bundle(dataset)
+    for preset in BOTH:
+        name = f"drive1_{preset}"
+        _rows(report, f"prior.none.{preset}", runs.predictions(bundle, dataset, name))
+        for kind, prior_of in PRIORS.items():
+            _rows(report, f"prior.{kind}.{preset}", runs.predictions(bundle, dataset, name, prior=(kind, prior_of)))
+    for kind, prior_of in (("right", right), ("next_block", next_block)):
+        found = repeating_answers(runs, prior=(kind, prior_of))
+        _rows(report, f"prior.{kind}.repeating", found.of(between_landmarks(found)))
+
+
+def _rows(report: Report, row: str, found: Predictions) -> None:
+    good = accepted_within(found, 1.0)
+    report.share(f"{row}.within_1_m", good)
+    report.share(f"{row}.wrong_and_accepted", found.localized & ~good, better="lower")

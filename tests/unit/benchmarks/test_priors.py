@@ -1,0 +1,30 @@
+import numpy as np
+import pytest
+
+from benchmarks.priors import PRIORS, STD_M, next_block
+from model_training.simulation.repeating import BLOCK_M
+
+
+def drawn(kind, count=400):
+    T = np.eye(4)
+    T[:2, 3] = 30.0, -20.0
+    found = [PRIORS[kind](T, np.random.default_rng([1, k])) for k in range(count)]
+    assert {prior.position_std_m for prior in found} == {STD_M}
+    return np.array([prior.position_m for prior in found]) - T[:2, 3]
+
+
+def test_a_right_prior_errs_by_what_it_says():
+    assert drawn("right").std(axis=0) == pytest.approx(STD_M, rel=0.15)
+    assert np.abs(drawn("right").mean(axis=0)).max() < 1
+
+
+@pytest.mark.parametrize(("kind", "least", "most"), [("aside", 10, 25), ("elsewhere", 60, 120)])
+def test_a_wrong_prior_is_wrong_by_more_than_it_says(kind, least, most):
+    away = np.hypot(*drawn(kind).T)
+    assert least <= away.min() < away.max() <= most
+    assert np.abs(drawn(kind).mean(axis=0)).max() < 0.15 * most  # in any direction
+
+
+def test_the_next_block_is_a_block_further():
+    T = np.eye(4)
+    np.testing.assert_allclose(next_block(T, np.random.default_rng(0)).position_m, [BLOCK_M, 0.0])
