@@ -170,7 +170,7 @@ def main() -> None:
         parser.error(f"--only: there is no part {unknown[0]!r}; there are: {', '.join(parts)}")
     if arguments.only is not None:
         report.keep_others()
-    if arguments.note:
+    if arguments.note or arguments.only is not None:  # an earlier run's note does not speak of this one
         report.notes["run"] = arguments.note
     for name in wanted:
         print(f"--- {name}", flush=True)

@@ -1,6 +1,6 @@
 """Does confidence know what it does not know? Another city's queries, streets that the map lacks, pictures that show nothing."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -14,6 +14,8 @@ from model_training.calibration.fit import expected_calibration_error
 from model_training.datasets.without_streets import WithoutStreets
 from model_training.evaluation.predict import Predictions, joined
 from model_training.mapping.build import BuildSettings
+from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.depth_noise import DEPTHS, measured_depth
 from model_training.simulation.hard import HARD
 from model_training.stock import CALIBRATION
 from service.errors import NoDepthError
@@ -41,15 +43,17 @@ def doubt_rows(report: Report, runs: Runs) -> None:
     """False accepts by kind, calibration error, Brier score."""
     inside: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = []
     outside: list[NDArray[np.float64]] = []
-    accepted_at: dict[str, float] = {}
+    own_of: dict[str, tuple[NDArray[np.float64], NDArray[np.bool_]]] = {}
+    strangers: dict[str, NDArray[np.float64]] = {}
     for preset in BOTH:
         own = unseen_answers(runs, preset)
         confidence, right = confidence_and_right(joined(own))
-        accepted_at[preset] = float(np.quantile(confidence[right], 0.05))
+        own_of[preset] = confidence, right
         other = confidence_and_right(_of_another_city(runs, preset))[0]
         _false_rows(report, f"doubt.other_city.{preset}", other, confidence, right, FALSE_BARS["other_city", preset])
         away, near, near_right = _where_streets_are_missing(runs, preset)
         _false_rows(report, f"doubt.removed_streets.{preset}", away, near, near_right, FALSE_BARS["removed_streets", preset])  # fmt: skip
+        strangers |= {f"other_city.{preset}": other, f"removed_streets.{preset}": away}
         take = np.random.default_rng(5).permutation(len(confidence))[: 1000 if preset == "stereo" else 500]
         inside.append((confidence[take], right[take]))
         outside += [other[:500], away[:500]]
@@ -60,12 +64,15 @@ def doubt_rows(report: Report, runs: Runs) -> None:
     report.row("doubt.expected_calibration_error", error, "share", bar=0.02, better="lower", n=len(right))
     report.row("doubt.brier_score", float(np.mean((confidence - right) ** 2)), "share", better="lower", n=len(right))
     localizer = Localizer.open(runs.bundle(runs.dataset(unseen_plan(0))))
-    for kind, queries in nonsense(np.random.default_rng(6)).items():
-        found = np.array([_confidence_of(localizer, query) for query in queries])
-        for preset in BOTH:
-            accepted = float((found >= accepted_at[preset]).mean())
-            report.row(f"doubt.{kind}.{preset}.false_accepts_at_95", accepted, "share", better="lower", n=len(found))
+    for preset in BOTH:
+        for kind, queries in nonsense(np.random.default_rng(6), preset).items():
+            found = np.array([_confidence_of(localizer, query) for query in queries])
+            _false_rows(report, f"doubt.{kind}.{preset}", found, *own_of[preset])
+            strangers[f"{kind}.{preset}"] = found
     _reliability(report, confidence, right)
+    report.notes["accepts"] = {
+        name: curve(*own_of[name.rpartition(".")[2]], found) for name, found in strangers.items()
+    }
 
 
 def _of_another_city(runs: Runs, preset: str) -> Predictions:
@@ -106,12 +113,24 @@ def _hard(runs: Runs, count: int) -> tuple[NDArray[np.float64], NDArray[np.bool_
 
 
 def _false_rows(
-    report: Report, row: str, negative: NDArray[np.float64], confidence: NDArray[np.float64], right: NDArray[np.bool_], bar: float
+    report: Report, row: str, negative: NDArray[np.float64], confidence: NDArray[np.float64], right: NDArray[np.bool_],
+    bar: float | None = None,
 ) -> None:  # fmt: skip
     level = float(np.quantile(confidence[right], 0.05))
     report.share(f"{row}.false_accepts_at_95", negative >= level, bar=bar, better="lower")
     report.share(f"{row}.accepted_by_default", negative >= default_threshold(), better="lower")
     report.row(f"{row}.average_precision", average_precision(confidence, right, negative), "share", n=len(negative))
+
+
+def curve(
+    confidence: NDArray[np.float64], right: NDArray[np.bool_], negative: NDArray[np.float64]
+) -> list[tuple[float, float]]:
+    """Share of the strangers that are accepted, and of the queries accepted and right, by falling confidence; 41 points."""
+    levels = np.quantile(confidence[right], np.linspace(1, 0, 41))
+    return [
+        (round(float((negative >= level).mean()), 4), round(float((right & (confidence >= level)).mean()), 4))
+        for level in levels
+    ]
 
 
 @cache
@@ -141,24 +160,26 @@ def _confidence_of(localizer: Localizer, query: Query) -> float:
         return 0.0
 
 
-def nonsense(rng: np.random.Generator, count: int = 100) -> dict[str, list[Query]]:
-    """Pictures that no street shows."""
-    return {
-        "indoor": list(_many(rng, count, _room)), "blank_wall": list(_many(rng, count, _wall)),
-        "covered_lens": list(_many(rng, count, _covered)), "sky": list(_many(rng, count, _sky)),
-        "noise": list(_many(rng, count, _noise)),
-    }  # fmt: skip
+def nonsense(rng: np.random.Generator, preset: str, count: int = 100) -> dict[str, list[Query]]:
+    """Pictures that no street shows, as a depth camera of the preset measures them."""
+    drawn: dict[str, Picture] = {"indoor": _room, "blank_wall": _wall, "covered_lens": _covered, "sky": _sky, "noise": _noise}  # fmt: skip
+    return {kind: [_measured(rng, kind, one, preset) for _ in range(count)] for kind, one in drawn.items()}
 
 
 _CAMERA = PinholeCamera(640, 480, 320.0, 320.0, 319.5, 239.5)
+#: What is drawn of these are stray measurements already, of nothing; of the others surfaces, which a camera measures.
+_STRAY = ("covered_lens", "sky")
 
 
-def _many(rng: np.random.Generator, count: int, one: Picture) -> Iterator[Query]:
-    for _ in range(count):
-        z, grey = one(rng)
-        noisy = np.where(z > 0, 1 / np.maximum(1 / np.maximum(z, 1e-3) + rng.normal(0, 0.1 / 80, z.shape), 1e-3), 0)
-        rgb = np.repeat(np.clip(grey + rng.normal(0, 4, z.shape), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-        yield Query(rgb=rgb, depth_m=noisy.astype(np.float32), camera=_CAMERA)
+def _measured(rng: np.random.Generator, kind: str, one: Picture, preset: str) -> Query:
+    z, grey = one(rng)
+    surfaces = np.zeros_like(z) if kind in _STRAY else z
+    plain = np.full(z.shape, kind == "blank_wall")
+    depth_m = measured_depth(surfaces.astype(np.float32), plain, DEPTHS[preset], CONDITIONS["clear"], rng)
+    if kind in _STRAY:
+        depth_m = np.where(z > 0, z, depth_m).astype(np.float32)
+    rgb = np.repeat(np.clip(grey + rng.normal(0, 4, z.shape), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    return Query(rgb=rgb, depth_m=depth_m, camera=_CAMERA)
 
 
 def _rays() -> NDArray[np.float64]:

@@ -35,6 +35,7 @@ def main() -> None:
             "| row | value | 95 % interval | n | bar | |", "|---|---|---|---|---|---|",
         ]  # fmt: skip
         lines += [_line(row) for row in report["rows"]]
+        lines += _conditions({row["id"]: row["value"] for row in report["rows"]})
         whys = [f"- `{row['id']}`: {row['why']}" for row in report["rows"] if row.get("why")]
         lines += ["", *whys, ""] if whys else [""]
         picture = _plot(path.stem, report["rows"])
@@ -42,6 +43,9 @@ def main() -> None:
             lines += [f"![{path.stem}]({picture.name})", ""]
         if "reliability" in report.get("notes", {}):
             lines += [f"![reliability]({_reliability(path.stem, report['notes']['reliability']).name})", ""]
+        if "accepts" in report.get("notes", {}):
+            picture = _accepts(path.stem, report["notes"]["accepts"])
+            lines += [f"![false accepts against true accepts, for each kind of stranger]({picture.name})", ""]
     (REPORTS / "README.md").write_text("\n".join(lines))
 
 
@@ -53,6 +57,30 @@ def explain(rows: list[dict[str, Any]]) -> bool:
         if why is not None and not row.get("holds", True) and row.get("why") != why:
             row["why"], changed = why, True
     return changed
+
+
+def _conditions(values: dict[str, float | None]) -> list[str]:
+    """Hard conditions as a table, the clear day's figure beside each, and which stage loses most of what is lost."""
+    head, tail = "full.condition.", ".within_1_m"
+    clear = values.get(f"{head}clear{tail}")
+    names = [row.removeprefix(head).removesuffix(tail) for row in values if row.startswith(head) and row.endswith(tail)]
+    names = [name for name in names if not name.endswith(".forced") and name != "clear"]
+    if clear is None or not names:
+        return []
+    lines = ["", "| condition | within 1 m | clear day | difference | most is lost by |", "|---|---|---|---|---|"]
+    for name in names:
+        right, found, forced = (
+            values.get(f"{head}{name}.{figure}") for figure in ("within_1_m", "recall_at_10_5m", "forced_within_1_m")
+        )
+        if right is None:
+            continue
+        lost = {}
+        if found is not None and forced is not None:
+            lost = {"retrieval": 1 - found, "choice and registration": found - forced, "doubt": forced - right}
+        most = max(lost, key=lambda stage: lost[stage]) if lost else ""
+        told = f"{most} ({100 * lost[most]:.1f} points)" if most else ""
+        lines.append(f"| {name.replace('_', ' ')} | {right:.3f} | {clear:.3f} | {right - clear:+.3f} | {told} |")
+    return lines
 
 
 def _other_commits(rows: list[dict[str, Any]]) -> list[str]:
@@ -93,6 +121,31 @@ def _bar(row: dict[str, Any]) -> str:
     if isinstance(row["bar"], list):
         return "{:g} to {:g}".format(*row["bar"])
     return f"{'at least' if row['better'] == 'higher' else 'at most'} {row['bar']:g}"
+
+
+def _accepts(name: str, curves: dict[str, list[list[float]]]) -> Path:
+    """What accepting more costs: strangers of each kind that are accepted, against queries accepted and right."""
+    presets = sorted({kind.rpartition(".")[2] for kind in curves})
+    figure, panels = plt.subplots(1, len(presets), figsize=(4.6 * len(presets), 3.8), sharey=True, squeeze=False)
+    for axes, preset in zip(panels[0], presets, strict=True):
+        for number, (kind, points) in enumerate(
+            (kind, points) for kind, points in curves.items() if kind.endswith(f".{preset}")
+        ):
+            label = kind.removesuffix(f".{preset}").replace("_", " ")
+            axes.step([p[0] for p in points], [p[1] for p in points], where="post", label=label, color=f"C{number}")
+        axes.set(xlim=(0, 1), ylim=(0, 1.02), title=preset, xlabel="strangers accepted")
+        axes.set_xscale("symlog", linthresh=0.01)
+        axes.set_xticks([0, 0.01, 0.1, 1], ["0", "1 %", "10 %", "all"])
+        axes.grid(alpha=0.3)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    panels[0][0].set_ylabel("accepted and within 1 m")
+    panels[0][0].legend(frameon=False, fontsize=8, loc="lower right")
+    figure.tight_layout()
+    path = REPORTS / f"{name}_accepts.png"
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+    return path
 
 
 def _plot(name: str, rows: list[dict[str, Any]]) -> Path | None:

@@ -79,7 +79,8 @@ class Report:
     def keep_others(self) -> None:
         """Keep the rows of earlier runs, each with the commit that it was measured at; this run's replace them.
 
-        What is kept is read when the report is written, so that two parts may be measured at once.
+        What is kept is read when the report is written, so that two parts may be measured at once. Notes are kept as well; one
+        that is None here is dropped.
         """
         self._keep = True
 
@@ -91,7 +92,8 @@ class Report:
         last = json.loads(path.read_text())
         rows = {row["id"]: {"commit": last["made"]["commit"]} | row for row in last["rows"]}
         rows.update({row["id"]: row for row in self.rows})
-        return list(rows.values()), last.get("notes", {}) | self.notes
+        notes = last.get("notes", {}) | self.notes
+        return list(rows.values()), {name: note for name, note in notes.items() if note is not None}
 
     def write(self) -> Path:
         """Write the file and say where."""

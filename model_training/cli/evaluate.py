@@ -43,7 +43,7 @@ def command(
         bool, typer.Option("--raw-baseline", help="compare with the raw range image's nearest neighbour")
     ] = False,
     trajectory: Annotated[
-        Path | None, typer.Option(help="write the answered poses in TUM format (one query set)")
+        Path | None, typer.Option(help="write the accepted poses in TUM format (one query set)")
     ] = None,
     predictions: Annotated[
         Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")

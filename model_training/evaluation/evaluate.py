@@ -98,6 +98,9 @@ def _is_of_the_survey(source: dict[str, Any], name: str) -> bool:
 
 
 def write_trajectory(path: Path, predictions: Predictions) -> None:
-    """Write the answered poses, T_map_camera, in TUM format, each with the timestamp of its truth."""
-    answered = np.isfinite(predictions.T_answer[:, 0, 3])
+    """Write the accepted poses, T_map_camera, in TUM format, each with the timestamp of its truth.
+
+    They are those that ``rms_distance_error_m`` is of; where a map is not calibrated, every answer is accepted.
+    """
+    answered = predictions.localized & np.isfinite(predictions.T_answer[:, 0, 3])
     write_tum(path, predictions.stamp_s[answered], predictions.T_answer[answered])

@@ -130,3 +130,13 @@ def test_parts_that_are_measured_at_once_keep_each_others_rows(report):
     assert {row_id: row["value"] for row_id, row in rows.items()} == {"old": 3.0, "a": 2.0, "b": 2.0}
     assert "commit" in rows["a"]
     assert "commit" not in rows["b"]
+
+
+def test_a_note_that_no_longer_speaks_of_the_rows_is_dropped(report):
+    report.notes |= {"run": "of another encoder", "map": "a city"}
+    report.row("a", 1.0, "m")
+    report.write()
+    again = Report("mine", "make mine")
+    again.keep_others()
+    again.notes["run"] = None
+    assert json.loads(again.write().read_text())["notes"] == {"map": "a city"}

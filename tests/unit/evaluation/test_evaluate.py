@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from model_training.datasets.dataset import (
     write_tum,
 )
 from model_training.evaluation.evaluate import city_seen_in_training, evaluate, split_of, write_trajectory
+from model_training.evaluation.measures import measure
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from service.maps.reader import MapBundle
 
@@ -38,6 +40,16 @@ def test_the_trajectory_has_the_timestamps_of_the_truth(small_map, stamped, tmp_
     ape = evo_ape(stamped.folder / "queries" / NAME / "poses.txt", tmp_path / "answers.txt", "--project_to_plane", "xy")
     assert ape.pairs == 4
     assert ape.rmse_m == pytest.approx(found.figures["rms_distance_error_m"], abs=1e-5)
+
+
+def test_the_trajectory_leaves_out_what_was_not_accepted(small_map, stamped, tmp_path, evo_ape):
+    """So that evo's figure is ours where a map refuses answers, too."""
+    found = evaluate(MapBundle.open(small_map), stamped, [NAME]).predictions[NAME]
+    refused = replace(found, status=np.where(np.arange(5) == 1, "AMBIGUOUS", found.status))
+    write_trajectory(tmp_path / "answers.txt", refused)
+    np.testing.assert_array_equal(read_tum(tmp_path / "answers.txt")[0], STAMPS[[0, 3, 4]])
+    ape = evo_ape(stamped.folder / "queries" / NAME / "poses.txt", tmp_path / "answers.txt", "--project_to_plane", "xy")
+    assert ape.rmse_m == pytest.approx(measure(refused, [str(k) for k in range(40)])["rms_distance_error_m"], abs=1e-5)
 
 
 ELSEWHERE, HERE, UNKNOWN = ("city-1000",), ("city-1000", "city-9"), ()
