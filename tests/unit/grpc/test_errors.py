@@ -1,6 +1,7 @@
 """What a gRPC client sees when something is wrong."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,26 @@ def test_work_whose_deadline_has_passed_is_dropped(
             threading.Event().wait(0.05)
     held.set()
     assert later.result(10) == "ran"
+
+
+def test_work_whose_caller_has_gone_is_dropped(
+    stub: LocalizationServiceStub, request_of: Any, engine: Engine, held: threading.Event
+) -> None:
+    """The place in the queue comes back while the worker is still busy."""
+    call = stub.Localize.future(request_of())
+    assert became(lambda: engine.admission.waiting == 1, within_s=10)
+    call.cancel()
+    assert became(lambda: engine.admission.waiting == 0, within_s=1)  # sooner than its time is over
+    assert engine.admission.working == 1
+    held.set()
+    assert stub.Localize(request_of()).map.name == "tiny"
+
+
+def became(true: Callable[[], bool], *, within_s: float) -> bool:
+    until = time.monotonic() + within_s
+    while not true() and time.monotonic() < until:
+        time.sleep(0.01)
+    return true()
 
 
 def test_the_services_own_limit_of_time_holds_where_the_caller_has_none(

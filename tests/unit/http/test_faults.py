@@ -1,6 +1,8 @@
 """What goes wrong inside one request stays inside it."""
 
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,8 +10,11 @@ from types import SimpleNamespace
 import cv2
 import httpx
 import pytest
+import uvicorn
 from onnxruntime.capi.onnxruntime_pybind11_state import RuntimeException
 
+from service.http.app import create_app
+from service.http.protocol import BoundedHttp
 from service.imaging import decode
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
@@ -70,3 +75,41 @@ def test_a_stuck_request_is_told_so_and_the_others_are_answered(
     first.join(30)
     goes_on.set()
     assert (found[0].status_code, found[0].json()["code"]) == (504, "deadline")
+
+
+def test_work_whose_caller_has_gone_is_dropped(engine: Engine, parts_of: Parts) -> None:
+    """Over a real socket, which the caller closes while its request waits: the place in the queue comes back at once."""
+    release, hold = threading.Event(), []
+    for _ in range(2):
+        began = threading.Event()
+        hold.append(engine.admission.submit(lambda began=began: (began.set(), release.wait(30))))
+        assert began.wait(30)
+    files = {name: (name, data) for name, data in parts_of().items()}
+    asked = httpx.Request("POST", "http://127.0.0.1/v1/localize", files=files)
+    head = f"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: {asked.headers['content-type']}\r\n"
+    head += f"Content-Length: {asked.headers['content-length']}\r\n\r\n"
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        config = uvicorn.Config(create_app(engine), http=BoundedHttp, lifespan="off", log_config=None)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            with socket.create_connection(listener.getsockname(), timeout=10) as caller:
+                caller.sendall(head.encode() + asked.read())
+                assert became(lambda: engine.admission.waiting == 1)
+            assert became(lambda: engine.admission.waiting == 0)
+            assert engine.admission.working == 2
+        finally:
+            release.set()
+            server.should_exit = True
+            thread.join()
+    for each in hold:
+        each.result(30)
+
+
+def became(true: Callable[[], bool], *, within_s: float = 3.0) -> bool:
+    """Sooner than the five seconds that a request may take."""
+    until = time.monotonic() + within_s
+    while not true() and time.monotonic() < until:
+        time.sleep(0.01)
+    return true()
