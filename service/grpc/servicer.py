@@ -51,6 +51,7 @@ class Servicer(LocalizationServiceServicer):
                 raise RequestError(
                     f"requests: there are {len(request.requests)}; send 1 to {MOST_FRAMES}", field="requests"
                 )
+            self._engine.metrics.batched(len(request.requests))
             begun = [self._begin(call, each) for each in request.requests]
             outcomes = [_outcome(call, number, each) for number, each in enumerate(begun)]
             return pb.LocalizeBatchResponse(outcomes=outcomes)

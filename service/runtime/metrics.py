@@ -2,11 +2,14 @@
 
 import os
 from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.gc_collector import GCCollector
+from prometheus_client.metrics_core import Metric
 from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
@@ -20,6 +23,7 @@ from service.runtime.map_registry import MapRegistry
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512, 1.0, 2.0, 5.0, 10.0, 30.0)
 _SHARES = (0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
+_FOLDER = "PROMETHEUS_MULTIPROC_DIR"
 _STAGES = ("decode", "fuse", "encode", "search", "register")
 
 
@@ -36,7 +40,7 @@ class Metrics:
     def __init__(self, admission: Admission, maps: MapRegistry) -> None:
         self._registry = CollectorRegistry()
         self._maps = _Maps(maps)
-        self._is_one_of_several = "PROMETHEUS_MULTIPROC_DIR" in os.environ
+        self._is_one_of_several = _FOLDER in os.environ
         if not self._is_one_of_several:
             for collector in (ProcessCollector, PlatformCollector, GCCollector):
                 collector(registry=self._registry)
@@ -73,6 +77,10 @@ class Metrics:
             registry=self._registry,
         )
 
+        self._batches = Histogram(
+            "streetfix_batch_size", "Requests of a batch.", buckets=(1, 2, 4, 8, 16), registry=self._registry
+        )
+
     def _gauge(self, name: str, what: str) -> Gauge:
         """Of several processes the sum over those that live."""
         return Gauge(name, what, registry=self._registry, multiprocess_mode="livesum")
@@ -85,6 +93,10 @@ class Metrics:
             self._confidence.labels(bundle.name).observe(answer.confidence)
         for stage in _STAGES:
             self._stage_seconds.labels(stage).observe(_milliseconds(answer.timings, stage) / 1e3)
+
+    def batched(self, requests: int) -> None:
+        """Count a batch of so many requests."""
+        self._batches.observe(requests)
 
     def requested(self, face: str, method: str, code: str, seconds: float | None) -> None:
         """Count a request.
@@ -106,7 +118,41 @@ class Metrics:
         together = CollectorRegistry()
         MultiProcessCollector(together)  # type: ignore[no-untyped-call]  # the library leaves it untyped
         together.register(self._maps)
+        together.register(_Processes(Path(os.environ[_FOLDER])))
         return generate_latest(together)
+
+
+class _Processes(Collector):
+    """Processor time, memory and open files of all workers together; pages that they share are counted by each."""
+
+    _SUMMED = (
+        "process_cpu_seconds",
+        "process_resident_memory_bytes",
+        "process_virtual_memory_bytes",
+        "process_open_fds",
+    )
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder  # the client library keeps a file there for each worker that lives
+
+    def collect(self) -> Iterator[Metric]:
+        """The sums, under the names that a single process has."""
+        pids = {path.stem.rpartition("_")[2] for path in self._folder.glob("gauge_livesum_*.db")}
+        found: dict[str, list[Metric]] = {}
+        for pid in pids:
+            for metric in ProcessCollector(pid=partial(str, pid), registry=None).collect():
+                found.setdefault(metric.name, []).append(metric)
+        for name in self._SUMMED:
+            metrics = found.get(name, [])
+            if metrics:
+                total = Metric(name, f"{metrics[0].documentation} Of all workers.", metrics[0].type)
+                sample = metrics[0].samples[0]
+                total.add_sample(sample.name, sample.labels, sum(each.samples[0].value for each in metrics))
+                yield total
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing that could clash."""
+        return ()
 
 
 class _Maps(Collector):

@@ -1,6 +1,7 @@
 """The same request gets the same answer through every face, over real sockets."""
 
 import json
+import re
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -123,6 +124,7 @@ def test_a_batch_answers_each_on_its_own(faces: Any, parts_of: Parts) -> None:
     client, stub = faces
     parts = parts_of()
     good, lost = json.loads(parts["request"]), json.loads(parts["request"]) | {"map": "west"}
+    before = batches(client)
     rest = posted(client, "/v1/localize/batch", numbered(parts, 2, {"requests": [good, lost]}))["outcomes"]
     message = pb.LocalizeRequest(**pair(parts), camera=CAMERA, depth_format=DEPTH)
     elsewhere = pb.LocalizeRequest(**pair(parts), camera=CAMERA, depth_format=DEPTH, map="west")
@@ -134,6 +136,14 @@ def test_a_batch_answers_each_on_its_own(faces: Any, parts_of: Parts) -> None:
         problem[name] for name in ("code", "title", "detail", "field")
     )
     assert (problem["code"], problem["field"], problem["status"]) == ("unknown-map", "requests.1.map", 404)
+    assert batches(client) == (before[0] + 2, before[1] + 4)
+
+
+def batches(client: httpx.Client) -> tuple[float, float]:
+    """How many batches came, of how many requests."""
+    text = client.get("/metrics").text
+    found = dict(re.findall(r"^streetfix_batch_size_(count|sum) (\S+)$", text, re.MULTILINE))
+    return float(found["count"]), float(found["sum"])
 
 
 def test_a_stream_is_a_sequence_that_grows(faces: Any, parts_of: Parts) -> None:

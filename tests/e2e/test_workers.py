@@ -105,6 +105,21 @@ def test_all_workers_count_together(service: Service, parts_of: Parts) -> None:
     assert service.metric("streetfix_map") > 0
 
 
+def test_processor_time_and_memory_are_those_of_all_workers(service: Service, parts_of: Parts) -> None:
+    assert post(service.url, parts_of()).status_code == 200
+    each = [of_process(pid) for pid in service.workers]
+    assert service.metric("process_resident_memory_bytes") == pytest.approx(sum(rss for rss, _ in each), rel=0.2)
+    assert service.metric("process_cpu_seconds_total") == pytest.approx(sum(cpu for _, cpu in each), rel=0.3)
+    assert service.metric("process_open_fds") > WORKERS * 3
+
+
+def of_process(pid: int) -> tuple[float, float]:
+    """Resident bytes and processor seconds of one process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    seconds = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return int(fields[21]) * os.sysconf("SC_PAGE_SIZE"), seconds
+
+
 def test_both_faces_answer_on_one_port_each(service: Service, parts_of: Parts) -> None:
     with grpc.insecure_channel(service.grpc) as channel:
         maps = LocalizationServiceStub(channel).ListMaps(pb.ListMapsRequest(), timeout=30).maps

@@ -197,6 +197,7 @@ async def _batch(engine: Engine, given: Given) -> bytes:
             return Outcome(answer=None, problem=problem_of(error, given.request_id))
 
     asked = await asyncio.wrap_future(engine.admission.submit(split))
+    engine.metrics.batched(len(asked))
     outcomes = await asyncio.gather(*(one(number, *each) for number, each in enumerate(asked)))
     return BatchAnswer(outcomes=list(outcomes)).model_dump_json(by_alias=True).encode()
 
