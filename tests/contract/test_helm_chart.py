@@ -57,6 +57,15 @@ def test_braces_and_blocks_of_templates_are_closed() -> None:
         assert opened == len(re.findall(r"{{-?\s*end\s*-?}}", text)), path.name
 
 
+def test_prometheus_shows_a_key_where_the_service_wants_one() -> None:
+    """The pods always ask for keys, of whoever wants their metrics too."""
+    pod, monitor = ((CHART / "templates" / name).read_text() for name in ("deployment.yaml", "monitor.yaml"))
+    assert "STREETFIX_API_KEYS" in pod
+    assert "prometheus.io/scrape" not in pod
+    assert "type: Bearer" in monitor
+    assert "scheme: https" in monitor.partition(".Values.tls.secret")[2]
+
+
 @needs_helm
 def test_helm_finds_nothing_to_complain_of() -> None:
     subprocess.run(["helm", "lint", "--strict", str(CHART)], check=True, capture_output=True)
@@ -64,10 +73,17 @@ def test_helm_finds_nothing_to_complain_of() -> None:
 
 @needs_helm
 @pytest.mark.parametrize(
-    "options", [[], ["--set", "autoscaling.enabled=true,tls.secret=certificate,network.collector=10.0.0.0/8"]]
+    "options",
+    [
+        [],
+        [
+            "--set",
+            "autoscaling.enabled=true,tls.secret=certificate,network.collector=10.0.0.0/8,monitor.enabled=true,monitor.secret=key",
+        ],
+    ],
 )
 def test_what_it_renders_is_what_kubernetes_reads(options: list[str]) -> None:
     done = subprocess.run(["helm", "template", "x", str(CHART), *options], check=True, capture_output=True, text=True)
     kinds = [document["kind"] for document in yaml.safe_load_all(done.stdout)]
     assert {"Deployment", "Service", "PodDisruptionBudget", "NetworkPolicy"} <= set(kinds)
-    assert ("HorizontalPodAutoscaler" in kinds) == bool(options)
+    assert ("HorizontalPodAutoscaler" in kinds) == ("PodMonitor" in kinds) == bool(options)
