@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -184,7 +185,8 @@ def test_doubt_is_a_problem_where_the_format_has_no_word_for_it(
     from service.localization.decide import Decision
 
     monkeypatch.setattr(localizer, "decide", lambda *_: Decision("AMBIGUOUS", 0.4))
-    monkeypatch.setattr(MapBundle, "calibration", object(), raising=False)
+    calibration = SimpleNamespace(least_false_accept_rate=0.001)
+    monkeypatch.setattr(MapBundle, "calibration", calibration, raising=False)
     refused = post(client, parts_of(), Accept="application/geopose+json")
     assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")
     assert "AMBIGUOUS" in refused.json()["detail"]
