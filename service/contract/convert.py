@@ -13,13 +13,13 @@ from service.contract import schema
 from service.errors import NotYetSupportedError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import (
-    covariance_at,
     heading_of_body,
     heading_of_camera,
     quaternion_xyzw_from,
     rotation_from_quaternion_xyzw,
     transform_from,
 )
+from service.geometry.uncertainty import covariance_at
 from service.localization.answer import Answer
 from service.localization.evidence import distinct_candidates
 from service.localization.localizer import Localizer

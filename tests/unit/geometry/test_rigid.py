@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from service.geometry.rigid import (
     R_BODY_OPTICAL,
-    covariance_at,
     heading_of_body,
     heading_of_camera,
     inverse,
@@ -128,20 +127,3 @@ def test_headings_of_camera_and_body_agree_on_one_vehicle(heading, pitch, roll):
     T_map_camera = transform_from(R_map_body @ R_BODY_OPTICAL, np.zeros(3))
     assert heading_of_body(T_map_body) == pytest.approx(heading, abs=1e-9)
     assert heading_of_camera(T_map_camera) == pytest.approx(heading, abs=1e-9)
-
-
-@given(lever=vectors, spread=st.integers(0, 1000))
-def test_covariance_is_carried_along_a_body_as_small_motions_are(lever, spread):
-    """A spread of six small motions of the body: the other point is moved by each of them, and by its turn times the lever."""
-    motions = np.random.default_rng(spread).normal(size=(6, 6))
-    moved = np.c_[motions[:, :3] + np.cross(motions[:, 3:], lever), motions[:, 3:]]
-    at = np.array([3.0, -2.0, 1.0])
-    scale = 1 + np.linalg.norm(lever) ** 2
-    np.testing.assert_allclose(
-        covariance_at(motions.T @ motions, at, at + lever) / scale, moved.T @ moved / scale, atol=1e-9
-    )
-
-
-def test_covariance_at_the_same_point_stays():
-    covariance = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
-    np.testing.assert_allclose(covariance_at(covariance, np.ones(3), np.ones(3)), covariance)
