@@ -211,34 +211,32 @@ def test_a_calibrated_map_says_how_sure_it_is_and_accepts_by_the_rate_asked_for(
     assert (retrieved.status, retrieved.confidence) == ("LOCALIZED", None)
 
 
-def test_fewer_false_accepts_than_calibration_measured_are_not_promised(
-    content_of: Callable[..., BundleContent],
-    calibration_json: Callable[..., dict[str, Any]],
-    tmp_path: Path,
-    query: Query,
-) -> None:
+@pytest.fixture
+def calibrated(
+    content_of: Callable[..., BundleContent], calibration_json: Callable[..., dict[str, Any]], tmp_path: Path
+) -> Localizer:
+    """A map whose calibration gives even odds whatever the evidence."""
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
-    localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
-    assert localizer.bundle.calibration is not None
-    least = localizer.bundle.calibration.least_false_accept_rate
+    return Localizer.open(MapBundle.open(tmp_path / "m"))
+
+
+def test_fewer_false_accepts_than_calibration_measured_are_not_promised(calibrated: Localizer, query: Query) -> None:
+    assert calibrated.bundle.calibration is not None
+    least = calibrated.bundle.calibration.least_false_accept_rate
     with pytest.raises(RequestError, match=rf"ask for {least:g} or more") as caught:
-        localizer.localize(replace(query, false_accept_rate=0.5 * least))
+        calibrated.localize(replace(query, false_accept_rate=0.5 * least))
     assert caught.value.field == "options.false_accept_rate"
-    assert localizer.localize(replace(query, false_accept_rate=least)).confidence is not None
+    assert calibrated.localize(replace(query, false_accept_rate=least)).confidence is not None
     # Without registration there is no confidence, so nothing is promised.
-    assert localizer.localize(replace(query, false_accept_rate=0.5 * least, refine=False)).confidence is None
+    assert calibrated.localize(replace(query, false_accept_rate=0.5 * least, refine=False)).confidence is None
 
 
 def test_a_calibrated_map_believes_nothing_of_a_picture_that_is_too_empty_to_register(
-    content_of: Callable[..., BundleContent],
-    calibration_json: Callable[..., dict[str, Any]],
-    tmp_path: Path,
-    query: Query,
+    calibrated: Localizer, query: Query
 ) -> None:
-    write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     few = np.zeros_like(query.depth_m)
     few[20:23, 20:24] = query.depth_m[20:23, 20:24]
-    answer = Localizer.open(MapBundle.open(tmp_path / "m")).localize(replace(query, depth_m=few))
+    answer = calibrated.localize(replace(query, depth_m=few))
     assert (answer.status, answer.confidence, answer.evidence, answer.candidates) == ("OUT_OF_MAP", 0.0, None, None)
 
 
