@@ -2,14 +2,18 @@
 
 from pydantic import BaseModel, ValidationError
 
-from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
+from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters, RgbParameters
 from service.errors import DatasetError
 
-_MODELS: dict[str, type[BaseModel]] = {"lidar": LidarParameters, "depth": DepthParameters}
+_MODELS: dict[str, type[BaseModel]] = {
+    "lidar": LidarParameters,
+    "rgb": RgbParameters,
+    "depth": DepthParameters,
+}
 
 
-def sensor_parameters(settings: list[str]) -> tuple[LidarParameters, DepthParameters]:
-    """What the settings say of the LiDAR and of the depth camera.
+def sensor_parameters(settings: list[str]) -> tuple[LidarParameters, RgbParameters, DepthParameters]:
+    """What the settings say of the LiDAR, the RGB camera and the depth camera.
 
     Args:
         settings: texts such as ``lidar.channels=64``.
@@ -32,9 +36,13 @@ def sensor_parameters(settings: list[str]) -> tuple[LidarParameters, DepthParame
             raise DatasetError(f"{name}: it is set twice; give it once", field=name)
         given[sensor][field] = value
     try:
-        return LidarParameters.model_validate(given["lidar"]), DepthParameters.model_validate(given["depth"])
+        return (
+            LidarParameters.model_validate(given["lidar"]),
+            RgbParameters.model_validate(given["rgb"]),
+            DepthParameters.model_validate(given["depth"]),
+        )
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        sensor = "lidar" if error.title == LidarParameters.__name__ else "depth"
+        sensor = next(name for name, model in _MODELS.items() if model.__name__ == error.title)
         name = f"{sensor}.{first['loc'][0]}"
         raise DatasetError(f"{name}: {first['msg']} (given: {first['input']!r})", field=name) from error

@@ -9,7 +9,7 @@ from rich.console import Console
 from model_training.cli.progress import bars
 from model_training.cli.sensor_options import sensor_parameters
 from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
-from model_training.simulation.sensor_parameters import DepthParameters
+from model_training.simulation.sensor_parameters import DepthParameters, RgbParameters
 from model_training.simulation.simulate import simulate
 from service.errors import DatasetError
 
@@ -22,7 +22,7 @@ Examples:
   streetfix simulate --seed 9001 --queries 334 --out data/unseen1
 
 \b
-  streetfix simulate --lidar os1_128 --set lidar.channels=64 --set depth.noise_px=0.3 --out data/others
+  streetfix simulate --lidar os1_128 --rgb small --set lidar.channels=64 --set rgb.noise=2 --set depth.noise_px=0.3 --out data/others
 
 An interrupted run goes on where it stopped. Same seed, same bytes, for any number of workers.
 """
@@ -55,6 +55,15 @@ def command(
     depth: Annotated[
         list[str] | None, typer.Option(help="ideal, precise or stereo; repeat for several [default: precise]")
     ] = None,
+    rgb: Annotated[str, typer.Option(help="automatic, small or fixed")] = "automatic",
+    sun_elevation: Annotated[
+        float | None,
+        typer.Option(help="of the sun above the horizon, degrees [default: by the condition]", min=1, max=90),
+    ] = None,
+    sun_azimuth: Annotated[
+        float | None,
+        typer.Option(help="of the sun, from east counter-clockwise, degrees [default: by chance]", min=-360, max=360),
+    ] = None,
     condition: Annotated[str, typer.Option(help="of all queries: clear, rain, snow, fog, night or low_sun")] = "clear",
     survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
     survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
@@ -79,7 +88,9 @@ def command(
     settings: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="SENSOR.NUMBER=VALUE", help="a number of lidar or depth in place of its preset's; repeat"
+            "--set",
+            metavar="SENSOR.NUMBER=VALUE",
+            help="a number of lidar, rgb or depth in place of its preset's; repeat",
         ),
     ] = None,
     camera: Annotated[str, typer.Option(help="picture size in pixels, up to 4096x4096")] = "640x480",
@@ -87,10 +98,12 @@ def command(
     workers: Annotated[int | None, typer.Option(help="processes [default: one a core]", min=1)] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
-    lidar_parameters, depth_parameters = sensor_parameters(settings or [])
+    lidar_parameters, rgb_parameters, depth_parameters = sensor_parameters(settings or [])
     of_all: dict[str, object] = {
         "depths": tuple(depth or ["precise"]), "condition": condition, "turn_deg": turn, "pitch_deg": pitch,
         "blocked": blocked, "max_depth_m": max_depth, "depth_parameters": depth_parameters,
+        "rgb": None if rgb == "automatic" else rgb, "rgb_parameters": rgb_parameters,
+        "sun_elevation_deg": sun_elevation, "sun_azimuth_deg": sun_azimuth,
     }  # fmt: skip
     of_drives: dict[str, object] = {"parked_changed": parked_changed, "aside_m": aside, "heading_deg": heading}
     plans = []
@@ -101,9 +114,10 @@ def command(
         own = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
         # Without any drive nothing would take these three: the plan refuses them rather than pass them over.
         plans.append(QueryPlan.model_validate(own if plans else own | of_drives))
-    if depth_parameters != DepthParameters() and not plans:
+    if not plans and (depth_parameters, rgb_parameters) != (DepthParameters(), RgbParameters()):
         raise DatasetError(
-            "set: without queries nothing measures depth; ask for some, or set numbers of lidar only", field="set"
+            "set: without queries nothing takes pictures or measures depth; ask for some, or set numbers of lidar only",
+            field="set",
         )
     if city not in ("paper", "city"):
         raise DatasetError(f"city: {city!r} is neither 'paper' nor 'city'", field="city")

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from model_training.simulation.blocker import Blocker
 from model_training.simulation.conditions import Condition
+from model_training.simulation.exposure import RgbModel, exposed
 from model_training.simulation.meshes import Material
 from model_training.simulation.scene import Hits, Scene
-from model_training.simulation.shading import Light, shade, shadows, to_srgb
+from model_training.simulation.shading import Light, shade, shadows
 from model_training.simulation.terrain import GroundPicture
 from service.geometry.camera import PinholeCamera
 
@@ -35,7 +36,7 @@ def unit_rays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.fl
 
 def take(
     scene: Scene, ground: GroundPicture, camera: PinholeCamera, T_map_camera: NDArray[np.float64], light: Light,
-    condition: Condition, rng: np.random.Generator, *, rays_camera: NDArray[np.float32], z_of_ray: NDArray[np.float32],
+    condition: Condition, model: RgbModel, rng: np.random.Generator, *, rays_camera: NDArray[np.float32], z_of_ray: NDArray[np.float32],
     blocker: Blocker | None = None,
 ) -> Picture:  # fmt: skip
     """Take a picture; ``rays_camera`` and ``z_of_ray`` are those of ``unit_rays``."""
@@ -53,7 +54,7 @@ def take(
         distance = np.where(stopped, near, distance)
         material = np.where(stopped, Material.METAL, material)
         linear = np.where(stopped[:, None], albedo * light.sky, linear)
-    rgb = _expose(linear.reshape(*shape, 3), condition, rng)
+    rgb = exposed(linear.reshape(*shape, 3), model, condition, rng)
     depth = (distance * z_of_ray).reshape(shape)
     blank = ((material == Material.GLASS) | (material == Material.METAL) | (material == Material.MATTE)).reshape(shape)
     return Picture(rgb, depth, blank & (depth > 0))
@@ -76,32 +77,3 @@ def _lit(
     small = lit.reshape(-(-shape[0] // SHADOW_STEP), -(-shape[1] // SHADOW_STEP)).astype(np.uint8)
     spread = cv2.resize(small, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
     return np.asarray(spread, np.uint8).reshape(-1) > 0
-
-
-def _expose(linear: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Automatic exposure, noise, rain and snow in the air, the lens's glare."""
-    mean = float(np.mean(linear[::4, ::4].min(axis=2))) + 1e-4
-    gain = min(0.26 / mean, 60.0) * rng.uniform(0.8, 1.25)
-    picture = to_srgb(linear, gain)
-    sigma = 1.2 + 0.35 * min(gain, 40.0)
-    picture += rng.standard_normal(linear.shape[:2], dtype=np.float32)[..., None] * np.float32(sigma)
-    picture += cv2.resize(rng.standard_normal((linear.shape[0] // 2, linear.shape[1] // 2, 3), dtype=np.float32),
-                          (linear.shape[1], linear.shape[0])) * np.float32(0.5 * sigma)  # fmt: skip
-    if condition.streaks > 0:
-        _particles(picture, condition, rng)
-    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
-
-
-def _particles(picture: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> None:
-    """Streaks of rain or flakes of snow, drawn into the picture in place."""
-    height, width = picture.shape[:2]
-    flakes = condition.snow_cover > 0
-    slant = rng.normal(0, 0.15)
-    for _ in range(int(condition.streaks * 500 * width / 640)):
-        x, y = int(rng.integers(width)), int(rng.integers(height))
-        tone = float(rng.uniform(170, 235))
-        if flakes:
-            cv2.circle(picture, (x, y), int(rng.integers(1, 4)), (tone, tone, tone), -1, cv2.LINE_AA)
-        else:
-            length = int(rng.integers(6, 26))
-            cv2.line(picture, (x, y), (x + int(slant * length), y + length), (tone, tone, tone), 1, cv2.LINE_AA)

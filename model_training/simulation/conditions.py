@@ -6,6 +6,11 @@ Extinction coefficients (per metre, one way) at 905 nm:
 - fog: Koschmieder, 3.912 / visibility, visibility 50 m.
 Particles that answer a LiDAR come near the sensor, where its pulse is strong; their share grows with the extinction
 (Goodin et al., Electronics 8(1), 2019; Heinzler et al., RA-L 5(2), 2020: most false returns within 10 m in fog and snow).
+
+Light, relative to a clear day's: rain, snow and fog have no sun of their own, the sky's light alone; wet surfaces are darker (Lekner and
+Dorf, Applied Optics 27(7), 1988), fresh snow reflects 0.8 to 0.9 of what is visible (Warren, Reviews of Geophysics 20(1), 1982).
+That triangulated depth gets noisier and sparser in rain, fog and darkness is measured (Gruber et al., 3DV 2019); by how much
+(``disparity_noise``, ``holes``) is chosen here, and so are ``streaks``, ``glare`` and ``ambient``: no publication gives them.
 """
 
 from dataclasses import dataclass

@@ -8,8 +8,9 @@ from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler
 
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import DEPTHS
+from model_training.simulation.exposure import RGBS, RgbModel
 from model_training.simulation.lidar import LIDARS
-from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
+from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters, RgbParameters
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
@@ -61,9 +62,17 @@ class QueryPlan(_Model):
     blocked: float = Field(0.0, ge=0, le=0.9)
     max_depth_m: float | None = Field(None, ge=1)
     depth_parameters: DepthParameters = DepthParameters()  # in place of those of each of ``depths``
+    rgb: str | None = None  # None: the preset ``automatic``
+    rgb_parameters: RgbParameters = RgbParameters()  # in place of those of ``rgb``
+    sun_elevation_deg: float | None = Field(None, ge=1, le=90)  # None: by the condition, differing from drive to drive
+    sun_azimuth_deg: float | None = Field(None, ge=-360, le=360)  # from east counter-clockwise; None: by chance
     # Frames in a row, ``step_m`` of straight driving apart, the last at the pose drawn; None: single pictures.
     sequence: int | None = Field(None, ge=2, le=20)
     step_m: float | None = Field(None, ge=0.1, le=10)
+
+    def rgb_model(self) -> RgbModel:
+        """The RGB camera of this drive."""
+        return self.rgb_parameters.on(self.rgb or "automatic")
 
     def refuse_what_does_nothing(self) -> None:
         """Refuse a field that was changed and that this traversal would pass over in silence.
@@ -75,6 +84,9 @@ class QueryPlan(_Model):
         refused = [("aside_m", poses), ("heading_deg", poses)] if self.on_track else []
         refused += [("parked_changed", vehicles)] if self.traversal == 0 else []
         refused += [("step_m", "has no sequence")] if self.sequence is None else []
+        sunless = f"has no sun, being of the condition {self.condition!r}"
+        if CONDITIONS[self.condition].sun_strength == 0:
+            refused += [("sun_elevation_deg", sunless), ("sun_azimuth_deg", sunless)]
         for field, why in refused:
             value = getattr(self, field)
             if value != type(self).model_fields[field].default:
@@ -113,6 +125,7 @@ class SimulationPlan(_Model):
         ]
         for query in self.queries:
             named.append(("condition", query.condition, CONDITIONS))
+            named.append(("rgb", query.rgb or "automatic", RGBS))
             named += [("depth", depth, DEPTHS) for depth in query.depths]
         for field, value, known in named:
             if value not in set(known):
@@ -122,6 +135,7 @@ class SimulationPlan(_Model):
             query.refuse_what_does_nothing()
             for depth in query.depths:
                 query.depth_parameters.on(depth)
+            query.rgb_model()
         names = [query.name for query in self.queries]
         if len(set(names)) != len(names):
             raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")

@@ -6,6 +6,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from model_training.simulation.depth_noise import DEPTHS, DepthModel
+from model_training.simulation.exposure import RGBS, RgbModel
 from model_training.simulation.lidar import LIDARS, LidarModel
 from service.errors import DatasetError
 
@@ -41,6 +42,30 @@ class LidarParameters(_Parameters):
             raise DatasetError(
                 f"lidar.top_deg: {model.top_deg:g} is not above lidar.bottom_deg, {model.bottom_deg:g}; change one of them",
                 field="lidar.top_deg",
+            )
+        return model
+
+
+class RgbParameters(_Parameters):
+    """Of the RGB camera; stops, gains and display values of 0 to 255, as in ``RgbModel``."""
+
+    exposure_ev: float | None = Field(None, ge=-6, le=6)
+    most_gain: float | None = Field(None, ge=0.01, le=1000)
+    fixed_gain: float | None = Field(None, ge=0, le=1000)
+    noise: float | None = Field(None, ge=0, le=128)
+    noise_per_gain: float | None = Field(None, ge=0, le=128)
+
+    def on(self, preset: str) -> RgbModel:
+        """The preset with these numbers.
+
+        Raises:
+            DatasetError: the limit of metering is set for an exposure that is fixed.
+        """
+        model = replace(RGBS[preset], **self.model_dump())
+        if model.fixed_gain > 0 and self.most_gain is not None:
+            raise DatasetError(
+                f"rgb.most_gain: {self.most_gain:g} would do nothing, since rgb.fixed_gain is {model.fixed_gain:g}; leave one out",
+                field="rgb.most_gain",
             )
         return model
 

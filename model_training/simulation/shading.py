@@ -36,11 +36,26 @@ class Light:
     haze_per_m: float
 
     @staticmethod
-    def of(condition: Condition, rng: np.random.Generator) -> "Light":
-        """The sun stands where the hour has it; its azimuth and the clouds differ from drive to drive."""
+    def of(
+        condition: Condition,
+        rng: np.random.Generator,
+        *,
+        elevation_deg: float | None = None,
+        azimuth_deg: float | None = None,
+    ) -> "Light":
+        """The sun stands where the hour has it, or where it is told to; its azimuth and the clouds differ from drive to drive.
+
+        Args:
+            condition: the weather.
+            rng: of this drive.
+            elevation_deg: of the sun above the horizon.
+            azimuth_deg: of the sun, from east counter-clockwise.
+        """
         spread = 12.0 if condition.sun_elevation_deg > 20 else 2.0
         elevation = np.deg2rad(condition.sun_elevation_deg + rng.uniform(-spread, spread))
         azimuth = rng.uniform(0, 2 * np.pi)
+        elevation = elevation if elevation_deg is None else np.deg2rad(elevation_deg)
+        azimuth = azimuth if azimuth_deg is None else np.deg2rad(azimuth_deg)
         warm = np.clip(1.2 - np.sin(elevation), 0.0, 1.0)
         sun = np.array([1.0, 0.95 - 0.15 * warm, 0.85 - 0.4 * warm]) * 2.4 * condition.sun_strength
         grey = 1.0 if condition.sun_strength == 0 else rng.uniform(0.0, 0.5)

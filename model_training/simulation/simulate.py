@@ -175,7 +175,10 @@ def _queries(
     quota = quota_of(city, query, candidates)
     camera = plan.camera.pinhole()
     rays, z_of_ray = unit_rays(camera)
-    light = Light.of(CONDITIONS[query.condition], np.random.default_rng([plan.seed, 32, query.traversal]))
+    light = Light.of(
+        CONDITIONS[query.condition], np.random.default_rng([plan.seed, 32, query.traversal]),
+        elevation_deg=query.sun_elevation_deg, azimuth_deg=query.sun_azimuth_deg,
+    )  # fmt: skip
     scene = Scene(joined([city.static, city.occupants(query.traversal, parked_changed=query.parked_changed)]))
     job = _Job(
         plan,
@@ -268,7 +271,7 @@ def _one_pair(number: int) -> int:
     blocker = None
     if query.blocked > 0:
         blocker = Blocker.before(T, job.city.height(T[0, 3], T[1, 3]), query.blocked, rng)
-    picture = take(job.scene, job.city.ground, job.camera, T, job.light, condition, rng,
+    picture = take(job.scene, job.city.ground, job.camera, T, job.light, condition, query.rgb_model(), rng,
                    rays_camera=job.rays, z_of_ray=job.z_of_ray, blocker=blocker)  # fmt: skip
     encoded = cv2.imencode(".jpg", picture.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
     for index, name in enumerate(query.depths):

@@ -78,16 +78,19 @@ def test_simulate_takes_weather_and_mounting_on_the_track_too(tmp_path: Path) ->
 
 def test_simulate_replaces_single_numbers_of_the_sensors(tmp_path: Path) -> None:
     given = ("--set", "lidar.channels=16", "--set", "lidar.max_range_m=25", "--set", "depth.noise_px=0.3")
+    given += ("--rgb", "small", "--set", "rgb.noise=2", "--sun-elevation", "20")
     assert run("simulate", "--out", tmp_path / "set", *given, "--queries", "1", "--on-track", "1", *SMALL) == 0
     plan = plan_in(tmp_path / "set")
     assert plan["lidar_parameters"] == {"channels": 16, "max_range_m": 25.0}
+    assert [query["rgb_parameters"] for query in plan["queries"]] == [{"noise": 2.0}] * 2
+    assert [(query["rgb"], query["sun_elevation_deg"]) for query in plan["queries"]] == [("small", 20.0)] * 2
     assert [query["depth_parameters"] for query in plan["queries"]] == [{"noise_px": 0.3}] * 2
 
 
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["radar.power=1"], "radar.power: there is no sensor 'radar'; there are: lidar, depth"),
+        (["radar.power=1"], "radar.power: there is no sensor 'radar'; there are: lidar, rgb, depth"),
         (["lidar.beams=64"], "lidar.beams: lidar has no number 'beams'; it has: channels, columns"),
         (["depth.noise_px"], "set: 'depth.noise_px' is not SENSOR.NUMBER=VALUE"),
         (["channels=64"], "set: 'channels=64' is not SENSOR.NUMBER=VALUE"),
@@ -118,10 +121,15 @@ def test_simulate_refuses_a_number_that_no_sensor_can_take(
         (("--size", "0x400"), "size: 0 in '0x400' is not between 30 and 10000"),
         (("--size", "300xinf"), "size: inf in '300xinf' is not between"),
         (("--lidar", "none"), "lidar: 'none' is no preset"),
+        (("--rgb", "none"), "rgb: 'none' is no preset; there are: automatic, small, fixed"),
+        (
+            ("--condition", "fog", "--sun-azimuth", "90"),
+            "sun_azimuth_deg: 90 would do nothing, since 'drive1' has no sun",
+        ),
         (("--table1",), "--city paper"),
         (("--city", "paper", "--size", "300x400"), "size: the paper's city has its own"),
         (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 would do nothing"),
-        (("--queries", "0", "--set", "depth.noise_px=1"), "without queries nothing measures depth"),
+        (("--queries", "0", "--set", "depth.noise_px=1"), "without queries nothing takes pictures or measures depth"),
     ],
 )
 def test_simulate_says_what_is_wrong_and_writes_nothing(

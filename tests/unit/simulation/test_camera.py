@@ -4,8 +4,10 @@ import pytest
 from model_training.simulation.blocker import Blocker
 from model_training.simulation.camera import take, unit_rays
 from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.exposure import RGBS, exposed
 from model_training.simulation.meshes import Material, MeshBuilder
 from model_training.simulation.scene import Scene
+from model_training.simulation.sensor_parameters import RgbParameters
 from model_training.simulation.shading import Light, shade
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
@@ -13,18 +15,19 @@ from service.imaging.view_grid import ViewGrid
 
 CAMERA = PinholeCamera(96, 72, 48.0, 48.0, 47.5, 35.5)
 GRID = ViewGrid()
+CLEAR = CONDITIONS["clear"]
 
 
 def pose(*, heading_deg=0.0, x_m=0.0, z_m=1.5):
     return transform_from(rotation_z(np.deg2rad(heading_deg)) @ R_BODY_OPTICAL, np.array([x_m, 0.0, z_m]))
 
 
-def picture_of(wall, condition_name="clear", *, seed=0, T_map_camera=None, blocker=None):
+def picture_of(wall, condition_name="clear", *, seed=0, T_map_camera=None, blocker=None, model=RGBS["automatic"]):
     condition = CONDITIONS[condition_name]
     rays, z = unit_rays(CAMERA)
     light = Light.of(condition, np.random.default_rng(seed))
     return take(
-        wall.scene, wall.ground, CAMERA, pose() if T_map_camera is None else T_map_camera, light, condition,
+        wall.scene, wall.ground, CAMERA, pose() if T_map_camera is None else T_map_camera, light, condition, model,
         np.random.default_rng(seed), rays_camera=rays, z_of_ray=z, blocker=blocker,
     )  # fmt: skip
 
@@ -139,3 +142,50 @@ def test_a_blocker_is_in_depth_and_colour(wall):
 def test_one_seed_gives_one_picture(wall):
     one, other = picture_of(wall, "snow", seed=4), picture_of(wall, "snow", seed=4)
     np.testing.assert_array_equal(one.rgb, other.rgb)
+
+
+def grey(value, shape=(48, 64)):
+    return np.full((*shape, 3), value, np.float32)
+
+
+def test_a_metered_picture_is_as_bright_in_half_the_light():
+    bright, dim = (exposed(grey(light), RGBS["automatic"], CLEAR, np.random.default_rng(1)) for light in (0.4, 0.2))
+    assert abs(float(bright.mean()) - float(dim.mean())) < 3
+
+
+def test_a_fixed_exposure_is_darker_in_half_the_light():
+    bright, dim = (exposed(grey(light), RGBS["fixed"], CLEAR, np.random.default_rng(1)) for light in (0.4, 0.2))
+    assert dim.mean() < 0.85 * bright.mean()
+
+
+@pytest.mark.parametrize("preset", ["automatic", "fixed"])
+def test_a_stop_more_is_brighter_by_as_much_as_twice_the_light(preset):
+    plain = RGBS["fixed"]
+    one_more = exposed(grey(0.2), RgbParameters(exposure_ev=1.0).on(preset), CLEAR, np.random.default_rng(1))
+    assert one_more.mean() > exposed(grey(0.2), RgbParameters().on(preset), CLEAR, np.random.default_rng(1)).mean() + 20
+    if preset == "fixed":
+        assert (
+            abs(float(one_more.mean()) - float(exposed(grey(0.4), plain, CLEAR, np.random.default_rng(1)).mean())) < 2
+        )
+
+
+def test_noise_is_what_is_asked_for():
+    quiet = exposed(
+        grey(0.3, (200, 200)), RgbParameters(noise=0, noise_per_gain=0).on("automatic"), CLEAR, np.random.default_rng(1)
+    )
+    loud = exposed(
+        grey(0.3, (200, 200)), RgbParameters(noise=8, noise_per_gain=0).on("automatic"), CLEAR, np.random.default_rng(1)
+    )
+    assert quiet.std() == 0
+    # A colour's own noise is half of what all share, and less after it is enlarged.
+    assert 8.0 < loud[..., 0].std() < 8.0 * (1 + 0.5**2) ** 0.5
+
+
+def test_the_sun_stands_where_it_is_told_to():
+    light = Light.of(CLEAR, np.random.default_rng(0), elevation_deg=30.0, azimuth_deg=90.0)
+    np.testing.assert_allclose(light.toward_sun, [0.0, np.cos(np.pi / 6), 0.5], atol=1e-12)
+
+
+def test_telling_the_sun_draws_no_other_clouds():
+    told = Light.of(CLEAR, np.random.default_rng(0), elevation_deg=30.0, azimuth_deg=90.0)
+    assert told.clouds == Light.of(CLEAR, np.random.default_rng(0)).clouds

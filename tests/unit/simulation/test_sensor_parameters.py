@@ -4,14 +4,18 @@ from pathlib import Path
 import pytest
 
 from model_training.simulation.depth_noise import DEPTHS, DepthModel
+from model_training.simulation.exposure import RGBS, RgbModel
 from model_training.simulation.lidar import LIDARS, LidarModel
-from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
+from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters, RgbParameters
 from service.errors import DatasetError
 
 FORMATS = Path(__file__).parents[3] / "docs" / "formats.md"
 
 
-@pytest.mark.parametrize(("parameters", "model"), [(LidarParameters, LidarModel), (DepthParameters, DepthModel)])
+@pytest.mark.parametrize(
+    ("parameters", "model"),
+    [(LidarParameters, LidarModel), (RgbParameters, RgbModel), (DepthParameters, DepthModel)],
+)
 def test_every_number_of_a_sensor_can_be_set_and_is_documented(parameters, model):
     numbers = {field.name for field in fields(model)} - {"name"}
     assert set(parameters.model_fields) == numbers
@@ -20,11 +24,15 @@ def test_every_number_of_a_sensor_can_be_set_and_is_documented(parameters, model
 
 
 @pytest.mark.parametrize(
-    ("parameters", "presets"), [(LidarParameters, LIDARS), (DepthParameters, DEPTHS)], ids=["lidar", "depth"]
+    ("parameters", "presets"),
+    [(LidarParameters, LIDARS), (RgbParameters, RGBS), (DepthParameters, DEPTHS)],
+    ids=["lidar", "rgb", "depth"],
 )
 def test_every_preset_lies_within_the_bounds(parameters, presets):
     for name, preset in presets.items():
         numbers = {field.name: getattr(preset, field.name) for field in fields(preset) if field.name != "name"}
+        if numbers.get("fixed_gain"):
+            del numbers["most_gain"]  # would do nothing, and is refused
         assert parameters.model_validate(numbers).on(name) == preset
 
 
@@ -41,10 +49,11 @@ def test_only_what_is_given_is_written():
     ("parameters", "preset", "field"),
     [
         (LidarParameters(bottom_deg=15), "paper_32", "lidar.top_deg"),
+        (RgbParameters(most_gain=4), "fixed", "rgb.most_gain"),
         (DepthParameters(min_range_m=4, max_range_m=4), "ideal", "depth.max_range_m"),
     ],
 )
-def test_a_field_or_a_range_that_is_empty_is_refused(parameters, preset, field):
+def test_what_leaves_nothing_or_does_nothing_is_refused(parameters, preset, field):
     with pytest.raises(DatasetError, match=field) as refused:
         parameters.on(preset)
     assert refused.value.field == field
