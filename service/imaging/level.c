@@ -42,7 +42,7 @@ static void solve(double H[3][3], const double g[3], double s[3]) {
     }
 }
 
-/* R: level from camera, row by row; bands: how far a point may lie from the plane, metres and metres a metre, one pair a round;
+/* R: level from camera, row by row; bands: how far a point may lie from the plane, metres, metres a metre, share of it above; a round each;
  * out: slopes and offset. */
 void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, const double *R, const Ground *o,
                           const double *bands, int64_t rounds, Point *points, double *out) {
@@ -71,7 +71,8 @@ void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, co
         for (int64_t i = 0; i < count; i++) {
             const Point *q = points + i;
             const double off = q->z - (q->x * out[0] + q->y * out[1] + out[2]);
-            if (!(fabs(off) < bands[2 * k] + bands[2 * k + 1] * q->reach)) continue;
+            const double band = bands[3 * k] + bands[3 * k + 1] * q->reach;
+            if (!(off > -band && off < bands[3 * k + 2] * band)) continue;
             const double w = q->certainty, wx = w * q->x, wy = w * q->y;
             H[0][0] += wx * q->x;
             H[1][0] += wy * q->x;

@@ -82,6 +82,21 @@ def test_the_foot_of_a_wall_seven_metres_ahead_tilts_the_ground_by_a_degree_and_
     assert found.height_m == pytest.approx(1.5, abs=0.08)
 
 
+def street_depth(kerb_m):
+    """Depth of a road 10 m wide between pavements that stand a kerb higher, seen from 1.5 m above its middle."""
+    rays = CAMERA.rays_of_pixels()
+    down, aside = np.maximum(rays[..., 1], 1e-9), np.abs(rays[..., 0])
+    road, pavement = 1.5 / down, (1.5 - kerb_m) / down
+    z = np.where(aside * road < 5.0, road, np.where(aside * pavement < 5.0, 5.0 / np.maximum(aside, 1e-9), pavement))
+    return np.where((rays[..., 1] > 0) & (z < 40), z, 0).astype(np.float32)
+
+
+def test_pavements_beside_the_road_hardly_tilt_the_ground():
+    found = level_camera(street_depth(0.15), CAMERA, down_camera=None, nominal_height_m=1.5)
+    assert angle_deg(found.R_level_camera, R_BODY_OPTICAL) < 0.15  # degrees; 0.33 with one band for both sides
+    assert found.height_m == pytest.approx(1.5, abs=0.015)
+
+
 def test_depth_of_another_size_gives_the_same_level():
     R = tilted(pitch_deg=3, roll_deg=2)
     small = CAMERA.scaled_to(80, 60)
@@ -119,8 +134,9 @@ def plain_fit(depth_m, camera, R, height_m):
     design, z = np.column_stack([near[:, :2], np.ones(len(near))]), near[:, 2]
     reach = np.hypot(near[:, 0], near[:, 1])
     certainty = 1.0 / ((module.NOISE_M + module.NOISE_PER_M * reach) ** 2 * module.CORRELATED)
-    for band_m, band_slope in module.BANDS:
-        keep = np.abs(z - design @ solution) < band_m + band_slope * reach
+    for band_m, band_slope, above in module.BANDS:
+        off, band = z - design @ solution, band_m + band_slope * reach
+        keep = (off > -band) & (off < above * band)
         if not keep.any():
             break
         weighted = design * np.where(keep, certainty, 0.0)[:, None]
