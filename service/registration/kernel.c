@@ -233,7 +233,9 @@ static inline void tell(const Query *q, const Options *o, const State *s, double
         ratio = ratio > 2 ? 2 : ratio;
         const double along = sigma[k] * c;
         const double variance = along * along * ratio * ratio * ratio + surface2 + thickness[k] * thickness[k];
-        const double k2 = 4 * variance + robust2, damp = k2 / (k2 + r * r);
+        /* The weight is odd in the error of 1 / range by the third power, the robust kernel even in it by the second. */
+        const double even = along * along * ratio * ratio + surface2 + thickness[k] * thickness[k];
+        const double k2 = 4 * even + robust2, damp = k2 / (k2 + r * r);
         b->r[k] = r;
         b->w[k] = use * weight[k] * damp * damp / variance;
         b->known[k] = use;

@@ -115,3 +115,14 @@ def test_noise_that_is_even_in_inverse_range_draws_no_wall_nearer(
     bias = drawn_nearer_m(distance_m, error)
     assert bias > 0.01
     assert abs(too_far_ahead) < 0.05 * bias
+
+
+@pytest.mark.parametrize("distance_m", [2.5, 4.0, 5.0])
+def test_a_narrow_robust_kernel_damps_both_halves_of_the_noise_alike(wall, points_at, start_at, distance_m):
+    """Errors of 0.8 standard deviations: of larger ones a kernel that lets go chooses a half, which no symmetry forbids."""
+    start = start_at(np.eye(3), [0.01 - distance_m, 0, 0])
+    kernel = {"robust_first": 1e-3, "robust_last": 1e-3, "prior_weight": 1e-6}
+    options = SolverOptions(**(FREE | kernel), iterations=30, free_scale=False)
+    error = 0.8 * 0.02 * distance_m
+    align(*wall, seen_twice(points_at, distance_m, error), start, options)
+    assert abs(float(start["t"][0][0]) + distance_m) < 0.05 * drawn_nearer_m(distance_m, error)
