@@ -25,9 +25,9 @@ from service.registration.surfel_map import SurfelMap
 class SupportWeights:
     """What speaks for a candidate against its rivals, in nats: a conditional logit over the candidates of the watch cities' queries."""
 
-    inliers: float = 8.6
-    similarity: float = 97.0
-    likelihood: float = 2.3
+    inliers: float = 16.0
+    similarity: float = 87.0
+    likelihood: float = 2.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

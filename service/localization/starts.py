@@ -27,7 +27,7 @@ class StartSettings:
     """
 
     most: int = 32
-    less_similar: float = 0.05
+    less_similar: float = 0.1
     apart_m: float = 2.2
     apart_rad: float = float(np.deg2rad(20.0))
     temperature: float = 0.02

@@ -74,7 +74,8 @@ class Site(_Frozen):
     """What queries drawn from this map's own survey say of its confidence.
 
     ``offset``, never above 0, is added to the log odds: thresholds, which do not know of it, are then reached by fewer answers,
-    so their false-accept rates hold all the more.
+    so their false-accept rates hold all the more. ``expected_calibration_error`` is that of a single bin, the mean confidence against the
+    share that was right: more bins would hold too few of so few queries.
     """
 
     offset: float = Field(le=0)

@@ -52,7 +52,7 @@ class RegistrationSettings:
     kept_of_each: tuple[int, int] = (2, 5)
     middle_points: int = 400
     refined: int = 6
-    similarity_weight: float = 8.0
+    similarity_weight: float = 4.0
     apart_m: float = 0.5
     fine_weight: float = 1.0
     #: Surfaces count as rough at first, or what is near and well measured, mostly vehicles, would pull everything its way.
