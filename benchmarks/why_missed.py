@@ -75,7 +75,7 @@ WHY_MISSED: dict[str, str] = {
         "93 of 3,130 answers are in another place when forced; 138 are refused, 53 of them right"
     ),
     "doubt.covariance_95_coverage": (
-        "the worst of the four above; in calibration cities 6 % of the stereo answers are too good for their ellipsoid and 9 % too bad,"
+        "in calibration cities 6 % of the stereo answers are too good for their ellipsoid and 9 % too bad,"
         " so no factor for all mends it; tried: patches that disagree (helped), figures of the query, the spread of nearby candidates "
         "(widens right answers as much), factors by axis and noise fitted anew, the picture's level and the kernel's damping, whose "
         "bias was half of the pitch's (0.854 instead of 0.839 there, nothing here)"
