@@ -27,6 +27,8 @@ from service.maps.calibration import read_calibration
 RIGHT_M = 1.0
 #: Cities whose maps are built once more with every second street left out.
 PARTIAL = (0, 1, 2)
+#: Shares of strangers at which the curves of accepts are told.
+ACCEPTED = (0.0, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0)
 #: Draws one picture: depth (z, m, 0 for none) and grey.
 Picture = Callable[[np.random.Generator], tuple[NDArray[np.float64], NDArray[np.float64]]]
 FALSE_BARS = {("other_city", "precise"): 0.003, ("removed_streets", "precise"): 0.005,
@@ -125,11 +127,12 @@ def _false_rows(
 def curve(
     confidence: NDArray[np.float64], right: NDArray[np.bool_], negative: NDArray[np.float64]
 ) -> list[tuple[float, float]]:
-    """Share of the strangers that are accepted, and of the queries accepted and right, by falling confidence; 41 points."""
-    levels = np.quantile(confidence[right], np.linspace(1, 0, 41))
+    """Share of the strangers that are accepted at most, and of the queries accepted and right, for each of ``ACCEPTED``."""
+    falling = np.sort(negative)[::-1]
+    refused = [falling[int(share * len(falling) + 1e-9)] if share < 1 else -np.inf for share in ACCEPTED]
     return [
-        (round(float((negative >= level).mean()), 4), round(float((right & (confidence >= level)).mean()), 4))
-        for level in levels
+        (share, round(float((right & (confidence > level)).mean()), 4))
+        for share, level in zip(ACCEPTED, refused, strict=True)
     ]
 
 

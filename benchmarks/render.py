@@ -132,8 +132,8 @@ def _accepts(name: str, curves: dict[str, list[list[float]]]) -> Path:
             (kind, points) for kind, points in curves.items() if kind.endswith(f".{preset}")
         ):
             label = kind.removesuffix(f".{preset}").replace("_", " ")
-            axes.step([p[0] for p in points], [p[1] for p in points], where="post", label=label, color=f"C{number}")
-        axes.set(xlim=(0, 1), ylim=(0, 1.02), title=preset, xlabel="strangers accepted")
+            axes.plot([p[0] for p in points], [p[1] for p in points], label=label, color=f"C{number}")
+        axes.set(xlim=(0, 1), ylim=(0.5, 1.01), title=preset, xlabel="strangers accepted")
         axes.set_xscale("symlog", linthresh=0.01)
         axes.set_xticks([0, 0.01, 0.1, 1], ["0", "1 %", "10 %", "all"])
         axes.grid(alpha=0.3)

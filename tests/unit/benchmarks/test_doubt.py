@@ -122,10 +122,10 @@ def test_a_stereo_rig_invents_depth_where_there_is_none_and_errs_more(pictures):
     assert roughness(stereo["blank_wall"]) > 2 * roughness(pictures["blank_wall"])
 
 
-def test_the_curve_rises_from_nothing_to_all_true_answers():
+def test_the_curve_tells_how_many_true_answers_are_left_for_each_share_of_strangers():
     confidence, right = np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True])
-    points = curve(confidence, right, np.array([0.95, 0.1, 0.65, 0.2]))
-    assert len(points) == 41
-    assert points[0] == (0.25, 0.25)  # the surest true answer alone, and the one stranger who is surer
-    assert points[-1] == (0.5, 0.75)
-    assert points == sorted(points)
+    points = dict(curve(confidence, right, np.array([0.85, 0.1, 0.65, 0.2])))
+    assert points[0.0] == 0.25  # surer than every stranger is 0.9 alone
+    assert points[0.2] == 0.25  # a fifth of four strangers is none
+    assert points[0.5] == 0.75  # two of them let 0.6 pass, and 0.7, which is wrong
+    assert points[1.0] == 0.75
