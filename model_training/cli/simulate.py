@@ -114,6 +114,12 @@ def command(
         own = of_all | {"name": "survey_drive", "traversal": 0, "count": on_track, "on_track": True}
         # Without any drive nothing would take these three: the plan refuses them rather than pass them over.
         plans.append(QueryPlan.model_validate(own if plans else own | of_drives))
+    looks = {"rgb": None if rgb == "automatic" else rgb, "sun-elevation": sun_elevation, "sun-azimuth": sun_azimuth}
+    for option, value in looks.items():
+        if not plans and value is not None:
+            raise DatasetError(
+                f"{option}: without queries nothing takes pictures; ask for some, or leave it out", field=option
+            )
     if not plans and (depth_parameters, rgb_parameters) != (DepthParameters(), RgbParameters()):
         raise DatasetError(
             "set: without queries nothing takes pictures or measures depth; ask for some, or set numbers of lidar only",

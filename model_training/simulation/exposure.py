@@ -33,7 +33,7 @@ RGBS = {
     for m in (
         RgbModel("automatic"),
         RgbModel("small", most_gain=30.0, noise=3.0, noise_per_gain=1.0),  # a phone's or webcam's sensor
-        RgbModel("fixed", fixed_gain=0.8),  # set once for a clear day: bright streets burn out, night is black
+        RgbModel("fixed", fixed_gain=0.8),  # set once for a clear day: night is nearly black
     )
 }
 

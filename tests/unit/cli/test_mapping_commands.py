@@ -121,6 +121,8 @@ def test_simulate_refuses_a_number_that_no_sensor_can_take(
         (("--size", "0x400"), "size: 0 in '0x400' is not between 30 and 10000"),
         (("--size", "300xinf"), "size: inf in '300xinf' is not between"),
         (("--lidar", "none"), "lidar: 'none' is no preset"),
+        (("--queries", "0", "--rgb", "small"), "rgb: without queries nothing takes pictures"),
+        (("--queries", "0", "--sun-azimuth", "0"), "sun-azimuth: without queries nothing takes pictures"),
         (("--rgb", "none"), "rgb: 'none' is no preset; there are: automatic, small, fixed"),
         (
             ("--condition", "fog", "--sun-azimuth", "90"),
