@@ -1,14 +1,19 @@
-"""Ask calibration queries: of their own city's map, of another city's, of sparse ones, and of one that left some streets out."""
+"""Ask calibration queries: of their own city's map, of another's, of sparse ones, of one without some streets; and walls and rooms."""
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from model_training.calibration.fit import RIGHT_M, Asked
-from model_training.calibration.plans import SEQUENCE
+from model_training.calibration.plans import BOTH, SEQUENCE
+from model_training.calibration.strangers import KINDS, strangers
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.predict import Predictions, predict
+from service.errors import NoDepthError
+from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
+from service.localization.query import Query
+from service.maps.calibration import FEATURES
 
 Report = Callable[[str, int, int], None]
 
@@ -41,6 +46,32 @@ def where_streets_are_missing(
         found.append(_rows(asked_of(predictions, f"removed_streets.{preset_of(name)}", known=False), outside))
         found.append(_rows(both, ~outside))
     return found
+
+
+def walls_and_rooms(
+    localizer: Localizer, camera: PinholeCamera, seed: int, report: Report, *, count: int = 100
+) -> list[Asked]:
+    """Pictures of what is in no map, so many of each kind and depth preset."""
+    found = []
+    for number, kind in enumerate(KINDS):
+        for preset in BOTH:
+            rng = np.random.default_rng([seed, number, BOTH.index(preset)])
+            evidence = np.full((count, len(FEATURES)), np.nan)
+            for k, query in enumerate(strangers(kind, camera, preset, count, rng)):
+                evidence[k] = _evidence(localizer, query)
+                report(f"strangers {kind}_{preset}", k + 1, count)
+            nowhere = np.zeros(count, bool)
+            found.append(Asked(evidence, nowhere, nowhere, np.full(count, f"{kind}.{preset}")))
+    return found
+
+
+def _evidence(localizer: Localizer, query: Query) -> np.ndarray | float:
+    """NaN where nothing was registered."""
+    try:
+        evidence = localizer.localize(query).evidence
+    except NoDepthError:
+        return np.nan
+    return np.nan if evidence is None else evidence
 
 
 def _predicted(localizer: Localizer, dataset: Dataset, name: str, report: Report) -> Predictions:

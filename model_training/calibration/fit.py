@@ -14,12 +14,13 @@ from service.maps.calibration import (
     Threshold,
     expanded,
     probability,
+    terms,
 )
 
 RIGHT_M = 1.0
 RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
 #: Strength of the ridge, in queries; the one that lost least when each city was predicted from the other.
-RIDGE = 3.0
+RIDGE = 10.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def _logistic(
     spread: NDArray[np.float64], ridge: float, *, without: tuple[str, ...] = (),
 ) -> Logistic:  # fmt: skip
     wide = expanded(evidence, tuple(mean), tuple(spread))
-    silent = np.tile([name in without for name in FEATURES], 3)
+    silent = [any(FEATURES[k] in without for k in term) for term in terms(len(FEATURES))]
     wide[:, silent] = 0.0
     design = np.c_[wide, np.ones(len(wide))]
     penalty = np.r_[np.full(wide.shape[1], ridge), 1e-6]

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.calibration.collect import in_the_map, of_another_city, where_streets_are_missing
+from model_training.calibration.collect import in_the_map, of_another_city, walls_and_rooms, where_streets_are_missing
 from model_training.calibration.fit import Asked, expected_calibration_error, fit, pooled
 from model_training.calibration.plans import CITIES, calibration_plan, repeating_plan
+from model_training.calibration.strangers import KINDS
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.without_streets import WithoutStreets
 from model_training.mapping.build import BuildSettings, build_map
@@ -21,6 +22,8 @@ from service.maps.reader import MapBundle
 CLEAR_SETS = ("clear_precise", "clear_stereo")
 #: Distance of a map's places; and of a sparse survey's, whose queries look less alike, and must not be taken for strangers.
 PLACES_M, SPARSE_M = 1.0, 5.0
+#: Kinds of queries that are in no map, but for their depth preset.
+STRANGERS = ("other_city", "removed_streets", *KINDS)
 Report = Callable[[str, int, int], None]
 
 
@@ -77,7 +80,7 @@ def _sparse(work: Path, encoder: Path, dataset: Dataset, report: Report) -> Loca
 
 
 def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew: bool, report: Report) -> Asked:
-    """All queries of one city: of its map, of the next city's, of sparse ones of both, of its map with a third of the streets left out."""
+    """One city: its queries of its map, the next city's, sparse ones of both, its own without a third of the streets; walls and rooms."""
     return _kept(work, encoder, cities[index], lambda: _ask(work, encoder, cities, index, report), anew=anew)
 
 
@@ -104,6 +107,9 @@ def _ask(work: Path, encoder: Path, cities: list[Dataset], index: int, report: R
     own, other = cities[index], cities[(index + 1) % len(cities)]
     partial = WithoutStreets(own.folder)
     found = in_the_map(_localizer(work, encoder, own, own.name, report), own, report)
+    found += walls_and_rooms(
+        _localizer(work, encoder, own, own.name, report), own.description.sensors.cameras[0].pinhole(), index, report
+    )
     found += of_another_city(_localizer(work, encoder, other, other.name, report), own, report)
     found += in_the_map(_sparse(work, encoder, own, report), own, report, CLEAR_SETS)
     found += of_another_city(_sparse(work, encoder, other, report), own, report, CLEAR_SETS)
@@ -124,7 +130,7 @@ def cross_checks(parts: list[Asked], alike: Asked) -> list[str]:
             accepted = np.quantile(confidence[inside], 0.05)
             shares = (
                 f"{kind} {np.mean(confidence[held_out.kind == f'{kind}.{preset}'] >= accepted):.4f}"
-                for kind in ("other_city", "removed_streets")
+                for kind in STRANGERS
             )
             lines.append(f"  {preset}: false accepts at 95 % of the true ones: {', '.join(shares)}")
     return lines

@@ -191,7 +191,7 @@ class SequenceRequest(_Strict):
 
 
 class Street(BaseModel):
-    """The street under the registered position; without registration the one that the nearest places voted for."""
+    """The street under the registered position; without registration that of the heaviest cluster of similar places."""
 
     id: str
     name: str = Field(examples=["End of street 4"])

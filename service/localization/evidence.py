@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+from service.imaging.shape import shape_of
+from service.imaging.view_grid import ViewGrid
 from service.localization.frames import Frame
 from service.localization.hypotheses import Hypothesis
 from service.localization.refine import Candidate, Refined
@@ -14,6 +16,7 @@ from service.maps.calibration import FEATURES
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
 #: Another place, for the margin of similarity; votes within VOTE_M of the answer count for it.
 OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
+_NEAREST = 5  # neighbours whose poses are to agree
 _MOST_MARGIN = 12.0  # nats; where there is no rival at all, too
 _MOST_PLACE_M = 10.0
 
@@ -24,6 +27,7 @@ def evidence_of(
     neighbours: tuple[Neighbour, ...],
     hypotheses: tuple[Hypothesis, ...],
     places_m: Float64[NDArray[np.float64], "P 2"],
+    grid: ViewGrid,
 ) -> Float64[NDArray[np.float64], " F"]:
     """One number for each of ``service.maps.calibration.FEATURES``.
 
@@ -33,8 +37,11 @@ def evidence_of(
         neighbours: distinct places, the most similar first; those of the reference.
         hypotheses: clusters of the reference's most similar views.
         places_m: x, y of all places of the map.
+        grid: the map's view grid.
     """
     best, reference = refined.best, frames[0]
+    ahead = int(np.argmin(np.abs(reference.views.turns_rad)))
+    shape = shape_of(reference.views.planes[ahead, 0], grid)
     xy = best.T_map_camera[:2, 3]
     away = np.array([np.hypot(*(place.position_m[:2] - xy)) for place in neighbours])
     similarities = np.array([place.similarity for place in neighbours])
@@ -56,14 +63,25 @@ def evidence_of(
         "unmapped": best.agreement.unmapped,
         "log_sigma": float(np.log(sigma_m)),
         "scale": abs(float(np.log(best.registered.scale))) / 0.01,
+        "residual": float(np.log(refined.disagreement)),
         "votes": float((away[:VOTERS] < VOTE_M).sum()) / there,
+        "pose_spread": _spread(neighbours[:_NEAREST]),
         "entropy": float(-(weights * np.log(np.maximum(weights, 1e-12))).sum()),
         "log_noise": float(np.log(np.median([frame.noise for frame in frames]))),
         "points": refined.points / 3000.0 / len(frames),
         "measured": reference.views.measured_share,
         "place_m": min(best.place_m, _MOST_PLACE_M),
+        "facings": shape.facings,
+        "far": shape.far,
+        "edges": shape.edges,
     }
     return np.array([found[name] for name in FEATURES])
+
+
+def _spread(neighbours: tuple[Neighbour, ...]) -> float:
+    """How far the most similar places stand from their middle: logarithm of the root mean square (m), of 0.1 m at least."""
+    xy = np.array([place.position_m[:2] for place in neighbours])
+    return float(np.log(np.sqrt(xy.var(axis=0).sum()) + 0.1))
 
 
 def _margin(candidates: tuple[Candidate, ...]) -> float:

@@ -15,11 +15,10 @@ from service.localization.encoder import Encoder, Provider
 from service.localization.evidence import evidence_of
 from service.localization.frames import Frame
 from service.localization.hypotheses import ClusterSettings, Hypothesis, believed, cluster
-from service.localization.prior import Prior
 from service.localization.query import Query
 from service.localization.refine import RefineSettings, refine
 from service.localization.search import distinct_places, search_views
-from service.localization.street_vote import StreetVote, vote
+from service.localization.street_vote import vote
 from service.maps.reader import MapBundle
 from service.registration.points import inverse_depth_noise
 
@@ -142,7 +141,9 @@ class Localizer:
             evidence = (
                 None
                 if refined is None
-                else evidence_of(frames, refined, neighbours, hypotheses, self.bundle.T_map_place[:, :2, 3])
+                else evidence_of(
+                    frames, refined, neighbours, hypotheses, self.bundle.T_map_place[:, :2, 3], self.bundle.grid
+                )
             )
         decision = None
         if registers and self.bundle.calibration is not None:
@@ -155,7 +156,7 @@ class Localizer:
         return Answer(
             status="LOCALIZED" if decision is None else decision.status,
             confidence=None if decision is None else decision.confidence,
-            street=self._street_of(T_map_camera, streets, hypotheses[0], query.prior, registered=refined is not None),
+            street=self._street_of(T_map_camera, hypotheses[0], registered=refined is not None),
             vote=streets,
             T_map_camera=T_map_camera,
             covariance=None if refined is None else refined.covariance,
@@ -187,15 +188,14 @@ class Localizer:
                 field="options.false_accept_rate",
             )
 
-    def _street_of(
-        self, T_map_camera: Transform, voted: StreetVote | None, heaviest: Hypothesis, prior: Prior | None, *, registered: bool
-    ) -> int:  # fmt: skip
-        """A metric position says which street it lies in; a cluster of places does not know better than their vote, unless by a prior."""
-        if self.bundle.streets is None or voted is None:
+    def _street_of(self, T_map_camera: Transform, heaviest: Hypothesis, *, registered: bool) -> int:
+        """A metric position says which street it lies in; without one it is that of the heaviest cluster, which never spans two.
+
+        The vote of the nearest places crosses a street's border more often (decision log).
+        """
+        if self.bundle.streets is None:
             return -1
-        if registered:
-            return self.bundle.streets.index_at(T_map_camera[:2, 3])
-        return voted.street if prior is None else heaviest.street
+        return self.bundle.streets.index_at(T_map_camera[:2, 3]) if registered else heaviest.street
 
     def _pose_of(self, hypothesis: Hypothesis, view: QueryViews) -> Transform:
         """The camera stands at the hypothesis, at its own height above the ground under the places' LiDAR."""

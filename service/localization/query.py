@@ -11,8 +11,8 @@ from service.geometry.rigid import Transform
 from service.localization.prior import Prior
 
 MOST_NEIGHBOURS = 50
-#: Of calibration's strangers, whatever their kind; at this rate an answer is accepted that is about as likely right as not.
-FALSE_ACCEPT_RATE = 0.03
+#: Of calibration's strangers, every kind weighing alike (decision log).
+FALSE_ACCEPT_RATE = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -17,7 +17,7 @@ from service.registration.kernel import QueryPoints
 from service.registration.points import PointSettings, points_of
 from service.registration.register import Registered, RegistrationSettings, register
 from service.registration.rendered import Agreement, Seen, agreement, seen_by
-from service.registration.scatter import scatter_of
+from service.registration.scatter import disagreement, scatter_of
 from service.registration.surfel_map import SurfelMap
 
 
@@ -86,11 +86,19 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refined:
-    """Candidates, the best supported first, its covariance (6 x 6, translation first, map axes, about the camera), points used."""
+    """What registration found.
+
+    Attributes:
+        candidates: the best supported first.
+        covariance: of the best, translation first, map axes, about the camera.
+        points: that were used.
+        disagreement: how many times more than their noise says the picture's patches disagree about the best pose, as a variance.
+    """
 
     candidates: tuple[Candidate, ...]
     covariance: Float64[NDArray[np.float64], "6 6"]
     points: int
+    disagreement: float
 
     @property
     def best(self) -> Candidate:
@@ -130,7 +138,8 @@ def refine(
     candidates.sort(key=lambda candidate: -candidate.support)
     best = candidates[0].registered
     scatter = scatter_of(cloud, merged, best, settings.registration)
-    return Refined(tuple(candidates), covariance_of(best.information, scatter, noise), len(merged))
+    covariance = covariance_of(best.information, scatter, noise)
+    return Refined(tuple(candidates), covariance, len(merged), disagreement(best.information, scatter))
 
 
 def _points(frame: Frame, settings: RefineSettings) -> QueryPoints:

@@ -1,6 +1,7 @@
 """``calibration.json``: from the evidence of an answer to the probability that it is right; what it was measured on."""
 
 import json
+from functools import cache
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -14,10 +15,10 @@ from service.errors import BundleError
 FEATURES = (
     "margin", "inliers", "similarity", "similarity_margin", "likelihood", "through", "front", "unmapped", "log_sigma", "scale", "votes",
     "entropy", "log_noise", "points", "measured", "place_m",
+    "facings", "far", "edges", "residual", "pose_spread",
 )  # fmt: skip
 #: The features that say what rivals there are; whether the place is in the map at all does not depend on them.
-RIVALRY = ("margin", "similarity_margin", "votes", "entropy")
-_NOISE = FEATURES.index("log_noise")
+RIVALRY = ("margin", "similarity_margin", "votes", "entropy", "pose_spread")
 _CLIP = 4.0  # standard deviations: no feature may run further away than calibration has seen
 
 
@@ -26,12 +27,12 @@ class _Frozen(BaseModel):
 
 
 class Logistic(_Frozen):
-    """Logistic regression over features, their squares, and their products with the depth's noise.
+    """Logistic regression over features and all their products by two, squares among them.
 
     Attributes:
         mean: of each feature; what features are told from.
         spread: standard deviation of each, the unit they are told in.
-        weights: of the features, of their squares, of their products with ``log_noise``; three times as many.
+        weights: of the features, then of their products, in the order of ``terms``.
         bias: log odds where all features are at their means.
     """
 
@@ -43,8 +44,8 @@ class Logistic(_Frozen):
     @model_validator(mode="after")
     def _lengths(self) -> "Logistic":
         count = len(FEATURES)
-        if (len(self.mean), len(self.spread), len(self.weights)) != (count, count, 3 * count):
-            raise ValueError(f"mean and spread need {count} numbers, weights {3 * count}")
+        if (len(self.mean), len(self.spread), len(self.weights)) != (count, count, len(terms(count))):
+            raise ValueError(f"mean and spread need {count} numbers, weights {len(terms(count))}")
         if min(self.spread) <= 0:
             raise ValueError("spread must be positive")
         return self
@@ -56,11 +57,18 @@ class Logistic(_Frozen):
 
 def expanded(
     evidence: Float64[NDArray[np.float64], "*n F"], mean: tuple[float, ...], spread: tuple[float, ...]
-) -> Float64[NDArray[np.float64], "*n 3*F"]:
-    """Features in their units, their squares, and their products with the noise."""
+) -> Float64[NDArray[np.float64], "*n T"]:
+    """Features in their units, and their products by two, in the order of ``terms``."""
     z = np.clip((evidence - np.array(mean)) / np.array(spread), -_CLIP, _CLIP)
-    wide: Float64[NDArray[np.float64], "*n 3*F"] = np.concatenate([z, z * z, z * z[..., _NOISE, None]], axis=-1)
+    one, other = np.triu_indices(z.shape[-1])
+    wide: Float64[NDArray[np.float64], "*n T"] = np.concatenate([z, z[..., one] * z[..., other]], axis=-1)
     return wide
+
+
+@cache
+def terms(count: int) -> tuple[tuple[int, ...], ...]:
+    """What ``expanded`` makes of so many features: which of them each term is a product of."""
+    return (*((k,) for k in range(count)), *((j, k) for j in range(count) for k in range(j, count)))
 
 
 class Threshold(_Frozen):

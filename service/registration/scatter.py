@@ -11,6 +11,9 @@ from service.registration.surfel_map import SurfelMap
 #: Width of a patch. Within one, points err together: noise of matching hangs together over 16 to 60 pixels of 640, a parked car
 #: that was not there is as wide. Of 0.05, 0.1, 0.2 and 0.3, watch cities.
 PATCH_RAD = 0.2
+#: Of a direction's information, every unknown in units of its own; less is next to none (a wall's distance against the scale: 4e-6).
+_TOLD = 1e-4
+_LEAST = 1e-6  # disagreement; its logarithm is evidence
 
 
 def scatter_of(
@@ -34,6 +37,22 @@ def scatter_of(
     each = pulls(cloud.grid, cloud.surfels, weighed, state, settings.fine, patches(points.ray))
     scatter: Float64[NDArray[np.float64], "8 8"] = each.T @ each * (len(each) / max(len(each) - UNKNOWNS, 1))
     return scatter
+
+
+def disagreement(
+    information: Float64[NDArray[np.float64], "8 8"], scatter: Float64[NDArray[np.float64], "8 8"]
+) -> float:
+    """The residual of a pose: mean ratio of ``scatter_of`` to the points' information; 1 where their noise explains it all.
+
+    In directions that no point tells anything of there is nothing to disagree about, so they do not count.
+    """
+    sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    strength, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
+    told = strength > _TOLD
+    if not told.any():
+        return 1.0
+    seen = np.einsum("ik,ij,jk->k", axes[:, told], scatter / np.outer(sizes, sizes), axes[:, told])
+    return max(float(np.mean(seen / strength[told])), _LEAST)
 
 
 def patches(ray: Float32[NDArray[np.float32], "n 3"]) -> Int32[NDArray[np.int32], " n"]:

@@ -13,10 +13,11 @@ from model_training.mapping.voxel_map import VoxelMap
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
 from service.imaging.query_view import QueryViews
+from service.imaging.view_grid import ViewGrid
 from service.localization.frames import Frame
 from service.localization.query import Query
 from service.localization.search import ViewMatches
-from service.maps.calibration import FEATURES, Calibration
+from service.maps.calibration import FEATURES, Calibration, terms
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
@@ -44,9 +45,8 @@ def frame_of(
     depth_m = np.zeros((camera.height, camera.width), np.float32) if depth_m is None else depth_m
     query = Query(rgb=np.zeros((*depth_m.shape, 3), np.uint8), depth_m=depth_m, camera=camera)
     turned = np.array(descriptors, np.float32)
-    views = QueryViews(
-        np.zeros((len(turned), 6, 2, 2), np.float32), (0.0,) * len(turned), np.array(R_level_camera), height_m, 0.75
-    )
+    planes = np.zeros((len(turned), 6, ViewGrid().rows, ViewGrid().columns), np.float32)
+    views = QueryViews(planes, (0.0,) * len(turned), np.array(R_level_camera), height_m, 0.75)
     T = np.eye(4) if T_reference_camera is None else T_reference_camera
     return Frame(query, T, views, turned, matches, noise)
 
@@ -54,7 +54,7 @@ def frame_of(
 def calibration_document(**changed: Any) -> dict[str, Any]:
     """A good ``calibration.json``: whatever the evidence, it is right at even odds and in the map three times in four."""
     count = len(FEATURES)
-    flat = {"mean": [0.0] * count, "spread": [1.0] * count, "weights": [0.0] * (3 * count)}
+    flat = {"mean": [0.0] * count, "spread": [1.0] * count, "weights": [0.0] * len(terms(count))}
     document = {
         "calibrated": True, "features": list(FEATURES), "right": flat | {"bias": 0.0}, "known": flat | {"bias": float(np.log(3.0))},
         "thresholds": [{"false_accept_rate": 0.001, "confidence": 0.9}, {"false_accept_rate": 0.01, "confidence": 0.4}],

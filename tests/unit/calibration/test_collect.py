@@ -1,9 +1,13 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from model_training.calibration import collect
-from model_training.calibration.collect import asked_of, in_the_map, of_another_city, preset_of
+from model_training.calibration.collect import asked_of, in_the_map, of_another_city, preset_of, walls_and_rooms
 from model_training.evaluation.predict import RANKED, Predictions
+from service.errors import NoDepthError
+from service.geometry.camera import PinholeCamera
 from service.maps.calibration import FEATURES
 
 
@@ -87,3 +91,42 @@ def test_sets_of_the_maps_own_city_keep_their_names_and_those_of_another_only_th
     assert [set(each.kind.tolist()) for each in other] == [{"other_city.precise"}, {"other_city.stereo"}]
     assert all(each.known.all() and each.right.all() for each in own)
     assert not any(each.known.any() or each.right.any() for each in other)
+
+
+class Wherever:
+    """Registers two pictures of three, refuses every fourth."""
+
+    def __init__(self):
+        self.asked = []
+
+    def localize(self, query):
+        self.asked.append(query)
+        number = len(self.asked) - 1
+        if number % 4 == 3:
+            raise NoDepthError("nothing", field="depth")
+        return SimpleNamespace(evidence=None if number % 4 == 1 else np.full(len(FEATURES), float(number)))
+
+
+def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
+    localizer, told = Wherever(), []
+    camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
+    found = walls_and_rooms(localizer, camera, 3, lambda *told_of: told.append(told_of), count=4)
+    assert [set(each.kind.tolist()) for each in found] == [
+        {"wall.precise"}, {"wall.stereo"}, {"room.precise"}, {"room.stereo"},
+    ]  # fmt: skip
+    assert not any(each.known.any() or each.right.any() for each in found)
+    for part, each in enumerate(found):
+        rows = each.evidence[:, 0]
+        np.testing.assert_array_equal(rows, [4 * part, np.nan, 4 * part + 2, np.nan])
+    assert told[3] == ("strangers wall_precise", 4, 4)
+    assert len(told) == len(localizer.asked) == 16
+
+
+def test_every_city_draws_walls_and_rooms_of_its_own():
+    def first(seed):
+        localizer = Wherever()
+        walls_and_rooms(localizer, PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5), seed, lambda *_: None, count=1)
+        return np.concatenate([query.depth_m for query in localizer.asked])
+
+    np.testing.assert_array_equal(first(1), first(1))
+    assert not np.array_equal(first(1), first(2))

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.localization.decide import decide
-from service.maps.calibration import FEATURES
+from service.maps.calibration import FEATURES, terms
 
 
 def odds(p):
@@ -16,7 +16,7 @@ def decided(calibration_json, calibration_of):
     """What is made of a first feature whose size is the log odds of being right, and of whether the place is known."""
 
     def made(right, known=0.5, rate=0.01, **changed):
-        first = np.eye(1, 3 * len(FEATURES))[0].tolist()
+        first = np.eye(1, len(terms(len(FEATURES))))[0].tolist()
         good = calibration_json()
         calibration = calibration_of(
             right=good["right"] | {"weights": first}, known=good["known"] | {"bias": odds(known)}, **changed

@@ -6,6 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
+from service.imaging.shape import shape_of
+from service.imaging.view_grid import ViewGrid
 from service.localization.evidence import evidence_of, is_rival
 from service.localization.hypotheses import Hypothesis
 from service.localization.refine import Candidate, Refined
@@ -22,8 +24,8 @@ def candidate(support=0.0, *, xyz=(0.0, 0.0, 1.5), heading_deg=0.0, scale=1.0):
     return Candidate(T_map_camera, registered, 0.8, 1.5, Agreement(-1.5, 0.02, 0.2, 0.1), support)
 
 
-def refined(*candidates, covariance=None, points=1500):
-    return Refined(candidates, np.eye(6) if covariance is None else covariance, points)
+def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
+    return Refined(candidates, np.eye(6) if covariance is None else covariance, points, disagreement)
 
 
 def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):
@@ -48,7 +50,7 @@ def weighed(frame):
         there = np.array(places or [each.position_m[:2] for each in neighbours], np.float64)
         found = evidence_of(
             frames or (frame,), refined(*(candidates or [candidate()]), **options), tuple(neighbours),
-            tuple(hypothesis(weight) for weight in weights), there,
+            tuple(hypothesis(weight) for weight in weights), there, ViewGrid(),
         )  # fmt: skip
         assert found.shape == (len(FEATURES),)
         return dict(zip(FEATURES, found.tolist(), strict=True))
@@ -194,3 +196,34 @@ def test_margins_of_several_frames_count_by_the_root_of_their_number(weighed, fr
     assert one["margin"] == pytest.approx(3.0)
     assert four["margin"] == pytest.approx(6.0)
     assert four["similarity_margin"] == pytest.approx(2 * one["similarity_margin"])
+
+
+def test_the_shape_is_that_of_the_view_straight_ahead(frame, weighed):
+    """Of three turns the middle one: a wall 6 m ahead with a post, whatever the others show."""
+    planes = np.zeros((3, 6, ViewGrid().rows, ViewGrid().columns), np.float32)
+    planes[1, 0] = 6.0
+    planes[1, 0, :, 40:44] = 3.0
+    views = replace(frame.views, planes=planes, turns_rad=(-0.09, 0.0, 0.09))
+    found = weighed(frames=(replace(frame, views=views),))
+    assert found["far"] == pytest.approx(np.log(6.0))
+    assert found["edges"] == pytest.approx(2 / 127)
+    assert found["facings"] == pytest.approx(shape_of(planes[1, 0], ViewGrid()).facings)
+
+
+def test_the_residual_is_the_logarithm_of_the_patches_disagreement(weighed):
+    assert weighed(disagreement=np.e**2)["residual"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "expected"),
+    [
+        ((0, 0, 0, 0, 0), 0.1),
+        ((3,), 0.1),
+        ((-5, 5), 5.1),
+        ((0, 0, 0, 0, 10), 4.1),  # variance 16
+        ((0, 0, 0, 0, 0, 1000), 0.1),  # the sixth does not count
+    ],
+)
+def test_the_spread_is_that_of_the_five_most_similar_places(weighed, x_m, expected):
+    found = weighed(neighbours=[neighbour(x) for x in x_m])
+    assert found["pose_spread"] == pytest.approx(np.log(expected))

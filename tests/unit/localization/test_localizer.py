@@ -15,6 +15,7 @@ from service.localization.localizer import Localizer
 from service.localization.prior import Prior
 from service.localization.query import Query
 from service.localization.search import distinct_places, search_views
+from service.localization.street_vote import StreetVote
 from service.maps.calibration import FEATURES
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
@@ -53,8 +54,7 @@ def test_without_registration_the_pose_stands_at_the_place_at_the_cameras_own_he
         None,
         0.0,
     )
-    assert answer.vote is not None
-    assert answer.street == answer.vote.street
+    assert answer.street == answer.hypotheses[0].street == 2
     # The place's LiDAR is at (20, 100, 2), 1.8 m above the ground; the camera 1.5 m.
     np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, 100, 0.2 + answer.height_m], atol=0.05)
     assert answer.height_m == pytest.approx(1.5, abs=0.05)
@@ -81,6 +81,17 @@ def test_a_registered_position_says_which_street_it_lies_in(
     localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
     registered, voted = (localizer.localize(replace(query, refine=refine)) for refine in (True, False))
     assert (registered.street, voted.street) == (2, 0)
+
+
+def test_without_registration_the_heaviest_cluster_says_the_street_whatever_the_places_vote(
+    localizer: Localizer, query: Query, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Places on both sides of a street's border vote across it; a cluster lies on one side."""
+    outvoted = StreetVote(street=1, share=0.6, shares=((1, 0.6), (2, 0.4)))
+    monkeypatch.setattr("service.localization.localizer.vote", lambda *_: outvoted)
+    answer = localizer.localize(replace(query, refine=False))
+    assert answer.vote is outvoted
+    assert answer.street == answer.hypotheses[0].street == 2
 
 
 def test_a_map_without_a_cloud_answers_by_retrieval(

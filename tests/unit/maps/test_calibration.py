@@ -6,10 +6,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import BundleError
-from service.maps.calibration import FEATURES, RIVALRY, Calibration, Logistic, expanded, probability, read_calibration
+from service.maps.calibration import (
+    FEATURES,
+    RIVALRY,
+    Calibration,
+    Logistic,
+    expanded,
+    probability,
+    read_calibration,
+    terms,
+)
 from service.maps.content import UNCALIBRATED
 
 COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
+TERMS = COUNT + COUNT * (COUNT + 1) // 2
 PATH = "maps/town/calibration.json"
 SITE = {"offset": -1.0, "queries": 200, "right": 150, "expected_calibration_error": 0.02}
 
@@ -42,7 +52,7 @@ def test_what_is_written_is_read_again(document):
     for name in ("right", "known"):
         document[name] = {
             "mean": rng.normal(size=COUNT).tolist(), "spread": rng.uniform(0.1, 9, COUNT).tolist(),
-            "weights": rng.normal(size=3 * COUNT).tolist(), "bias": float(rng.normal()),
+            "weights": rng.normal(size=TERMS).tolist(), "bias": float(rng.normal()),
         }  # fmt: skip
     document["site"] = SITE
     calibration = read(document)
@@ -90,7 +100,7 @@ def test_a_calibration_without_thresholds_is_refused(document):
 @pytest.mark.parametrize("part", ["right", "known"])
 def test_a_regression_of_another_length_is_refused(document, part, name, length):
     document[part][name] = [1.0] * length
-    refused(document, f"{part}: .*mean and spread need {COUNT} numbers, weights {3 * COUNT}")
+    refused(document, f"{part}: .*mean and spread need {COUNT} numbers, weights {TERMS}")
 
 
 @pytest.mark.parametrize("spread", [0.0, -1.0])
@@ -125,14 +135,20 @@ def test_numbers_that_are_none_are_refused(document, number):
     refused(json.dumps(document).replace("123456.0", number).encode(), "")
 
 
-def test_features_enter_in_their_spreads_squared_and_times_the_noise():
-    """One deviation of the noise up, three of feature 0 down, half a one of feature 2 up."""
-    mean, spread = np.arange(COUNT, dtype=np.float64), np.full(COUNT, 2.0)
-    z = one_hot(COUNT, _0=-3.0, _2=0.5) + one_hot(COUNT, **{f"_{NOISE}": 1.0})
-    found = expanded(mean + 2 * z, tuple(mean), tuple(spread))
-    np.testing.assert_allclose(found[:COUNT], z)
-    np.testing.assert_allclose(found[COUNT : 2 * COUNT], z**2)
-    np.testing.assert_allclose(found[2 * COUNT :], z)  # times one
+def test_features_enter_in_their_spreads_and_multiplied_by_two():
+    """Of three features, each 7 at its mean and 2 a deviation: one, minus three and a half deviations."""
+    found = expanded(np.array([9.0, 1.0, 8.0]), (7.0, 7.0, 7.0), (2.0, 2.0, 2.0))
+    assert terms(3) == ((0,), (1,), (2,), (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    np.testing.assert_allclose(found, [1, -3, 0.5, 1, -3, 0.5, 9, -1.5, 0.25])
+
+
+@pytest.mark.parametrize("count", [1, 4, COUNT])
+def test_every_term_is_the_product_of_the_features_that_it_names(count):
+    evidence = np.random.default_rng(count).uniform(-2, 2, (5, count))
+    found = expanded(evidence, (0.0,) * count, (1.0,) * count)
+    named = np.stack([evidence[:, list(term)].prod(axis=1) for term in terms(count)], axis=1)
+    np.testing.assert_allclose(found, named)
+    assert len(set(terms(count))) == count + count * (count + 1) // 2
 
 
 @pytest.mark.parametrize(
@@ -150,7 +166,8 @@ def test_features_enter_in_their_spreads_squared_and_times_the_noise():
 )
 def test_log_odds_by_hand(margin, noise, expected):
     """The margin has weight 10, its square 100, its product with the noise 1000; a deviation is 4 units above 7."""
-    weights = one_hot(3 * COUNT, **{"_0": 10.0, f"_{COUNT}": 100.0, f"_{2 * COUNT}": 1000.0})
+    square, product = terms(COUNT).index((0, 0)), terms(COUNT).index((0, NOISE))
+    weights = one_hot(TERMS, **{"_0": 10.0, f"_{square}": 100.0, f"_{product}": 1000.0})
     mean, spread = one_hot(COUNT, _0=7.0), np.ones(COUNT) + one_hot(COUNT, _0=3.0)
     logistic = Logistic(mean=tuple(mean), spread=tuple(spread), weights=tuple(weights), bias=0.5)
     evidence = one_hot(COUNT, _0=7.0 + 4.0 * margin) + one_hot(COUNT, **{f"_{NOISE}": noise})
@@ -192,7 +209,7 @@ def test_many_answers_get_the_confidence_that_each_gets_alone(calibration_of, se
     rng = np.random.default_rng(seed)
     right = {
         "mean": rng.normal(size=COUNT).tolist(), "spread": rng.uniform(0.5, 2, COUNT).tolist(),
-        "weights": (0.3 * rng.normal(size=3 * COUNT)).tolist(), "bias": 0.1,
+        "weights": (0.1 * rng.normal(size=TERMS)).tolist(), "bias": 0.1,
     }  # fmt: skip
     calibration, evidence = calibration_of(right=right), rng.normal(size=(count, COUNT))
     together = calibration.confidence(evidence)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from service.registration.kernel import align, pulls
 from service.registration.register import Registered, RegistrationSettings
-from service.registration.scatter import PATCH_RAD, patches, scatter_of
+from service.registration.scatter import PATCH_RAD, disagreement, patches, scatter_of
 from service.registration.surfel_map import SurfelMap
 
 ORIGIN = np.array([500.0, -300.0, 40.0])
@@ -221,3 +221,20 @@ def test_points_that_err_together_scatter_as_often_more_as_a_patch_has_of_them(m
     assert len(fan) / (patches(fan).max() + 1) == 25
     found, expected = (in_units_of(information, each) for each in (mean_scatter(patchwise=True), information))
     np.testing.assert_allclose(np.diag(found), 25 * np.diag(expected), rtol=0.15)
+
+
+@pytest.mark.parametrize(("patchwise", "expected"), [(False, 1.0), (True, 25.0)])
+def test_disagreement_is_how_many_times_more_the_patches_scatter_than_points_would(
+    mean_scatter, information, patchwise, expected
+):
+    """Of a wall ahead half of the unknowns are told nothing of; they do not count."""
+    assert disagreement(information, mean_scatter(patchwise=patchwise)) == pytest.approx(expected, rel=0.2)
+
+
+def test_disagreement_by_hand_in_any_units():
+    """Two unknowns, one scattering twice as much as it should, one four times: three; the rest is not told."""
+    information = np.diag([4.0, 1e-4, 0, 0, 0, 0, 0, 0])
+    scatter = np.diag([8.0, 4e-4, 0, 0, 0, 0, 0, 9.0])
+    assert disagreement(information, scatter) == pytest.approx(3.0)
+    assert disagreement(np.zeros((8, 8)), scatter) == 1.0
+    assert disagreement(information, np.zeros((8, 8))) > 0  # its logarithm is a feature

@@ -1,0 +1,127 @@
+"""Places that are in no map: plain walls near by, and rooms. Drawn of boxes, since no city of the simulator has their like.
+
+A city's own strangers (another city, streets that the map lacks) are as rich in shape as its queries. What is flat fits anywhere
+in a city along its façades, so it has to be asked for by itself. The evaluation draws its own walls and rooms (``benchmarks``).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model_training.simulation.conditions import CONDITIONS
+from model_training.simulation.depth_noise import DEPTHS, measured_depth
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import rotation_x, rotation_z
+from service.localization.query import Query
+
+_FAR = 80.0  # metres: as good as without end
+_UP_IS = -1.0  # the level frame is the optical one without tilt: x right, y down, z forward
+
+
+@dataclass(frozen=True)
+class Box:
+    """A solid block that stands upright.
+
+    Attributes:
+        low: (3) corner, metres, in the level frame turned by ``yaw_rad`` about the vertical through the camera.
+        high: (3) the opposite one.
+        yaw_rad: to the right.
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    yaw_rad: float = 0.0
+
+    def entered(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where rays (H, W, 3) from the camera meet it, as multiples of the ray; infinity where they do not (slab method)."""
+        sine, cosine = np.sin(self.yaw_rad), np.cos(self.yaw_rad)
+        x, z = rays[..., 0] * cosine - rays[..., 2] * sine, rays[..., 0] * sine + rays[..., 2] * cosine
+        near, far = np.full(x.shape, -np.inf), np.full(x.shape, np.inf)
+        for axis, direction in enumerate((x, rays[..., 1], z)):
+            slope = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
+            first, second = self.low[axis] / slope, self.high[axis] / slope
+            near, far = np.maximum(near, np.minimum(first, second)), np.minimum(far, np.maximum(first, second))
+        return np.where((near < far) & (near > 0), near, np.inf)
+
+
+def wall(rng: np.random.Generator) -> list[Box]:
+    """What stands close before the camera: a wall, often bare, sometimes with another one beside it."""
+    distance, yaw = float(rng.uniform(0.7, 12.0)), float(np.deg2rad(rng.uniform(-50, 50)))
+    height = _FAR if rng.random() < 0.5 else float(rng.uniform(2.0, 9.0))
+    ground = _ground(rng)
+    top = ground + _UP_IS * height
+    boxes = [
+        Box((-_FAR, ground, -_FAR), (_FAR, ground + 1, _FAR)),
+        Box((-_FAR, top, distance), (_FAR, ground, distance + 1), yaw),
+    ]
+    if rng.random() < 0.3:
+        side = float(rng.uniform(1.0, 8.0))
+        low, high = (side, side + 1) if rng.random() < 0.5 else (-side - 1, -side)
+        boxes.append(Box((low, top, -_FAR), (high, ground, _FAR), yaw))
+    for _ in range(int(rng.integers(0, 6)) if rng.random() < 0.5 else 0):
+        left, foot = float(rng.uniform(-6, 6)), ground + _UP_IS * float(rng.uniform(0, 2))
+        wide, tall, deep = (float(value) for value in rng.uniform((0.2, 0.5, 0.03), (2.0, 3.0, 0.4)))
+        boxes.append(Box((left, foot + _UP_IS * tall, distance - deep), (left + wide, foot, distance), yaw))
+    return boxes
+
+
+def room(rng: np.random.Generator) -> list[Box]:
+    """The inside of a room, a corridor or a hall, with what stands in it; one wall may be missing."""
+    yaw, ground = float(rng.uniform(-np.pi, np.pi)), _ground(rng)
+    ceiling = ground + _UP_IS * float(rng.uniform(2.2, 5.0))
+    left, back, right, front = (float(value) for value in np.exp(rng.uniform(np.log(0.8), np.log(14.0), 4)))
+    sides = [
+        ((-left - 1, -_FAR), (-left, _FAR)), ((right, -_FAR), (right + 1, _FAR)),
+        ((-_FAR, -back - 1), (_FAR, -back)), ((-_FAR, front), (_FAR, front + 1)),
+    ]  # fmt: skip
+    if rng.random() < 0.3:
+        sides.pop(int(rng.integers(4)))
+    boxes = [Box((-_FAR, ground, -_FAR), (_FAR, ground + 1, _FAR)), Box((-_FAR, ceiling - 1, -_FAR), (_FAR, ceiling, _FAR))]  # fmt: skip
+    boxes += [Box((low[0], ceiling, low[1]), (high[0], ground, high[1]), yaw) for low, high in sides]
+    for _ in range(int(rng.integers(0, 9))):
+        x, z = float(rng.uniform(-left, right)), float(rng.uniform(-back, front))
+        wide, deep, tall = (float(value) for value in rng.uniform(0.2, (1.6, 1.6, 2.2)))
+        if max(abs(x) - wide, abs(z) - deep) > 0.4:  # not around the camera
+            boxes.append(Box((x, ground + _UP_IS * tall, z), (x + wide, ground, z + deep), yaw))
+    return boxes
+
+
+def _ground(rng: np.random.Generator) -> float:
+    """Height of the camera above it, metres."""
+    return float(rng.uniform(0.4, 2.2))
+
+
+#: Strangers by the name that their kind has in the calibration.
+KINDS: dict[str, Callable[[np.random.Generator], list[Box]]] = {"wall": wall, "room": room}
+
+
+def strangers(kind: str, camera: PinholeCamera, preset: str, count: int, rng: np.random.Generator) -> Iterator[Query]:
+    """Pictures of one kind, as the preset's depth camera measures them, tilted by a few degrees as a robot's are.
+
+    Args:
+        kind: one of ``KINDS``.
+        camera: of the colour and of the depth picture.
+        preset: one of ``DEPTHS``.
+        count: of pictures.
+        rng: chance.
+    """
+    for _ in range(count):
+        yield _picture(KINDS[kind](rng), camera, preset, rng)
+
+
+def _picture(boxes: list[Box], camera: PinholeCamera, preset: str, rng: np.random.Generator) -> Query:
+    pitch, roll = np.deg2rad(rng.normal(0, 2.0, 2))
+    rays = camera.rays_of_pixels() @ (rotation_x(pitch) @ rotation_z(roll)).T
+    depths = np.stack([box.entered(rays) for box in boxes])
+    seen = depths.argmin(axis=0)
+    depth = depths.min(axis=0)
+    there = depth < _FAR
+    bare = rng.random(len(boxes)) < 0.5  # without texture, so that stereo makes depth up there
+    measured = measured_depth(
+        np.where(there, depth, 0).astype(np.float32), bare[seen] & there, DEPTHS[preset], CONDITIONS["clear"], rng
+    )
+    colours = rng.uniform(40, 210, (len(boxes), 1)) + rng.normal(0, 15, (len(boxes), 3))
+    light = np.where(there[..., None], colours[seen], 235.0) + rng.normal(0, 4, (*seen.shape, 1))
+    return Query(rgb=np.clip(light, 0, 255).astype(np.uint8), depth_m=measured, camera=camera)
