@@ -15,6 +15,7 @@ from benchmarks.kitti_registration import kitti_registration_rows
 from benchmarks.kitti_retrieval import retrieve
 from benchmarks.plans import BOTH, paper_plan, unseen_plan
 from benchmarks.priors import prior_rows
+from benchmarks.raw import raw_condition_rows, raw_paper_rows, raw_unseen_rows
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs, share
 from benchmarks.sequences import sequence_rows
@@ -61,33 +62,6 @@ def unseen_rows(report: Report, runs: Runs) -> None:
             share(report, f"retrieval.unseen.{label}.{key}", found, key)
 
 
-def raw_unseen_rows(report: Report, runs: Runs) -> None:
-    """The raw range image in the same cities."""
-    for name, (label, _) in UNSEEN.items():
-        parts = []
-        for index in range(3):
-            dataset = runs.dataset(unseen_plan(index))
-            parts.append(runs.raw(runs.bundle(dataset), dataset, name))
-        raw_row(report, f"raw.unseen.{label}.recall_at_1_5m", parts, 0.40 if label == "precise" else None)
-
-
-def raw_row(report: Report, row_id: str, parts: list[dict[str, tuple[int, int]]], bar: float | None) -> None:
-    """The raw range image's recall at its best setting over all parts."""
-    totals = {s: (sum(p[s][0] for p in parts), sum(p[s][1] for p in parts)) for s in parts[0]}
-    best = max(totals, key=lambda s: totals[s][0])
-    right, count = totals[best]
-    report.row(
-        row_id,
-        right / count,
-        "share",
-        bar=bar,
-        better="lower",
-        n=count,
-        ci95=list(wilson_interval(right, count)),
-        why=f"best setting: {best}",
-    )
-
-
 def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
     """Real stereo frames; the rows stay, with a reason, where the recordings are not there."""
     kitti, drive = data / "kitti_stereo", data / "kitti_drive"
@@ -109,14 +83,6 @@ def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
         report.row(row_id, value, "share", bar=bar, n=count, ci95=list(wilson_interval(round(value * count), count)))
     best = max((k for k in found if k.startswith("raw_")), key=lambda k: found[k])
     report.row("raw.kitti_stereo.recall_at_1", found[best], "share", n=count, why=f"best setting: {best[4:]}")
-
-
-def raw_paper_rows(report: Report, runs: Runs) -> None:
-    """The raw range image in the paper's city."""
-    paper = runs.dataset(paper_plan())
-    for preset in BOTH:
-        found = [runs.raw(runs.bundle(paper), paper, f"drive1_{preset}")]
-        raw_row(report, f"raw.paper_city.{preset}.recall_at_1_5m", found, None)
 
 
 def trained_there_rows(report: Report, work: Path, encoder: Path) -> None:
@@ -163,6 +129,7 @@ def main() -> None:
         "weather": lambda: weather_rows(report, runs),
         "raw_unseen": lambda: raw_unseen_rows(report, runs),
         "raw_paper": lambda: raw_paper_rows(report, runs),
+        "raw_conditions": lambda: raw_condition_rows(report, runs),
         "trained_there": lambda: trained_there_rows(report, arguments.work, arguments.paper_encoder),
     }
     wanted = list(parts) if arguments.only is None else arguments.only.split(",")

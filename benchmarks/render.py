@@ -67,7 +67,11 @@ def _conditions(values: dict[str, float | None]) -> list[str]:
     names = [name for name in names if not name.endswith(".forced") and name != "clear"]
     if clear is None or not names:
         return []
-    lines = ["", "| condition | within 1 m | clear day | difference | most is lost by |", "|---|---|---|---|---|"]
+    lines = [
+        "",
+        "| condition | within 1 m | clear day | difference | most is lost by | R@1 at 5 m | of the raw range image |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for name in names:
         right, found, forced = (
             values.get(f"{head}{name}.{figure}") for figure in ("within_1_m", "recall_at_10_5m", "forced_within_1_m")
@@ -79,8 +83,16 @@ def _conditions(values: dict[str, float | None]) -> list[str]:
             lost = {"retrieval": 1 - found, "choice and registration": found - forced, "doubt": forced - right}
         most = max(lost, key=lambda stage: lost[stage]) if lost else ""
         told = f"{most} ({100 * lost[most]:.1f} points)" if most else ""
-        lines.append(f"| {name.replace('_', ' ')} | {right:.3f} | {clear:.3f} | {right - clear:+.3f} | {told} |")
+        first = _told(values.get(f"{head}{name}.recall_at_1_5m"))
+        raw = _told(values.get(f"raw.condition.{name}.recall_at_1_5m"))
+        lines.append(
+            f"| {name.replace('_', ' ')} | {right:.3f} | {clear:.3f} | {right - clear:+.3f} | {told} | {first} | {raw} |"
+        )
     return lines
+
+
+def _told(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
 
 
 def _other_commits(rows: list[dict[str, Any]]) -> list[str]:

@@ -1,0 +1,49 @@
+"""The raw range image, which learns nothing, in the same cities, drives and conditions: what a figure of ours is worth."""
+
+from collections.abc import Iterable
+
+from benchmarks.conditions import asked_of
+from benchmarks.plans import BOTH, paper_plan, unseen_plan
+from benchmarks.report import Report
+from benchmarks.runs import Runs
+from model_training.evaluation.error_measures import wilson_interval
+
+#: Query sets of the unseen cities: how their rows are called.
+UNSEEN = {"drive1_precise": "precise", "drive1_stereo": "stereo", "blocked25_precise": "precise_blocked_25"}
+TOO_EASY = 0.40  # a city that it solves says nothing
+
+
+def raw_unseen_rows(report: Report, runs: Runs) -> None:
+    """In the unseen cities."""
+    for name, label in UNSEEN.items():
+        parts = []
+        for index in range(3):
+            dataset = runs.dataset(unseen_plan(index))
+            parts.append(runs.raw(runs.bundle(dataset), dataset, name))
+        _row(report, f"raw.unseen.{label}.recall_at_1_5m", parts, TOO_EASY if label == "precise" else None)
+
+
+def raw_paper_rows(report: Report, runs: Runs) -> None:
+    """In the paper's city, another drive and the survey's own."""
+    paper = runs.dataset(paper_plan())
+    sets = {preset: f"drive1_{preset}" for preset in BOTH} | {"same_drive": "survey_drive_precise"}
+    for label, name in sets.items():
+        _row(report, f"raw.paper_city.{label}.recall_at_1_5m", [runs.raw(runs.bundle(paper), paper, name)])
+
+
+def raw_condition_rows(report: Report, runs: Runs) -> None:
+    """Under every hard condition."""
+    for condition, bundle, dataset, name in asked_of(runs):
+        _row(report, f"raw.condition.{condition}.recall_at_1_5m", [runs.raw(bundle, dataset, name)])
+
+
+def _row(report: Report, row_id: str, parts: Iterable[dict[str, tuple[int, int]]], bar: float | None = None) -> None:
+    """Its recall at its best setting over all parts."""
+    each = list(parts)
+    totals = {setting: tuple(sum(part[setting][k] for part in each) for k in (0, 1)) for setting in each[0]}
+    best = max(totals, key=lambda setting: totals[setting][0])
+    right, count = totals[best]
+    report.row(
+        row_id, right / count, "share", bar=bar, better="lower", n=count, ci95=list(wilson_interval(right, count)),
+        why=f"best setting: {best}",
+    )  # fmt: skip
