@@ -4,6 +4,7 @@ Facts after github.com/OpenArCloud/oscp-geopose-protocol (README, November 2026)
 
 - Intrinsics are COLMAP's, so the corner of the first pixel is (0, 0); ours puts its centre there.
 - A DEPTH image of integers holds millimetres; of floats metres. ``minMaxDepth`` ends what counts as measured.
+- An accuracy of 0, or of more than ``_MOST_STD_M``, is not known: the clients' own structures begin with 0 and with the largest float.
 - The accelerometer is W3C's: x right, y up, z towards the viewer, and at rest it points up; the camera looks the other way.
 """
 
@@ -25,11 +26,11 @@ from service.runtime.engine import EncodedQuery
 _MODELS = {
     "SIMPLE_PINHOLE": (1, 0), "PINHOLE": (2, 0), "SIMPLE_RADIAL": (1, 1), "RADIAL": (1, 2), "OPENCV": (2, 4), "FULL_OPENCV": (2, 8),
 }  # fmt: skip
-_COLOUR = ("RGBA32", "RGB", "GRAY8")
+_COLOUR = ("RGBA32", "RGB", "JPG", "GRAY8")
 _MOST_READINGS = 64
 _SAME_VIEW = 0.01  # of the picture's size
 #: Of a prior pose whose accuracy was not told, or told too well: its sender has moved since.
-_LEAST_STD_M, _HEADING_STD_DEG = 5.0, 30.0
+_LEAST_STD_M, _MOST_STD_M, _HEADING_STD_DEG = 5.0, 1e5, 30.0
 
 
 class _Lenient(BaseModel):
@@ -55,7 +56,9 @@ class CameraReading(_Lenient):
     """A picture."""
 
     sensorId: str | None = None
-    imageFormat: str | None = Field(None, description="RGBA32 or GRAY8 for colour, DEPTH for depth")
+    imageFormat: str | None = Field(
+        None, description="RGBA32, JPG or GRAY8 for colour, whatever the file's own format; DEPTH for depth"
+    )
     size: list[float] | None = Field(None, max_length=2, description="width, height")
     imageBytes: str | None = Field(None, description="base64 of an encoded picture, with or without a data: prefix")
     imageOrientation: ImageOrientation | None = None
@@ -253,5 +256,7 @@ def _prior(request: GeoPoseRequest, readings: SensorReadings) -> dict[str, Any] 
 
 
 def _place(latitude_deg: float, longitude_deg: float, std_m: float | None) -> dict[str, float]:
-    std = schema.PriorWgs84.model_fields["std_m"].default if std_m is None else max(std_m, _LEAST_STD_M)
+    std: float = schema.PriorWgs84.model_fields["std_m"].default
+    if std_m is not None and 0 < std_m <= _MOST_STD_M:
+        std = max(std_m, _LEAST_STD_M)
     return {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg, "std_m": std}

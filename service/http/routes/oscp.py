@@ -44,14 +44,12 @@ def router_for(asking: Asking) -> APIRouter:
     async def geopose(request: Request, map: Annotated[str | None, Query(max_length=64)] = None) -> Response:  # noqa: A002
         """Where a camera stands on the Earth: colour and DEPTH readings in, a GeoPose out.
 
-        `Accept: application/vnd.oscp+json;version=2.0` is needed. Intrinsics are COLMAP's (the corner of the first pixel is (0, 0));
+        `Accept: application/vnd.oscp+json;version=2.0` names the version; who names none (no Accept, `*/*`, `application/json`, as the
+        reference clients do) gets this one, another version is refused. Intrinsics are COLMAP's (the corner of the first pixel is (0, 0));
         DEPTH is a 16-bit PNG in millimetres or a float TIFF in metres; the accelerometer's axes are W3C's. An answer that is not sure
         is the problem `no-pose`, since the protocol has no word for doubt. `map` chooses among several maps.
         """
-        found = _VERSION.search(request.headers.get("accept", ""))
-        if found is None or found[1].split(".")[0] != "2":
-            said = "none" if found is None else found[1]
-            raise HTTPException(400, f"the protocol's version is {said}; send Accept: {MEDIA_TYPE}")
+        _require_version(request.headers.get("accept", ""))
 
         async def answer(body: bytearray) -> Response:
             def work() -> bytes:
@@ -68,3 +66,13 @@ def router_for(asking: Asking) -> APIRouter:
         return await asking(request, answer)
 
     return router
+
+
+def _require_version(accept: str) -> None:
+    """Who speaks of the protocol has to name this version; who accepts anything, or any JSON, has said nothing of it."""
+    found = _VERSION.search(accept)
+    if found is None and "vnd.oscp" not in accept.lower():
+        return
+    if found is None or found[1].split(".")[0] != "2":
+        said = "none" if found is None else found[1]
+        raise HTTPException(400, f"the protocol's version is {said}; send Accept: {MEDIA_TYPE}")

@@ -149,6 +149,20 @@ def test_a_satellite_fix_is_a_prior():
     assert (query.prior.position_std_m, query.prior.heading_rad) == (12.0, None)
 
 
+@pytest.mark.parametrize("accuracy", [0.0, -1.0, 3.4028234663852886e38, 1.7976931348623157e308, None])
+def test_an_accuracy_that_is_a_structures_first_value_is_not_known(accuracy):
+    """The clients' own structures begin with 0, and those of earlier poses with the largest float."""
+    fix = {"latitude": 48.1, "longitude": 11.5, "accuracy": accuracy}
+    geopose = {"position": {"lat": 48, "lon": 11, "h": 0}, "quaternion": NORTH}
+    earlier = {"geopose": geopose, "accuracy": {"position": accuracy}}
+    for asked in (request_of(readings={"geolocationReadings": [fix]}), request_of(priorPoses=[earlier])):
+        assert query_of(asked, None).prior.position_std_m == 20.0
+
+
+def test_a_picture_may_be_called_what_it_is():
+    assert query_of(request_of([reading("JPG", RGB), reading("DEPTH", DEPTH)]), None).rgb == RGB
+
+
 def test_an_earlier_pose_is_a_better_one_with_its_heading():
     earlier = {
         "id": "0",

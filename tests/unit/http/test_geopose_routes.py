@@ -24,6 +24,8 @@ from service.runtime.settings import Settings
 Parts = Callable[..., dict[str, bytes]]
 ClientOf = Callable[[Engine], httpx.Client]
 ACCEPT = {"Accept": "application/vnd.oscp+json;version=2.0;"}
+#: Requests as the Python, C++ and JavaScript clients of the protocol write them; pictures are put in by the test.
+GOLDEN = Path(__file__).parents[2] / "golden" / "oscp"
 MUNICH = {"latitude_deg": 48.0, "longitude_deg": 11.0, "height_m": 500.0}
 
 
@@ -139,6 +141,25 @@ def test_a_reference_client_gets_the_same_pose(client: httpx.Client, parts_of: P
     )
 
 
+@pytest.mark.parametrize("name", ["python", "cpp", "javascript"])
+def test_the_reference_clients_requests_are_answered_unchanged(
+    client: httpx.Client, parts_of: Parts, name: str
+) -> None:
+    """Of each the request as it writes it, headers included, with a DEPTH reading beside its picture."""
+    sent = json.loads((GOLDEN / f"{name}.json").read_text())
+    parts = parts_of()
+    for reading in sent["body"]["sensorReadings"]["cameraReadings"]:
+        assert reading["imageBytes"] == ""
+        content = parts["depth"] if reading["imageFormat"] == "DEPTH" else parts["rgb"]
+        reading["imageBytes"] = base64.b64encode(content).decode()
+    answer = client.post("/geopose", content=json.dumps(sent["body"]), headers=sent["headers"])
+    assert answer.status_code == 200, answer.text
+    told = answer.json()
+    assert told["id"] == sent["body"]["id"]
+    expected = post(client, parts).json()["geopose"]["position"]
+    assert told["geopose"]["position"]["lat"] == pytest.approx(expected["lat"], abs=1e-6)
+
+
 def test_rgb_alone_is_told_what_is_missing(client: httpx.Client, parts_of: Parts) -> None:
     request = oscp(parts_of())
     del request["sensorReadings"]["cameraReadings"][1]
@@ -148,7 +169,8 @@ def test_rgb_alone_is_told_what_is_missing(client: httpx.Client, parts_of: Parts
 
 
 @pytest.mark.parametrize(
-    "accept", ["*/*", "application/json", "application/vnd.oscp+json", "application/vnd.oscp+json;version=1.0"]
+    "accept",
+    ["application/vnd.oscp+json", "application/vnd.oscp+json;version=1.0", "application/vnd.oscp+json;version=x, */*"],
 )
 def test_another_version_is_refused(client: httpx.Client, parts_of: Parts, accept: str) -> None:
     refused = client.post("/geopose", json=oscp(parts_of()), headers={"Accept": accept})
