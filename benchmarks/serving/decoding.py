@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.report import Report
 from benchmarks.serving.ratios import Site
+from benchmarks.serving.rvl import write_rvl
 from model_training.datasets.dataset import Dataset
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import decode_depth, decode_rgb
@@ -61,6 +62,7 @@ def _depth_ways(stored: Data, camera: PinholeCamera) -> dict[str, tuple[Data, Ca
         "depth.raw16_zstd": ([write_raw16(each) for each in values], plain),
         "depth.raw16_lz4": ([write_raw16(each, "lz4") for each in values], plain),
         "depth.ros_png": ([bytes(12) + each for each in stored], ros),
+        "depth.ros_rvl": ([bytes(12) + write_rvl(each) for each in values], ros),
         "depth.float_tiff": (tiffs, metres),
     }
 
