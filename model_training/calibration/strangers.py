@@ -17,15 +17,14 @@ from service.geometry.rigid import rotation_x, rotation_z
 from service.localization.query import Query
 
 _FAR = 80.0  # metres: as good as without end
-_UP_IS = -1.0  # the level frame is the optical one without tilt: x right, y down, z forward
 
 
 @dataclass(frozen=True)
 class Box:
-    """A solid block that stands upright.
+    """A solid block that stands upright, in the level frame: x right, y down, z forward, the camera at its origin.
 
     Attributes:
-        low: (3) corner, metres, in the level frame turned by ``yaw_rad`` about the vertical through the camera.
+        low: (3) corner, metres, in that frame turned by ``yaw_rad`` about the vertical.
         high: (3) the opposite one.
         yaw_rad: to the right.
     """
@@ -51,7 +50,7 @@ def wall(rng: np.random.Generator) -> list[Box]:
     distance, yaw = float(rng.uniform(0.7, 12.0)), float(np.deg2rad(rng.uniform(-50, 50)))
     height = _FAR if rng.random() < 0.5 else float(rng.uniform(2.0, 9.0))
     ground = _ground(rng)
-    top = ground + _UP_IS * height
+    top = ground - height
     boxes = [
         Box((-_FAR, ground, -_FAR), (_FAR, ground + 1, _FAR)),
         Box((-_FAR, top, distance), (_FAR, ground, distance + 1), yaw),
@@ -61,16 +60,16 @@ def wall(rng: np.random.Generator) -> list[Box]:
         low, high = (side, side + 1) if rng.random() < 0.5 else (-side - 1, -side)
         boxes.append(Box((low, top, -_FAR), (high, ground, _FAR), yaw))
     for _ in range(int(rng.integers(0, 6)) if rng.random() < 0.5 else 0):
-        left, foot = float(rng.uniform(-6, 6)), ground + _UP_IS * float(rng.uniform(0, 2))
+        left, foot = float(rng.uniform(-6, 6)), ground - float(rng.uniform(0, 2))
         wide, tall, deep = (float(value) for value in rng.uniform((0.2, 0.5, 0.03), (2.0, 3.0, 0.4)))
-        boxes.append(Box((left, foot + _UP_IS * tall, distance - deep), (left + wide, foot, distance), yaw))
+        boxes.append(Box((left, foot - tall, distance - deep), (left + wide, foot, distance), yaw))
     return boxes
 
 
 def room(rng: np.random.Generator) -> list[Box]:
     """The inside of a room, a corridor or a hall, with what stands in it; one wall may be missing."""
     yaw, ground = float(rng.uniform(-np.pi, np.pi)), _ground(rng)
-    ceiling = ground + _UP_IS * float(rng.uniform(2.2, 5.0))
+    ceiling = ground - float(rng.uniform(2.2, 5.0))
     left, back, right, front = (float(value) for value in np.exp(rng.uniform(np.log(0.8), np.log(14.0), 4)))
     sides = [
         ((-left - 1, -_FAR), (-left, _FAR)), ((right, -_FAR), (right + 1, _FAR)),
@@ -84,7 +83,7 @@ def room(rng: np.random.Generator) -> list[Box]:
         x, z = float(rng.uniform(-left, right)), float(rng.uniform(-back, front))
         wide, deep, tall = (float(value) for value in rng.uniform(0.2, (1.6, 1.6, 2.2)))
         if max(abs(x) - wide, abs(z) - deep) > 0.4:  # not around the camera
-            boxes.append(Box((x, ground + _UP_IS * tall, z), (x + wide, ground, z + deep), yaw))
+            boxes.append(Box((x, ground - tall, z), (x + wide, ground, z + deep), yaw))
     return boxes
 
 
