@@ -1,7 +1,7 @@
 """Does confidence know what it does not know? Another city's queries, streets that the map lacks, pictures that show nothing."""
 
 from collections.abc import Callable
-from functools import cache
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,10 @@ from model_training.mapping.build import BuildSettings
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import DEPTHS, measured_depth
 from model_training.simulation.hard import HARD
-from model_training.stock import CALIBRATION
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
-from service.localization.query import FALSE_ACCEPT_RATE, Query
-from service.maps.calibration import read_calibration
+from service.localization.query import Query
 
 RIGHT_M = 1.0
 #: Cities whose maps are built once more with every second street left out.
@@ -33,6 +31,19 @@ ACCEPTED = (0.0, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0
 Picture = Callable[[np.random.Generator], tuple[NDArray[np.float64], NDArray[np.float64]]]
 FALSE_BARS = {("other_city", "precise"): 0.003, ("removed_streets", "precise"): 0.005,
               ("other_city", "stereo"): 0.02, ("removed_streets", "stereo"): 0.03}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Strangers:
+    """Queries that are in no map: what confidence each gets, and whether it is accepted by default."""
+
+    confidence: NDArray[np.float64]
+    accepted: NDArray[np.bool_]
+
+    @staticmethod
+    def of(answers: Predictions) -> "Strangers":
+        """No answer is no confidence."""
+        return Strangers(np.nan_to_num(answers.confidence), answers.localized)
 
 
 def confidence_and_right(answers: Predictions) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -46,19 +57,19 @@ def doubt_rows(report: Report, runs: Runs) -> None:
     inside: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = []
     outside: list[NDArray[np.float64]] = []
     own_of: dict[str, tuple[NDArray[np.float64], NDArray[np.bool_]]] = {}
-    strangers: dict[str, NDArray[np.float64]] = {}
+    strangers: dict[str, Strangers] = {}
     for preset in BOTH:
         own = unseen_answers(runs, preset)
         confidence, right = confidence_and_right(joined(own))
         own_of[preset] = confidence, right
-        other = confidence_and_right(_of_another_city(runs, preset))[0]
+        other = Strangers.of(_of_another_city(runs, preset))
         _false_rows(report, f"doubt.other_city.{preset}", other, confidence, right, FALSE_BARS["other_city", preset])
         away, near, near_right = _where_streets_are_missing(runs, preset)
         _false_rows(report, f"doubt.removed_streets.{preset}", away, near, near_right, FALSE_BARS["removed_streets", preset])  # fmt: skip
         strangers |= {f"other_city.{preset}": other, f"removed_streets.{preset}": away}
         take = np.random.default_rng(5).permutation(len(confidence))[: 1000 if preset == "stereo" else 500]
         inside.append((confidence[take], right[take]))
-        outside += [other[:500], away[:500]]
+        outside += [other.confidence[:500], away.confidence[:500]]
     inside.append(_hard(runs, 500))
     confidence = np.concatenate([*(c for c, _ in inside), *outside])
     right = np.concatenate([*(r for _, r in inside), *(np.zeros(len(c), bool) for c in outside)])
@@ -68,12 +79,12 @@ def doubt_rows(report: Report, runs: Runs) -> None:
     localizer = Localizer.open(runs.bundle(runs.dataset(unseen_plan(0))))
     for preset in BOTH:
         for kind, queries in nonsense(np.random.default_rng(6), preset).items():
-            found = np.array([_confidence_of(localizer, query) for query in queries])
+            found = Strangers(*map(np.array, zip(*(_told(localizer, query) for query in queries), strict=True)))
             _false_rows(report, f"doubt.{kind}.{preset}", found, *own_of[preset])
             strangers[f"{kind}.{preset}"] = found
     _reliability(report, confidence, right)
     report.notes["accepts"] = {
-        name: curve(*own_of[name.rpartition(".")[2]], found) for name, found in strangers.items()
+        name: curve(*own_of[name.rpartition(".")[2]], found.confidence) for name, found in strangers.items()
     }
 
 
@@ -85,10 +96,8 @@ def _of_another_city(runs: Runs, preset: str) -> Predictions:
     return joined([*first.values(), *second.values()])
 
 
-def _where_streets_are_missing(
-    runs: Runs, preset: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Confidence of the queries outside; confidence and rightness of those inside: maps with every second street."""
+def _where_streets_are_missing(runs: Runs, preset: str) -> tuple[Strangers, NDArray[np.float64], NDArray[np.bool_]]:
+    """The queries outside; confidence and rightness of those inside: maps with every second street."""
     away, near, right = [], [], []
     for index in PARTIAL:
         dataset, more = runs.dataset(unseen_plan(index)), runs.dataset(more_plan(index))
@@ -98,10 +107,10 @@ def _where_streets_are_missing(
             answers = runs.figures(bundle, asked, [name], refine=True)["predictions"][name]
             outside = partial.is_outside(answers.T_true[:, :2, 3])
             confidence, is_right = confidence_and_right(answers)
-            away.append(confidence[outside])
+            away.append(answers.of(outside))
             near.append(confidence[~outside])
             right.append(is_right[~outside])
-    return np.concatenate(away), np.concatenate(near), np.concatenate(right)
+    return Strangers.of(joined(away)), np.concatenate(near), np.concatenate(right)
 
 
 def _hard(runs: Runs, count: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -115,13 +124,14 @@ def _hard(runs: Runs, count: int) -> tuple[NDArray[np.float64], NDArray[np.bool_
 
 
 def _false_rows(
-    report: Report, row: str, negative: NDArray[np.float64], confidence: NDArray[np.float64], right: NDArray[np.bool_],
+    report: Report, row: str, negative: Strangers, confidence: NDArray[np.float64], right: NDArray[np.bool_],
     bar: float | None = None,
 ) -> None:  # fmt: skip
     level = float(np.quantile(confidence[right], 0.05))
-    report.share(f"{row}.false_accepts_at_95", negative >= level, bar=bar, better="lower")
-    report.share(f"{row}.accepted_by_default", negative >= default_threshold(), better="lower")
-    report.row(f"{row}.average_precision", average_precision(confidence, right, negative), "share", n=len(negative))
+    count = len(negative.confidence)
+    report.share(f"{row}.false_accepts_at_95", negative.confidence >= level, bar=bar, better="lower")
+    report.share(f"{row}.accepted_by_default", negative.accepted, better="lower")
+    report.row(f"{row}.average_precision", average_precision(confidence, right, negative.confidence), "share", n=count)
 
 
 def curve(
@@ -136,15 +146,6 @@ def curve(
     ]
 
 
-@cache
-def default_threshold() -> float:
-    """The confidence from which on the service accepts an answer if nobody says otherwise."""
-    calibration = read_calibration(CALIBRATION.read_bytes(), path=str(CALIBRATION))
-    if calibration is None:
-        raise ValueError(f"{CALIBRATION} says that it is no calibration")
-    return calibration.threshold(FALSE_ACCEPT_RATE)
-
-
 def average_precision(
     confidence: NDArray[np.float64], right: NDArray[np.bool_], negative: NDArray[np.float64]
 ) -> float:
@@ -156,11 +157,13 @@ def average_precision(
     return float(precision[true].mean())
 
 
-def _confidence_of(localizer: Localizer, query: Query) -> float:
+def _told(localizer: Localizer, query: Query) -> tuple[float, bool]:
+    """Confidence, and whether the answer is accepted."""
     try:
-        return localizer.localize(query).confidence or 0.0
+        answer = localizer.localize(query)
     except NoDepthError:
-        return 0.0
+        return 0.0, False
+    return answer.confidence or 0.0, answer.status == "LOCALIZED"
 
 
 def nonsense(rng: np.random.Generator, preset: str, count: int = 100) -> dict[str, list[Query]]:

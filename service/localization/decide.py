@@ -11,6 +11,9 @@ from service.maps.calibration import Calibration, probability
 
 #: An answer that is not accepted is ambiguous if the place is more probably in the map than not.
 KNOWN = 0.5
+#: Were the place in the map for certain, an accepted answer would be right in two cases of five at least: what keeps strangers out lets
+#: through one of six blocks that are all alike.
+ALIKE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +37,7 @@ def decide(
     if evidence is None:
         return Decision("OUT_OF_MAP", 0.0)
     confidence = float(calibration.confidence(evidence))
-    if confidence >= calibration.threshold(false_accept_rate):
-        return Decision("LOCALIZED", confidence)
     known = float(probability(calibration.known.log_odds(evidence)))
+    if confidence >= max(calibration.threshold(false_accept_rate), ALIKE * known):
+        return Decision("LOCALIZED", confidence)
     return Decision("AMBIGUOUS" if known >= KNOWN else "OUT_OF_MAP", confidence)

@@ -3,8 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import doubt
-from benchmarks.doubt import _false_rows, average_precision, confidence_and_right, curve, nonsense
+from benchmarks.doubt import Strangers, _false_rows, average_precision, confidence_and_right, curve, nonsense
 from benchmarks.report import Report
 
 
@@ -51,13 +50,13 @@ def test_no_answer_is_no_confidence_and_not_right(predictions_of):
     assert confidence.tolist() == [0.9, 0.8, 0.0, 0.0]
 
 
-def test_false_accepts_are_counted_where_ninety_five_in_a_hundred_true_ones_are_accepted(monkeypatch):
-    """True answers at 0.00 to 1.00: the level is 0.05. Two of the four outside reach it, one the service's own."""
-    monkeypatch.setattr(doubt, "default_threshold", lambda: 0.4)
+def test_false_accepts_are_counted_where_ninety_five_in_a_hundred_true_ones_are_accepted():
+    """True answers at 0.00 to 1.00: the level is 0.05. Two of the four outside reach it, the service accepted one."""
     report = Report("none", "none")
     confidence, right = np.arange(102) / 100, np.ones(102, bool)
     right[101], confidence[101] = False, 0.01
-    _false_rows(report, "x", np.array([0.01, 0.049, 0.05, 0.9]), confidence, right, 0.5)
+    outside = Strangers(np.array([0.01, 0.049, 0.05, 0.9]), np.array([False, False, False, True]))
+    _false_rows(report, "x", outside, confidence, right, 0.5)
     first, default, second = report.rows
     assert (default["id"], default["value"]) == ("x.accepted_by_default", 0.25)
     assert (first["id"], first["value"], first["n"], first["holds"]) == ("x.false_accepts_at_95", 0.5, 4, True)
