@@ -12,7 +12,7 @@ from service.localization.prior import Prior
 
 MOST_NEIGHBOURS = 50
 #: Of calibration's strangers, every kind weighing alike (decision log).
-FALSE_ACCEPT_RATE = 0.03
+FALSE_ACCEPT_RATE = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
