@@ -11,9 +11,9 @@ from service.maps.calibration import Calibration, probability
 
 #: An answer that is not accepted is ambiguous if the place is more probably in the map than not.
 KNOWN = 0.5
-#: Were the place in the map for certain, an accepted answer would be right in one case of five at least: what keeps strangers out lets
+#: Were the place in the map for certain, an accepted answer would be right in one case of three at least: what keeps strangers out lets
 #: through one of six blocks that are all alike.
-ALIKE = 0.2
+ALIKE = 0.35
 
 
 @dataclass(frozen=True, slots=True)
