@@ -124,11 +124,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "bench")
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--no-walls", action="store_true", help="leave out the demo and the tests, the longest part")
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument("--no-walls", action="store_true", help="leave out the demo and the tests, the longest part")
+    part.add_argument("--only-walls", action="store_true", help="the demo and the tests alone; the other rows stay")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
-    command = "make bench-training" + (" ARGS=--no-walls" if arguments.no_walls else "")
-    report = Report("training", command)
+    told = "--no-walls" if arguments.no_walls else "--only-walls" if arguments.only_walls else ""
+    report = Report("training", "make bench-training" + (f" ARGS={told}" if told else ""))
+    if arguments.only_walls:
+        report.keep_others()
+        walls(report)
+        print(f"written: {report.write()}")
+        return
     simulation(report, arguments.work)
     packs = packs_for_bench(arguments.work)
     own_size(report, packs, arguments.work, arguments.steps)
