@@ -9,6 +9,7 @@ from service.errors import DatasetError
 from service.maps.calibration import (
     FEATURES,
     RIVALRY,
+    UNWEIGHED,
     Calibration,
     Logistic,
     Threshold,
@@ -73,8 +74,8 @@ def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RID
         )  # fmt: skip
     weight = np.where(used.known, 0.5 / used.known.mean(), 0.5 / (~used.known).mean())
     mean, spread = used.evidence.mean(axis=0), used.evidence.std(axis=0) + 1e-9
-    right = _logistic(used.evidence, used.right, weight, mean, spread, ridge)
-    known = _logistic(used.evidence, used.known, weight, mean, spread, ridge, without=RIVALRY)
+    right = _logistic(used.evidence, used.right, weight, mean, spread, ridge, without=UNWEIGHED)
+    known = _logistic(used.evidence, used.known, weight, mean, spread, ridge, without=RIVALRY + UNWEIGHED)
     thresholds = _thresholds(asked, right)
     return Calibration(
         features=FEATURES, right=right, known=known, thresholds=thresholds, measured_on=measured_on | {"queries": len(asked)}
@@ -83,7 +84,7 @@ def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RID
 
 def _logistic(
     evidence: NDArray[np.float64], label: NDArray[np.bool_], weight: NDArray[np.float64], mean: NDArray[np.float64],
-    spread: NDArray[np.float64], ridge: float, *, without: tuple[str, ...] = (),
+    spread: NDArray[np.float64], ridge: float, *, without: tuple[str, ...],
 ) -> Logistic:  # fmt: skip
     wide = expanded(evidence, tuple(mean), tuple(spread))
     silent = [any(FEATURES[k] in without for k in term) for term in terms(len(FEATURES))]

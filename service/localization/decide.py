@@ -7,13 +7,13 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.localization.answer import Status
-from service.maps.calibration import Calibration, probability
+from service.maps.calibration import FEATURES, Calibration, probability
 
 #: An answer that is not accepted is ambiguous if the place is more probably in the map than not.
 KNOWN = 0.5
-#: Were the place in the map for certain, an accepted answer would be right in one case of three at least: what keeps strangers out lets
+#: An accepted answer holds more than half of the support of all places that the query may be at: what keeps strangers out lets
 #: through one of six blocks that are all alike.
-ALIKE = 0.35
+_SHARE, _HALF = FEATURES.index("log_share"), float(np.log(0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ def decide(
     if evidence is None:
         return Decision("OUT_OF_MAP", 0.0)
     confidence = float(calibration.confidence(evidence))
-    known = float(probability(calibration.known.log_odds(evidence)))
-    if confidence >= max(calibration.threshold(false_accept_rate), ALIKE * known):
+    if confidence >= calibration.threshold(false_accept_rate) and evidence[_SHARE] > _HALF:
         return Decision("LOCALIZED", confidence)
+    known = float(probability(calibration.known.log_odds(evidence)))
     return Decision("AMBIGUOUS" if known >= KNOWN else "OUT_OF_MAP", confidence)

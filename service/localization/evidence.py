@@ -52,8 +52,11 @@ def evidence_of(
     # What several frames agree on is surer than one frame's: the noise of their mean falls with the root of their number.
     several = float(np.sqrt(len(frames)))
     weights = np.array([hypothesis.weight for hypothesis in hypotheses])
+    behind = best.support - np.array([candidate.support for candidate in distinct_candidates(refined.candidates)])
     found = {
-        "margin": min(several * _margin(refined.candidates), _MOST_MARGIN),
+        "margin": min(several * float(behind[1:].min(initial=_MOST_MARGIN)), _MOST_MARGIN),
+        # Were support the log odds of a place, the best one's probability among its rivals: a half of two alike, a sixth of six.
+        "log_share": -float(np.log(np.exp(-several * behind).sum())),
         "inliers": best.registered.inliers,
         "similarity": best.similarity,
         "similarity_margin": several * (best.similarity - (float(elsewhere.max()) if len(elsewhere) else 0.5)),
@@ -82,13 +85,6 @@ def _spread(neighbours: tuple[Neighbour, ...]) -> float:
     """How far the most similar places stand from their middle: logarithm of the root mean square (m), of 0.1 m at least."""
     xy = np.array([place.position_m[:2] for place in neighbours])
     return float(np.log(np.sqrt(xy.var(axis=0).sum()) + 0.1))
-
-
-def _margin(candidates: tuple[Candidate, ...]) -> float:
-    """Support of the best over its best rival, nats."""
-    best = candidates[0]
-    rivals = [candidate.support for candidate in candidates[1:] if is_rival(best, candidate)]
-    return min(best.support - max(rivals), _MOST_MARGIN) if rivals else _MOST_MARGIN
 
 
 def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:

@@ -15,10 +15,12 @@ from service.errors import BundleError
 FEATURES = (
     "margin", "inliers", "similarity", "similarity_margin", "likelihood", "through", "front", "unmapped", "log_sigma", "scale", "votes",
     "entropy", "log_noise", "points", "measured", "place_m",
-    "facings", "far", "edges", "residual", "pose_spread",
+    "facings", "far", "edges", "residual", "pose_spread", "log_share",
 )  # fmt: skip
 #: The features that say what rivals there are; whether the place is in the map at all does not depend on them.
 RIVALRY = ("margin", "similarity_margin", "votes", "entropy", "pose_spread")
+#: Decides beside the confidence (``service.localization.decide``); in it, it would bring nothing (decision log), so it weighs nothing.
+UNWEIGHED = ("log_share",)
 _CLIP = 4.0  # standard deviations: no feature may run further away than calibration has seen
 
 

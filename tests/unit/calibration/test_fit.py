@@ -7,7 +7,7 @@ from model_training.calibration import fit as fitting
 from model_training.calibration.fit import RATES, Asked, _thresholds, expected_calibration_error, fit, pooled
 from service.errors import DatasetError
 from service.localization.query import FALSE_ACCEPT_RATE
-from service.maps.calibration import FEATURES, RIVALRY, Logistic, probability, read_calibration, terms
+from service.maps.calibration import FEATURES, RIVALRY, UNWEIGHED, Logistic, probability, read_calibration, terms
 
 COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
 INLIERS, MARGIN = FEATURES.index("inliers"), FEATURES.index("margin")
@@ -78,11 +78,13 @@ def test_the_weights_are_those_of_the_features_and_of_their_products(calibration
 
 
 def test_whether_the_place_is_known_does_not_depend_on_rivals(asked, calibration):
-    rivalry = [any(FEATURES[k] in RIVALRY for k in term) for term in terms(COUNT)]
+    rivalry, unweighed = (
+        np.array([any(FEATURES[k] in names for k in term) for term in terms(COUNT)]) for names in (RIVALRY, UNWEIGHED)
+    )
     weights = np.array(calibration.known.weights)
-    assert (weights[rivalry] == 0).all()
+    assert (weights[rivalry | unweighed] == 0).all()
     assert weights[INLIERS] == pytest.approx(1.2, abs=0.1)
-    assert (np.array(calibration.right.weights)[rivalry] != 0).all()
+    np.testing.assert_array_equal(np.array(calibration.right.weights) != 0, ~unweighed)
     rivals_differ = asked.evidence[:9].copy()
     rivals_differ[:, [FEATURES.index(name) for name in RIVALRY]] = 1e3
     known = calibration.known

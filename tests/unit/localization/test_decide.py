@@ -15,14 +15,14 @@ def odds(p):
 def decided(calibration_json, calibration_of):
     """What is made of a first feature whose size is the log odds of being right, and of whether the place is known."""
 
-    def made(right, known=0.5, rate=0.01, **changed):
+    def made(right, known=0.5, rate=0.01, *, share=1.0, **changed):
         first = np.eye(1, len(terms(len(FEATURES))))[0].tolist()
         good = calibration_json()
         calibration = calibration_of(
             right=good["right"] | {"weights": first}, known=good["known"] | {"bias": odds(known)}, **changed
         )
         evidence = np.zeros(len(FEATURES))
-        evidence[0] = odds(right)
+        evidence[0], evidence[FEATURES.index("log_share")] = odds(right), np.log(share)
         return decide(calibration, evidence, rate)
 
     return made
@@ -81,17 +81,18 @@ def test_who_can_live_with_more_false_accepts_is_refused_no_answer_that_another_
 
 
 @pytest.mark.parametrize(
-    ("right", "known", "status"),
+    ("share", "known", "status"),
     [
-        (0.34, 0.99, "AMBIGUOUS"),  # 0.3465 is needed
-        (0.35, 0.99, "LOCALIZED"),
-        (0.20, 0.60, "AMBIGUOUS"),
-        (0.17, 0.45, "LOCALIZED"),  # unsure whether it is in the map, but if it is, then there
-        (0.15, 0.45, "OUT_OF_MAP"),
+        (1.0, 0.9, "LOCALIZED"),
+        (0.51, 0.9, "LOCALIZED"),
+        (0.5, 0.9, "AMBIGUOUS"),  # two that are alike
+        (1 / 6, 0.9, "AMBIGUOUS"),
+        (1 / 6, 0.1, "OUT_OF_MAP"),
     ],
 )
-def test_one_of_several_that_are_alike_is_not_accepted_however_many_strangers_one_can_live_with(
-    decided, right, known, status
+def test_who_holds_no_more_than_half_of_the_support_of_all_places_is_not_accepted_however_sure(
+    decided, share, known, status
 ):
-    lax = [{"false_accept_rate": 0.01, "confidence": 0.05}]
-    assert decided(right, known, thresholds=lax).status == status
+    found = decided(0.95, known, share=share)
+    assert found.status == status
+    assert found.confidence == pytest.approx(0.95)

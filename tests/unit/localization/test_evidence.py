@@ -95,6 +95,25 @@ def test_the_margin_is_the_support_over_the_best_rival(weighed, rivals, margin):
 
 
 @pytest.mark.parametrize(
+    ("supports", "share"),
+    [
+        ([10.0], 1.0),
+        ([10.0, 10.0], 1 / 2),  # two alike
+        ([10.0] * 6, 1 / 6),  # six alike, whose margin is the same
+        ([10.0, 10.0 - np.log(3.0)], 3 / 4),
+        ([10.0, 9.0, 9.0], 1 / (1 + 2 / np.e)),
+        ([10.0, -990.0], 1.0),
+    ],
+)
+def test_the_share_is_the_best_ones_among_all_that_exclude_each_other(weighed, supports, share):
+    """And the next frame of the same street takes nothing from it."""
+    apart = [candidate(support, xyz=(20 * k, 0, 1.5)) for k, support in enumerate(supports)]
+    near = [candidate(support, xyz=(20 * k + 1, 0, 1.5)) for k, support in enumerate(supports)]
+    for candidates in (apart, [*apart, *near]):
+        assert weighed(candidates=tuple(candidates))["log_share"] == pytest.approx(np.log(share))
+
+
+@pytest.mark.parametrize(
     ("xyz", "heading_deg", "rival"),
     [((2.9, 0, 1.5), 0, False), ((0, -3.1, 1.5), 0, True), ((2, 2, 3.0), 0, True), ((2, 2, 1.5), 0, False), ((0, 0, 1.5), 29, False),
      ((0, 0, 1.5), -29, False), ((0, 0, 1.5), 31, True), ((0, 0, 1.5), -31, True), ((0, 0, 1.5), 359, False), ((0, 0, 1.5), 180, True)],
@@ -195,6 +214,8 @@ def test_margins_of_several_frames_count_by_the_root_of_their_number(weighed, fr
     one, four = weighed(**asked), weighed(**asked, frames=(frame,) * 4)
     assert one["margin"] == pytest.approx(3.0)
     assert four["margin"] == pytest.approx(6.0)
+    assert one["log_share"] == pytest.approx(-np.log1p(np.exp(-3)))
+    assert four["log_share"] == pytest.approx(-np.log1p(np.exp(-6)))
     assert four["similarity_margin"] == pytest.approx(2 * one["similarity_margin"])
 
 

@@ -9,6 +9,7 @@ from service.errors import BundleError
 from service.maps.calibration import (
     FEATURES,
     RIVALRY,
+    UNWEIGHED,
     Calibration,
     Logistic,
     expanded,
@@ -230,9 +231,10 @@ def test_the_threshold_is_that_of_the_greatest_rate_that_is_not_beyond_the_one_a
     assert calibration_of(thresholds=thresholds).threshold(rate) == confidence
 
 
-def test_every_feature_has_a_name_of_its_own_and_those_of_rivalry_are_among_them():
+def test_every_feature_has_a_name_of_its_own_and_those_of_rivalry_and_the_unweighed_are_among_them():
     assert len(set(FEATURES)) == COUNT
     assert set(RIVALRY) < set(FEATURES)
+    assert set(UNWEIGHED) < set(FEATURES) - set(RIVALRY)
 
 
 def test_a_calibration_cannot_be_changed(calibration_of):
