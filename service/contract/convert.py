@@ -21,9 +21,9 @@ from service.geometry.rigid import (
 )
 from service.geometry.uncertainty import covariance_at
 from service.localization.answer import Answer
-from service.localization.evidence import distinct_candidates
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
+from service.localization.rivals import behind, distinct_candidates, log_shares
 from service.localization.search import Neighbour
 from service.maps.reader import MapBundle
 from service.runtime.engine import EncodedQuery, Located
@@ -265,9 +265,7 @@ def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
     candidates = distinct_candidates(answer.candidates or ())
     if not candidates:
         return []
-    support = np.array([candidate.support for candidate in candidates])
-    shares = np.exp(support - support.max())
-    shares /= shares.sum()
+    shares = np.exp(log_shares(behind(candidates, answer.frames)))
     return [
         schema.HypothesisOfPose(
             pose=_pose(each.T_map_camera, heading_of_camera(each.T_map_camera), None), share=float(share),

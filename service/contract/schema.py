@@ -251,7 +251,9 @@ class HypothesisOfPose(BaseModel):
     """A place where the pictures may have been taken."""
 
     pose: Pose = Field(description="T_map_camera")
-    share: float = Field(description="of the support of all hypotheses, 0 to 1")
+    share: float = Field(
+        description="of the support of all hypotheses, 0 to 1; LOCALIZED needs more than a half for the first"
+    )
     inliers: float = Field(description="share of the depth's weight that lies on the map, 0 to 1")
     similarity: float = Field(description="of the pictures to the places around, cosine")
 

@@ -41,6 +41,7 @@ class Answer:
         T_map_camera: pose of the camera: registered, or of the heaviest cluster.
         covariance: of ``T_map_camera``, translation first, then rotation, map axes, about the camera; None without registration.
         candidates: the registered poses, the best supported first; None where nothing was registered.
+        frames: so many were asked together.
         T_map_vehicle: pose of the vehicle, where the query said how the camera sits on it.
         neighbours: the k most similar distinct places, the best first.
         hypotheses: all clusters of the most similar views, the heaviest first; with a prior, what it believes most.
@@ -55,6 +56,7 @@ class Answer:
     T_map_camera: Transform
     covariance: Float64[NDArray[np.float64], "6 6"] | None
     candidates: tuple[Candidate, ...] | None
+    frames: int
     evidence: Float64[NDArray[np.float64], " F"] | None
     T_map_vehicle: Transform | None
     neighbours: tuple[Neighbour, ...]

@@ -8,12 +8,11 @@ from service.imaging.shape import shape_of
 from service.imaging.view_grid import ViewGrid
 from service.localization.frames import Frame
 from service.localization.hypotheses import Hypothesis
-from service.localization.refine import Candidate, Refined
+from service.localization.refine import Refined
+from service.localization.rivals import behind, distinct_candidates, log_shares
 from service.localization.search import Neighbour
 from service.maps.calibration import FEATURES
 
-#: A rival stands further away than this, or looks another way: the next frame of the same street is none.
-RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
 #: Another place, for the margin of similarity; votes within VOTE_M of the answer count for it.
 OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
 _NEAREST = 5  # neighbours whose poses are to agree
@@ -49,14 +48,12 @@ def evidence_of(
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(refined.covariance[:2, :2])[-1]))
     # Of the places that are there: a sparse survey has fewer of them, but no less to say.
     there = float(np.clip((np.hypot(*(places_m - xy).T) < VOTE_M).sum(), 1, VOTERS))
-    # What several frames agree on is surer than one frame's: the noise of their mean falls with the root of their number.
     several = float(np.sqrt(len(frames)))
     weights = np.array([hypothesis.weight for hypothesis in hypotheses])
-    behind = best.support - np.array([candidate.support for candidate in distinct_candidates(refined.candidates)])
+    less = behind(distinct_candidates(refined.candidates), len(frames))
     found = {
-        "margin": min(several * float(behind[1:].min(initial=_MOST_MARGIN)), _MOST_MARGIN),
-        # Were support the log odds of a place, the best one's probability among its rivals: a half of two alike, a sixth of six.
-        "log_share": -float(np.log(np.exp(-several * behind).sum())),
+        "margin": float(less[1:].min(initial=_MOST_MARGIN)),
+        "log_share": float(log_shares(less)[0]),
         "inliers": best.registered.inliers,
         "similarity": best.similarity,
         "similarity_margin": several * (best.similarity - (float(elsewhere.max()) if len(elsewhere) else 0.5)),
@@ -85,19 +82,3 @@ def _spread(neighbours: tuple[Neighbour, ...]) -> float:
     """How far the most similar places stand from their middle: logarithm of the root mean square (m), of 0.1 m at least."""
     xy = np.array([place.position_m[:2] for place in neighbours])
     return float(np.log(np.sqrt(xy.var(axis=0).sum()) + 0.1))
-
-
-def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
-    """Those that exclude each other, the best supported of each place."""
-    kept: list[Candidate] = []
-    for candidate in candidates:
-        if all(is_rival(other, candidate) for other in kept):
-            kept.append(candidate)
-    return tuple(kept)
-
-
-def is_rival(one: Candidate, other: Candidate) -> bool:
-    """Whether two candidates are answers that exclude each other."""
-    apart = np.linalg.norm(one.T_map_camera[:3, 3] - other.T_map_camera[:3, 3])
-    turned = np.trace(one.T_map_camera[:3, :3].T @ other.T_map_camera[:3, :3])
-    return bool(apart > RIVAL_M or turned < 1 + 2 * np.cos(RIVAL_RAD))

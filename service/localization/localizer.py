@@ -161,6 +161,7 @@ class Localizer:
             T_map_camera=T_map_camera,
             covariance=None if refined is None else refined.covariance,
             candidates=None if refined is None else refined.candidates,
+            frames=len(frames),
             evidence=evidence,
             T_map_vehicle=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
             neighbours=neighbours[: max(query.neighbours, query.ranked)],

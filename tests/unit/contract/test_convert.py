@@ -124,8 +124,8 @@ def candidate(support, *, xyz, heading_deg=0.0):
     )
 
 
-def hypotheses_of(localized, *candidates):
-    answer = replace(localized.answer, candidates=candidates or None)
+def hypotheses_of(localized, *candidates, frames=1):
+    answer = replace(localized.answer, candidates=candidates or None, frames=frames)
     return answer_from(replace(localized, answer=answer)).hypotheses
 
 
@@ -136,6 +136,13 @@ def test_shares_follow_from_the_supports(localized):
         found = hypotheses_of(localized, *several)
         assert [each.share for each in found] == pytest.approx([0.5, 0.3, 0.2])
         assert [each.pose.position.x for each in found] == [500, 300, 200]
+
+
+def test_shares_of_several_frames_are_those_that_the_status_follows_from(localized):
+    """Of four frames, whose mean has half the noise, the odds count twice: 5 : 3 is 25 : 9."""
+    several = [candidate(np.log(k), xyz=(100 * k, 0, 1.5)) for k in (5, 3)]
+    found = hypotheses_of(localized, *several, frames=4)
+    assert [each.share for each in found] == pytest.approx([25 / 34, 9 / 34])
 
 
 def test_a_hypothesis_is_told_as_it_was_registered(localized):

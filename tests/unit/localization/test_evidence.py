@@ -2,26 +2,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
+from service.geometry.rigid import rotation_z
 from service.imaging.shape import shape_of
 from service.imaging.view_grid import ViewGrid
-from service.localization.evidence import evidence_of, is_rival
+from service.localization.evidence import evidence_of
 from service.localization.hypotheses import Hypothesis
-from service.localization.refine import Candidate, Refined
+from service.localization.refine import Refined
 from service.localization.search import Neighbour
 from service.maps.calibration import FEATURES
-from service.registration.register import Registered
 from service.registration.rendered import Agreement
-
-
-def candidate(support=0.0, *, xyz=(0.0, 0.0, 1.5), heading_deg=0.0, scale=1.0):
-    R = rotation_z(np.deg2rad(heading_deg))
-    registered = Registered(R, np.array(xyz, np.float64), scale, 0.0, 0.7, np.eye(8), 0)
-    T_map_camera = transform_from(R @ R_BODY_OPTICAL, np.array(xyz, np.float64))
-    return Candidate(T_map_camera, registered, 0.8, 1.5, Agreement(-1.5, 0.02, 0.2, 0.1), support)
 
 
 def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
@@ -42,7 +32,7 @@ def frame(frame_with, matches_at):
 
 
 @pytest.fixture(scope="module")
-def weighed(frame):
+def weighed(candidate, frame):
     """The evidence by name; whatever a test does not say is one candidate, one neighbour, one hypothesis, one frame."""
 
     def weigh(*, candidates=None, neighbours=None, weights=(1.0,), frames=None, places=None, **options):
@@ -63,7 +53,7 @@ def weighed(frame):
     [("inliers", 0.7), ("similarity", 0.8), ("likelihood", -1.5), ("through", 0.02), ("front", 0.2), ("unmapped", 0.1),
      ("measured", 0.75), ("place_m", 1.5)],
 )  # fmt: skip
-def test_what_is_known_of_the_best_candidate_is_told_as_it_is(weighed, name, expected):
+def test_what_is_known_of_the_best_candidate_is_told_as_it_is(candidate, weighed, name, expected):
     other = replace(
         candidate(-1.0, xyz=(50, 0, 1.5)), similarity=0.1, place_m=7.0, agreement=Agreement(-9.0, 0.9, 0.9, 0.9)
     )
@@ -71,7 +61,7 @@ def test_what_is_known_of_the_best_candidate_is_told_as_it_is(weighed, name, exp
 
 
 @pytest.mark.parametrize(("place_m", "expected"), [(0.0, 0.0), (9.9, 9.9), (10.1, 10.0), (1e4, 10.0)])
-def test_places_further_than_ten_metres_are_told_as_ten(weighed, place_m, expected):
+def test_places_further_than_ten_metres_are_told_as_ten(candidate, weighed, place_m, expected):
     """Calibration has seen no survey so sparse."""
     assert weighed(candidates=(replace(candidate(), place_m=place_m),))["place_m"] == expected
 
@@ -89,7 +79,7 @@ def test_places_further_than_ten_metres_are_told_as_ten(weighed, place_m, expect
         ([], 12.0),
     ],
 )
-def test_the_margin_is_the_support_over_the_best_rival(weighed, rivals, margin):
+def test_the_margin_is_the_support_over_the_best_rival(candidate, weighed, rivals, margin):
     others = [candidate(support, xyz=xyz, heading_deg=degrees) for support, xyz, degrees in rivals]
     assert weighed(candidates=(candidate(10.0), *others))["margin"] == pytest.approx(margin)
 
@@ -105,31 +95,12 @@ def test_the_margin_is_the_support_over_the_best_rival(weighed, rivals, margin):
         ([10.0, -990.0], 1.0),
     ],
 )
-def test_the_share_is_the_best_ones_among_all_that_exclude_each_other(weighed, supports, share):
+def test_the_share_is_the_best_ones_among_all_that_exclude_each_other(candidate, weighed, supports, share):
     """And the next frame of the same street takes nothing from it."""
     apart = [candidate(support, xyz=(20 * k, 0, 1.5)) for k, support in enumerate(supports)]
     near = [candidate(support, xyz=(20 * k + 1, 0, 1.5)) for k, support in enumerate(supports)]
     for candidates in (apart, [*apart, *near]):
         assert weighed(candidates=tuple(candidates))["log_share"] == pytest.approx(np.log(share))
-
-
-@pytest.mark.parametrize(
-    ("xyz", "heading_deg", "rival"),
-    [((2.9, 0, 1.5), 0, False), ((0, -3.1, 1.5), 0, True), ((2, 2, 3.0), 0, True), ((2, 2, 1.5), 0, False), ((0, 0, 1.5), 29, False),
-     ((0, 0, 1.5), -29, False), ((0, 0, 1.5), 31, True), ((0, 0, 1.5), -31, True), ((0, 0, 1.5), 359, False), ((0, 0, 1.5), 180, True)],
-)  # fmt: skip
-def test_a_rival_stands_three_metres_away_or_looks_thirty_degrees_aside(xyz, heading_deg, rival):
-    here, there = candidate(), candidate(xyz=xyz, heading_deg=heading_deg)
-    assert is_rival(here, there) == is_rival(there, here) == rival
-
-
-@given(st.floats(-180, 180), st.floats(-0.5, 0.5), st.floats(-29.5, 29.5))
-def test_whether_it_is_a_rival_does_not_depend_on_how_both_stand(heading_deg, lean_rad, apart_deg):
-    def leaning(degrees):
-        R = rotation_z(np.deg2rad(degrees)) @ rotation_y(lean_rad)
-        return replace(candidate(), T_map_camera=transform_from(R @ R_BODY_OPTICAL, np.zeros(3)))
-
-    assert not is_rival(leaning(heading_deg), leaning(heading_deg + apart_deg))
 
 
 def test_the_similarity_is_told_against_the_best_place_that_is_another(weighed):
@@ -185,7 +156,7 @@ def test_sigma_is_that_of_the_worst_horizontal_direction(weighed):
 
 
 @pytest.mark.parametrize("scale", [1.02, 1 / 1.02])
-def test_scale_is_told_in_hundredths_whichever_way_it_is_off(weighed, scale):
+def test_scale_is_told_in_hundredths_whichever_way_it_is_off(candidate, weighed, scale):
     assert weighed(candidates=(candidate(scale=scale),))["scale"] == pytest.approx(100 * np.log(1.02))
 
 
@@ -197,7 +168,7 @@ def test_the_noise_is_the_median_of_the_frames_and_points_are_counted_a_frame(we
     assert weighed(points=4500)["points"] == pytest.approx(1.5)
 
 
-def test_distances_are_from_the_best_candidate(weighed):
+def test_distances_are_from_the_best_candidate(candidate, weighed):
     there = candidate(10.0, xyz=(100, 0, 1.5))
     places = [neighbour(0, 0.9), neighbour(100, 0.7)]
     map_places = [(0.0, 0.0), (98.0, 0.0), (100.0, 0.0)]
@@ -206,7 +177,7 @@ def test_distances_are_from_the_best_candidate(weighed):
     assert found["similarity_margin"] == pytest.approx(0.8 - 0.9)
 
 
-def test_margins_of_several_frames_count_by_the_root_of_their_number(weighed, frame):
+def test_margins_of_several_frames_count_by_the_root_of_their_number(candidate, weighed, frame):
     asked = {
         "candidates": (candidate(10.0), candidate(7.0, xyz=(20, 0, 1.5))),
         "neighbours": [neighbour(0), neighbour(30)],
