@@ -15,6 +15,7 @@ import numpy as np
 from google.protobuf.message import DecodeError as ProtoError
 from pydantic import ValidationError
 
+from benchmarks.fuzz.http_bytes import SEEDS, Connections
 from service.contract import schema
 from service.contract.convert import parsed, query_from, sequence_from
 from service.contract.oscp import GeoPoseRequest, query_of
@@ -76,7 +77,8 @@ def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
         for name, data in (("rgb", b"123"), ("depth", b"456"), ("request", b"{}"))
     ) + b"\r\n--b--\r\n"  # fmt: skip
     return {
-        "multipart": Target(_multipart, (multipart,), 0.30),
+        "http": Target(Connections().take, SEEDS, 0.10),
+        "multipart": Target(_multipart, (multipart,), 0.20),
         "request_json": Target(_request, (request,), 0.18),
         "sequence_json": Target(_sequence, (sequence,), 0.06),
         "oscp_json": Target(_oscp, (_oscp_seed(),), 0.06),
