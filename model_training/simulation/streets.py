@@ -130,7 +130,7 @@ def streets_geojson(streets: list[Street]) -> dict[str, Any]:
             corridor = shapely.union_all(
                 [shapely.LineString(line).buffer(street.half_width_m + PAVEMENT_M, cap_style="flat") for line in lines]
             )
-            own = shapely.difference(corridor, shapely.union_all([taken, *polygons]), grid_size=GRID_M)
+            own = _areas(shapely.difference(corridor, shapely.union_all([taken, *polygons]), grid_size=GRID_M))
             polygons.append(own)
             features.append(
                 {
@@ -146,8 +146,16 @@ def streets_geojson(streets: list[Street]) -> dict[str, Any]:
                 }
             )
             index += 1
-        taken = shapely.union_all([taken, *polygons], grid_size=GRID_M)
+        taken = _areas(shapely.union_all([taken, *polygons], grid_size=GRID_M))
     return {"type": "FeatureCollection", "features": features}
+
+
+def _areas(shape: shapely.Geometry) -> shapely.Geometry:
+    """Its polygons alone: slivers collapse to lines on the grid, and what has lines in it GEOS refuses as an operand."""
+    if isinstance(shape, shapely.Polygon | shapely.MultiPolygon):
+        return shape
+    parts = shapely.get_parts(shapely.get_parts(shape))  # a collection may hold several that are several themselves
+    return shapely.MultiPolygon([part for part in parts if isinstance(part, shapely.Polygon)])
 
 
 def _geometry(shape: shapely.Geometry) -> dict[str, Any]:

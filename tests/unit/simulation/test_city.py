@@ -51,6 +51,16 @@ def test_street_polygons_are_valid(network):
     assert [shapely.is_valid_reason(shape) for shape in shapes] == ["Valid Geometry"] * len(shapes)
 
 
+@pytest.mark.parametrize(
+    ("seed", "size_m"), [(2007, (300.0, 400.0)), (2010, (300.0, 400.0)), (2005, (600.0, 400.0)), (2052, (600.0, 400.0))]
+)
+def test_slivers_that_collapse_to_lines_are_no_part_of_a_street(seed, size_m):
+    network = random_streets(np.random.default_rng([seed, 1]), size_m)
+    found = streets_geojson(network)["features"]  # GEOS refuses to unite what has lines in it
+    assert {feature["geometry"]["type"] for feature in found} <= {"Polygon", "MultiPolygon"}
+    assert len(found) == sum(len(street.classes()) for street in network)
+
+
 @pytest.mark.parametrize("network", NETWORKS)
 def test_every_point_of_a_centre_line_lies_in_a_street(network):
     everything = shapely.union_all(
