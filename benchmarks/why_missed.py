@@ -46,8 +46,8 @@ WHY_MISSED: dict[str, str] = {
     "real.kitti_stereo.registration.median_m": (
         "turned starts, full weight at the end, a free disparity offset and noise at the surface's range change it by less than 1 cm "
         "each; 1.2 cm of it come of how sure the ground's plane is taken to be (15 neighbouring points count once; with 50, as "
-        "before, and today's bands 0.099), since errors of real block matching are alike over more of the picture; next: their reach "
-        "told by the picture itself, which these seven frames must not choose"
+        "before, and today's bands 0.099); next: how far the ground's errors are alike, told by the picture itself, which these "
+        "seven frames must not choose"
     ),
     "real.kitti_stereo.registration.p95_m": (
         "0.141 where 50 neighbouring points of the ground count once, instead of 15, which simulated cities want; see the median"
