@@ -33,8 +33,8 @@ WHY_MISSED: dict[str, str] = {
         " work a picture than our trunk"
     ),
     "raw.unseen.precise.recall_at_1_5m": (
-        "the simulated streets are still too easy for it at its best setting; a harder city needs new training and evaluation cities, "
-        "not done yet"
+        "the three cities are of 300 x 400 m; in a watch city of 600 x 400 m it finds 0.38 of 100 queries, of 300 x 400 m 0.58, and the "
+        "stock encoder 0.99 of 300 in both; next: unseen cities of that size, all their rows anew"
     ),
     "retrieval.paper_city.precise.street_accuracy": _BORDERS,
     "retrieval.paper_city.precise.recall_at_10_5m": (
