@@ -22,9 +22,9 @@ _OVER_BARE = (
 )
 _PEERS = (
     "MLServer answers retrieval for 9 % less than ours (9.5 against 10.4 ms) and full requests for 1 % less: its handler runs in the "
-    "event loop's own thread, as its documentation advises without workers, so that nothing else is answered meanwhile; ours hands "
-    "work to another thread, so that health and refusals are; the others are 2 to 16 % dearer; of the 1.2 that a service adds to "
-    "the bare retrieval nearly all would have to go"
+    "event loop's own thread, as its documentation advises without workers; ours hands work to another thread, so that health and "
+    "refusals are answered and a stuck request stops no other; whether that is the 9 % is a guess, not measured; the others are 2 to "
+    "16 % dearer; of the 1.2 that a service adds to the bare retrieval nearly all would have to go"
 )
 WHY_MISSED: dict[str, str] = {
     "paper.streetfix.minutes_for_paper_images": (
