@@ -63,7 +63,10 @@ def invalid(error: ValidationError) -> RequestError:
 
 def request_error_from(errors: Sequence[Any]) -> RequestError:
     """The same from its list."""
-    told = [f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg']}" for each in errors[:5]]
+    told = [
+        f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg'].removeprefix('Value error, ')}"
+        for each in errors[:5]
+    ]
     field = ".".join(str(part) for part in errors[0]["loc"])
     return RequestError("; ".join(told) + "; see the schema at /openapi.json", field=field)
 

@@ -1,10 +1,14 @@
 """The contract as REST says it in JSON and gRPC in messages: requests and answers. Degrees here, radians inside."""
 
+import math
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from service.localization.query import MOST_NEIGHBOURS
+
+#: Of a focal length, in widths or heights of the picture: 175 degrees of view. What is less was given in another unit than pixels.
+LEAST_FOCAL = 0.02
 
 
 class _Strict(BaseModel):
@@ -49,13 +53,24 @@ class Camera(_Strict):
     model: Literal["PINHOLE"] = "PINHOLE"
     width: int = Field(ge=2, le=32768)
     height: int = Field(ge=2, le=32768)
-    fx: float = Field(gt=0, le=1e6)
-    fy: float = Field(gt=0, le=1e6)
+    fx: float = Field(gt=0, le=1e6, description=f"pixels, at least {LEAST_FOCAL} of the width")
+    fy: float = Field(gt=0, le=1e6, description=f"pixels, at least {LEAST_FOCAL} of the height")
     cx: float = Field(ge=-1e6, le=1e6)
     cy: float = Field(ge=-1e6, le=1e6)
     distortion: list[float] = Field(
         default_factory=list, max_length=14, description="must be empty or zero: send rectified pictures"
     )
+
+    @field_validator("fx", "fy")
+    @classmethod
+    def _is_in_pixels(cls, focal: float, info: ValidationInfo) -> float:
+        side = info.data.get("width" if info.field_name == "fx" else "height")  # None: refused itself
+        if side is not None and focal < LEAST_FOCAL * side:
+            seen_deg = 2 * math.degrees(math.atan(0.5 * side / focal))
+            raise ValueError(
+                f"{focal:g} px for a side of {side} px would see {seen_deg:.0f} degrees; give it in pixels"
+            )
+        return focal
 
 
 class Depth(_Strict):

@@ -18,6 +18,10 @@ CLOUD_FOLDER = "cloud"
 #: What maps are merged by; a service only checks its hash.
 STATISTICS_FILE = "voxels.npy"
 
+#: What no map reaches, metres from its origin; and how far a rotation may be off by what its numbers were rounded to.
+MOST_AWAY_M, _SKEW = 1e7, 1e-3
+NO_POSE = f"a pose is not finite, stretches, mirrors, or lies more than {MOST_AWAY_M:g} m from the origin"
+
 UNCALIBRATED = {"calibrated": False, "why": "nobody calibrated it; answers carry confidence null"}
 
 #: A place: pose of the levelled LiDAR (x forward, z up) and the number of its street's feature, -1 for none.
@@ -69,3 +73,12 @@ class BundleContent:
     georeference: Mapping[str, Any] | None = None
     licence: str = ""
     tool_versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def are_poses(T: Float64[NDArray[np.float64], "n 4 4"]) -> bool:
+    """Whether each turns and moves, no more: one that does not spoils all that is reckoned with it."""
+    R = T[:, :3, :3]
+    if not (np.abs(T[:, :3, 3]) <= MOST_AWAY_M).all() or not (np.abs(R) <= 1 + _SKEW).all():
+        return False
+    skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3))
+    return bool((skew < _SKEW).all() and (np.linalg.det(R) > 0).all() and (T[:, 3] == [0, 0, 0, 1]).all())

@@ -198,8 +198,10 @@ def _require_consistent(bundle: MapBundle) -> None:
         raise _defect(path / parts.PLACES_FILE, "a place lies in a street that is not there")
     if not np.array_equal(bundle.view_place, np.repeat(np.arange(counts.places), bundle.manifest.headings)):
         raise _defect(path / parts.VIEWS_FILE, "views do not lie place by place, a fan each")
-    if not np.isfinite(bundle.T_map_place).all() or not np.isfinite(bundle.view_heading_rad).all():
-        raise _defect(path / parts.PLACES_FILE, "a pose or a heading is not finite")
+    if not np.isfinite(bundle.view_heading_rad).all():
+        raise _defect(path / parts.VIEWS_FILE, "a heading is not finite")
+    if not parts.are_poses(bundle.T_map_place):
+        raise _defect(path / parts.PLACES_FILE, parts.NO_POSE)
 
 
 def _defect(path: Path, what: str) -> BundleError:

@@ -143,8 +143,10 @@ def _require_valid(content: BundleContent) -> None:
         what = "a view belongs to a place that is not there"
     elif content.place_street.min() < -1 or content.place_street.max() >= named:
         what = f"a place lies in a street that is not among the {named} of streets.geojson"
-    elif not np.isfinite(content.descriptors).all() or not np.isfinite(content.T_map_place).all():
-        what = "a descriptor or a pose is not finite"
+    elif not np.isfinite(content.descriptors).all():
+        what = "a descriptor is not finite"
+    elif not parts.are_poses(content.T_map_place):
+        what = parts.NO_POSE
     elif wrong := manifest.not_on_earth(content.georeference):
         what = f"georeference: {wrong}"
     elif "lidar_height_m" not in content.parameters:

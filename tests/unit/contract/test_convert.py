@@ -22,6 +22,11 @@ from service.runtime.engine import Located
 BOTH = {"position": {"x": 1, "y": 2}, "wgs84": {"latitude_deg": 0, "longitude_deg": 0}}
 
 
+@pytest.fixture
+def camera_document():
+    return {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5}
+
+
 def query_of(parts):
     return query_from(parsed(parts["request"], LocalizeRequest), rgb=parts["rgb"], depth=parts["depth"])
 
@@ -43,6 +48,26 @@ def test_a_transform_beyond_any_robot_is_refused(parts_of, far):
     with pytest.raises(RequestError) as caught:
         query_of(parts_of(T_vehicle_camera=T))
     assert caught.value.field == "T_vehicle_camera.position.x"
+
+
+@pytest.mark.parametrize(
+    ("field", "focal", "degrees"), [("fx", 0.5, 178), ("fy", 0.95, 175), ("fy", 1.57e-315, 180), ("fx", 1.27, 175)]
+)
+def test_a_focal_length_that_is_not_in_pixels_is_refused(camera_document, field, focal, degrees):
+    with pytest.raises(RequestError, match=f"would see {degrees} degrees; give it in pixels") as caught:
+        parsed(json.dumps({"camera": camera_document | {field: focal}}).encode(), LocalizeRequest)
+    assert caught.value.field == f"camera.{field}"
+
+
+def test_a_camera_of_nearly_175_degrees_is_taken(camera_document):
+    wide = parsed(json.dumps({"camera": camera_document | {"fx": 1.28, "fy": 0.96}}).encode(), LocalizeRequest)
+    assert (wide.camera.fx, wide.camera.fy) == (1.28, 0.96)
+
+
+def test_a_width_that_is_refused_is_told_alone(camera_document):
+    with pytest.raises(RequestError) as caught:
+        parsed(json.dumps({"camera": camera_document | {"width": 0}}).encode(), LocalizeRequest)
+    assert caught.value.field == "camera.width"
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,7 @@ def test_a_killed_writer_leaves_nothing_under_the_final_name(tmp_path: Path) -> 
         ({"view_place": np.full(48, 12, np.int32)}, "a place that is not there"),
         ({"place_street": np.full(12, 3, np.int32)}, "not among the 3"),
         ({"descriptors": np.full((48, 16), np.nan, np.float32)}, "not finite"),
+        ({"T_map_place": np.tile(2.0 * np.eye(4), (12, 1, 1))}, "a pose is not finite, stretches"),
         ({"parameters": {}}, "lidar_height_m"),
         ({"name": "a/b"}, "name"),
         ({"name": ""}, "name"),

@@ -179,6 +179,38 @@ def test_a_view_of_a_place_that_is_not_there_is_refused(bundle_copy: Path, tmp_p
         MapBundle.open(bundle_copy)
 
 
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [
+        ((0, 0), 1.01),
+        ((0, 0), 1e200),
+        ((2, 2), -1.0),
+        ((1, 3), -1.1e7),
+        ((0, 3), np.nan),
+        ((2, 0), np.inf),
+        ((3, 0), 1e-3),
+    ],
+)
+def test_a_place_whose_pose_is_no_rotation_and_translation_is_refused(
+    bundle_copy: Path, tmp_path: Path, at: tuple[int, int], value: float
+) -> None:
+    places = np.load(bundle_copy / "places.npy")
+    places["T_map_place"][5][at] = value
+    replace_file(bundle_copy, "places.npy", npy_bytes(tmp_path / "a.npy", places))
+    with pytest.raises(
+        BundleError, match=r"places\.npy: a pose is not finite, stretches, mirrors, or lies more than 1e\+07 m"
+    ):
+        MapBundle.open(bundle_copy)
+
+
+def test_a_view_whose_heading_is_not_finite_is_refused(bundle_copy: Path, tmp_path: Path) -> None:
+    views = np.load(bundle_copy / "views.npy")
+    views["heading_rad"][7] = np.nan
+    replace_file(bundle_copy, "views.npy", npy_bytes(tmp_path / "a.npy", views))
+    with pytest.raises(BundleError, match=r"views\.npy: a heading is not finite"):
+        MapBundle.open(bundle_copy)
+
+
 def test_views_that_do_not_lie_place_by_place_are_refused(bundle_copy: Path, tmp_path: Path) -> None:
     """Every place has its four, but the last view of one and the first of the next are swapped."""
     views = np.load(bundle_copy / "views.npy")
