@@ -13,15 +13,16 @@ from benchmarks.doubt import doubt_rows
 from benchmarks.full import full_paper_rows, full_unseen_rows
 from benchmarks.kitti_registration import kitti_registration_rows
 from benchmarks.kitti_retrieval import retrieve
-from benchmarks.plans import BOTH, paper_plan, unseen_plan
+from benchmarks.plans import BOTH, large_plan, paper_plan, unseen_plan
 from benchmarks.priors import prior_rows
-from benchmarks.raw import raw_condition_rows, raw_paper_rows, raw_unseen_rows
+from benchmarks.raw import raw_condition_rows, raw_paper_rows, raw_rows, raw_unseen_rows
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs, share
 from benchmarks.sequences import sequence_rows
 from benchmarks.speed import speed_rows
 from benchmarks.weather import weather_rows
 from model_training.evaluation.error_measures import wilson_interval
+from model_training.simulation.plan import SimulationPlan
 from model_training.stock import ENCODER
 from service.localization.encoder import Encoder
 
@@ -52,14 +53,32 @@ def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None
 
 def unseen_rows(report: Report, runs: Runs) -> None:
     """Three unseen cities with the stock encoder, clear and blocked."""
+    _retrieval_rows(report, runs, "unseen", unseen_plan, barred=True)
+
+
+def large_rows(report: Report, runs: Runs) -> None:
+    """What twice the size of a city costs: the same queries by retrieval, with registration, and by the raw image."""
+    _retrieval_rows(report, runs, "large", large_plan, barred=False)
+    for preset in BOTH:
+        datasets = [runs.dataset(large_plan(index)) for index in range(3)]
+        found = [runs.figures(runs.bundle(each), each, [f"drive1_{preset}"], refine=True) for each in datasets]
+        for key in ("within_0_5_m", "within_1_m", "localized"):
+            share(report, f"full.large.{preset}.{key}", found, key)
+    raw_rows(report, runs, "large", large_plan)
+
+
+def _retrieval_rows(
+    report: Report, runs: Runs, cities: str, plan_of: Callable[[int], SimulationPlan], *, barred: bool
+) -> None:
     for name, (label, bar) in UNSEEN.items():
         found = []
         for index in range(3):
-            dataset = runs.dataset(unseen_plan(index))
+            dataset = runs.dataset(plan_of(index))
             found.append(runs.figures(runs.bundle(dataset), dataset, [name]))
-        share(report, f"retrieval.unseen.{label}.recall_at_1_5m", found, "recall_at_1_5m", bar)
+        row = f"retrieval.{cities}.{label}"
+        share(report, f"{row}.recall_at_1_5m", found, "recall_at_1_5m", bar if barred else None)
         for key in ("recall_at_5_5m", "recall_at_10_5m", "street_accuracy", "within_1_m"):
-            share(report, f"retrieval.unseen.{label}.{key}", found, key)
+            share(report, f"{row}.{key}", found, key)
 
 
 def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
@@ -125,6 +144,7 @@ def main() -> None:
         "sequences": lambda: sequence_rows(report, runs),
         "priors": lambda: prior_rows(report, runs),
         "unseen": lambda: unseen_rows(report, runs),
+        "large": lambda: large_rows(report, runs),
         "paper": lambda: paper_rows(report, runs, "retrieval", barred=True),
         "weather": lambda: weather_rows(report, runs),
         "raw_unseen": lambda: raw_unseen_rows(report, runs),

@@ -1,12 +1,14 @@
 """The raw range image, which learns nothing, in the same cities, drives and conditions: what a figure of ours is worth."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from benchmarks.conditions import asked_of
 from benchmarks.plans import BOTH, paper_plan, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs
+from model_training.baselines.raw_range import STRAIGHT
 from model_training.evaluation.error_measures import wilson_interval
+from model_training.simulation.plan import SimulationPlan
 
 #: Query sets of the unseen cities: how their rows are called.
 UNSEEN = {"drive1_precise": "precise", "drive1_stereo": "stereo", "blocked25_precise": "precise_blocked_25"}
@@ -15,12 +17,21 @@ TOO_EASY = 0.40  # a city that it solves says nothing
 
 def raw_unseen_rows(report: Report, runs: Runs) -> None:
     """In the unseen cities."""
+    raw_rows(report, runs, "unseen", unseen_plan, TOO_EASY)
+
+
+def raw_rows(
+    report: Report, runs: Runs, cities: str, plan_of: Callable[[int], SimulationPlan], bar: float | None = None
+) -> None:
+    """In three cities, and of queries seen straight on alone, as a single picture is; the bar is of the precise preset."""
     for name, label in UNSEEN.items():
         parts = []
         for index in range(3):
-            dataset = runs.dataset(unseen_plan(index))
+            dataset = runs.dataset(plan_of(index))
             parts.append(runs.raw(runs.bundle(dataset), dataset, name))
-        _row(report, f"raw.unseen.{label}.recall_at_1_5m", parts, TOO_EASY if label == "precise" else None)
+        _row(report, f"raw.{cities}.{label}.recall_at_1_5m", parts, bar if label == "precise" else None)
+        straight = [{name: found for name, found in part.items() if name.endswith(STRAIGHT)} for part in parts]
+        _row(report, f"raw.{cities}.{label}.straight.recall_at_1_5m", straight)
 
 
 def raw_paper_rows(report: Report, runs: Runs) -> None:

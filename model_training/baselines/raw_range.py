@@ -2,7 +2,8 @@
 
 Four ways to compare a query's range view with the map's: L2 of the log ranges over cells that both measured; the same with
 a penalty for cells that one measured and the other did not; cosine of the masked log ranges; cosine after each view's mean
-is taken off. The best of them is what an honest comparison must beat.
+is taken off. Each with the query seen straight on, and at all turns at which the localizer asks it, which finds much more.
+The best of them is what an honest comparison must beat.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,9 @@ from service.localization.localizer import turns_on
 from service.maps.reader import MapBundle
 
 Ranges = NDArray[np.float32]
-SETTINGS = ("masked_l2", "masked_l2_gaps", "cosine", "cosine_centred")
+COMPARED = ("masked_l2", "masked_l2_gaps", "cosine", "cosine_centred")
+STRAIGHT = "_straight"
+SETTINGS = (*COMPARED, *(name + STRAIGHT for name in COMPARED))
 GAP_PENALTY = 0.15
 CHUNK = 2048
 
@@ -65,8 +68,10 @@ def raw_best_views(
 ) -> dict[str, NDArray[np.int64]]:  # fmt: skip
     """Number of the best place of queries of the sets, by every setting; -1 where a query measures nothing.
 
-    A query is asked at the same turns as the localizer asks it. ``every`` takes each n-th query of each set.
+    A query is asked at the same turns as the localizer asks it, by the settings that end in ``STRAIGHT`` at none. ``every`` takes each
+    n-th query of each set.
     """
+    straight = turns_on(bundle.grid).index(0)
     queries, usable = _query_ranges(bundle, dataset, names, every)
     asked = queries[usable].reshape(-1, *queries.shape[2:])
     best = {name: np.full(len(usable), -1, np.int64) for name in SETTINGS}
@@ -84,14 +89,15 @@ def raw_best_views(
         report("raw range images", place, total)
         if len(waiting) * len(fan) >= CHUNK or place == total:
             views = np.concatenate(waiting)
-            for name, each_turn in similarities(asked, views).items():
-                similarity = each_turn.reshape(-1, queries.shape[1], len(views)).max(axis=1)
-                at = similarity.argmax(axis=1)
-                top = similarity[np.arange(len(at)), at]
-                better = top > score[name][usable]
-                rows = np.flatnonzero(usable)[better]
-                score[name][rows] = top[better]
-                best[name][rows] = first + at[better] // len(fan)
+            for name, flat in similarities(asked, views).items():
+                each_turn = flat.reshape(-1, queries.shape[1], len(views))
+                for setting, similarity in ((name, each_turn.max(axis=1)), (name + STRAIGHT, each_turn[:, straight])):
+                    at = similarity.argmax(axis=1)
+                    top = similarity[np.arange(len(at)), at]
+                    better = top > score[setting][usable]
+                    rows = np.flatnonzero(usable)[better]
+                    score[setting][rows] = top[better]
+                    best[setting][rows] = first + at[better] // len(fan)
             first, waiting = place, []
     return best
 

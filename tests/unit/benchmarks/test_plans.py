@@ -5,6 +5,7 @@ pytest.importorskip("torch", reason="needs the extra `training`")
 from benchmarks.plans import (  # after the skip
     SEQUENCE,
     hard_plan,
+    large_plan,
     lidar_16_plan,
     more_plan,
     paper_plan,
@@ -19,6 +20,7 @@ from model_training.training.recipe import EVALUATION_SEEDS
 
 OWN = (
     [unseen_plan(k) for k in range(3)]
+    + [large_plan(k) for k in range(3)]
     + [more_plan(k) for k in range(3)]
     + [hard_plan(), lidar_16_plan(), repeating_plan()]
 )
@@ -45,6 +47,13 @@ def test_a_thousand_queries_of_each_unseen_city_and_both_plans_are_of_one_city()
     for one, other in zip(first, more, strict=True):
         assert one.model_dump(exclude={"name", "queries"}) == other.model_dump(exclude={"name", "queries"})
         assert not {query.traversal for query in one.queries} & {query.traversal for query in other.queries}
+
+
+def test_large_cities_are_asked_the_same_and_differ_in_size_alone():
+    for k in range(3):
+        small, large = unseen_plan(k), large_plan(k)
+        assert (small.size_m, large.size_m) == ((300.0, 400.0), (600.0, 400.0))
+        assert large.model_dump(exclude={"name", "size_m"}) == small.model_dump(exclude={"name", "size_m"})
 
 
 def test_every_hard_condition_stands_beside_a_clear_day():
