@@ -18,7 +18,8 @@ _OVER_BARE = (
     "medians of runs swing by 10 % (full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29); the event loop takes "
     "1.0 ms a request, and the worker's thread, between which and the loop the core changes, 0.3 to 0.7 ms more than a bare loop, "
     "with one client as with two; tried: httptools and uvloop, the routes past the framework, no proxy headers, fewer copies, bodies "
-    "in one piece that the system holds until they are whole (nothing)"
+    "in one piece that the system holds until they are whole, other intervals of thread switches and of garbage collection, one arena "
+    "of malloc (nothing); answering in the loop's thread is ruled out, since a stuck request would stop all others"
 )
 _PEERS = (
     "MLServer answers retrieval for 9 % less than ours (9.5 against 10.4 ms) and full requests for 1 % less: its handler runs in the "
