@@ -12,9 +12,10 @@ _BORDERS = (
 )
 _STEREO = (
     "not the noise: the same pictures aligned in disparity with their own true depth are 0.034 m and 0.16 degrees off (median, watch "
-    "city), so three quarters are lost in what registration minimises and over which points, and a quarter in what has moved (the map itself allows 0.07); tried: noise told at "
-    "the surface's range, rougher surfaces, leaving far points out, a fixed scale, a free offset, noise shared by neighbours, and, in "
-    "a first form, the surface on each pixel's own ray (0.125 to 0.19 m; 0.134 as it is); the last is to be gone on with"
+    "city); a quarter is lost in what has moved, the rest mostly in what registration minimises and over which points (the map itself "
+    "allows 0.07 m); tried: noise told at the surface's range, rougher surfaces, leaving far points out, a fixed scale, a free offset, "
+    "noise shared by neighbours, and, in a first form, the surface on each pixel's own ray (0.125 to 0.19 m; 0.134 as it is); to be "
+    "gone on with"
 )
 _OVER_BARE = (
     "medians of runs swing by 10 % (full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29); the event loop takes "
