@@ -13,7 +13,7 @@ PAPER_STEPS ?= 400
 DATA ?= ../shared/data/kitti_stereo
 
 # Compiled when the package is installed.
-KERNEL := hatch_build.py service/registration/kernel.c service/imaging/gather.c service/imaging/depth16.c
+KERNEL := hatch_build.py $(wildcard service/*/*.c service/*/*.h)
 
 # The console's page, and the browser's driver in its tests.
 WEB := service/console/web

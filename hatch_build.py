@@ -14,6 +14,7 @@ SOURCES = tuple(
     for name in (
         "registration/kernel.c",
         "registration/points.c",
+        "registration/rays.c",
         "imaging/gather.c",
         "imaging/level.c",
         "imaging/depth16.c",

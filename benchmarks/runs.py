@@ -37,7 +37,7 @@ def code_hash(*names: str) -> str:
     digest = hashlib.sha256()
     for name in names:
         inside = [ROOT / name] if (ROOT / name).is_file() else (ROOT / name).rglob("*")
-        for path in sorted(p for p in inside if p.suffix in (".py", ".c")):
+        for path in sorted(p for p in inside if p.suffix in (".py", ".c", ".h")):
             digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:8]
 

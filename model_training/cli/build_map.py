@@ -33,6 +33,12 @@ def command(
         bool,
         typer.Option(help="drop what later scans of a drive look through: vehicles that drove while it was surveyed"),
     ] = False,
+    align_survey: Annotated[
+        bool,
+        typer.Option(
+            help="bring the survey's scans into agreement first: poses are off by centimetres, scans tell by how much"
+        ),
+    ] = True,
     licence: Annotated[str, typer.Option(help="licence text kept in the manifest")] = "",
     calibration: Annotated[
         Path, typer.Option(help="of `streetfix calibrate` for the same encoder [default: the stock encoder's]")
@@ -49,6 +55,7 @@ def command(
     settings = BuildSettings(
         name=name or opened.name, spacing_m=spacing, headings=headings, voxel_m=voxel, expected_lidar_height_m=lidar_height,
         remove_weather=remove_weather, passes_vote=passes_vote, traffic_vote=traffic_vote, licence=licence, calibration=calibration,
+        align_survey=align_survey,
     )  # fmt: skip
     with bars() as report:
         manifest = build_map(opened, encoder, out, settings, overwrite=overwrite, report=report)

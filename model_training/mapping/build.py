@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from model_training.datasets.dataset import Dataset
+from model_training.mapping.align_survey import aligned
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.cloud import near, prepared, with_cloud
 from model_training.mapping.passes import moved
@@ -84,6 +85,9 @@ def build_map(
     with work_beside(out, key) as work:
         grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
         rows_seen = work.part("rows", lambda: {"seen": rows_seen_by(dataset, kept, grid, settings)})["seen"]
+        if settings.align_survey:
+            given = poses
+            poses = work.part("poses", lambda: {"aligned": aligned(dataset, given, kept, report=report)})["aligned"]
         drive = Drive(dataset, poses, kept, settings, encoder, grid, rows_seen)
         cloud = VoxelMap(settings.voxel_m, lattice_origin(settings.voxel_m, poses[:, :3, 3].mean(axis=0)))
         places = drive.places(cloud, work, apart=apart, report=report)
@@ -108,7 +112,7 @@ def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
     T_map_place = places.at_height(lidar_height_m)
     streets = dataset.streets()
     votes = {"passes_vote": settings.passes_vote, "traffic_vote": settings.traffic_vote}
-    voted = {name: 1.0 for name, wanted in votes.items() if wanted}
+    done = {name: 1.0 for name, wanted in {**votes, "survey_aligned": settings.align_survey}.items() if wanted}
     return BundleContent(
         name=settings.name, grid=drive.grid, headings=settings.headings, spacing_m=settings.spacing_m, rows_seen=drive.rows_seen,
         T_map_place=T_map_place, place_street=streets_of(streets, T_map_place),
@@ -118,7 +122,7 @@ def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
         calibration={"calibrated": False, "why": "no calibration fits this map's encoder; answers carry confidence null"},
         parameters={
             "lidar_height_m": lidar_height_m, "voxel_m": settings.voxel_m, "weather_removed": float(settings.remove_weather),
-            "expected_lidar_height_m": settings.expected_lidar_height_m, "survey_scans": float(len(drive.poses)), **voted,
+            "expected_lidar_height_m": settings.expected_lidar_height_m, "survey_scans": float(len(drive.poses)), **done,
         },
         licence=settings.licence,
         tool_versions=tool_versions(),

@@ -15,7 +15,9 @@ from service.errors import BundleError
 from service.maps.content import BundleContent
 
 #: Parameters that two drives of one map may differ in.
-_OF_A_DRIVE = ("lidar_height_m", "survey_scans", "passes_vote", "expected_lidar_height_m")
+_OF_A_DRIVE = ("lidar_height_m", "survey_scans", "passes_vote", "survey_aligned", "expected_lidar_height_m")
+#: Those of them that are said of a map where they hold of all of its drives.
+_OF_ALL = ("passes_vote", "survey_aligned")
 
 
 def require_same(a: BundleContent, b: BundleContent, *, names: tuple[str, str]) -> None:
@@ -75,8 +77,9 @@ def joined(a: BundleContent, b: BundleContent, *, newer_streets: bool = False) -
     streets = joined_streets(a.streets, b.streets, newer=newer_streets)
     scans = a.parameters.get("survey_scans", 0.0) + b.parameters.get("survey_scans", 0.0)
     parameters = {**a.parameters, "lidar_height_m": height_m, "survey_scans": scans}
-    if "passes_vote" not in b.parameters:
-        parameters.pop("passes_vote", None)
+    for name in _OF_ALL:
+        if name not in b.parameters:
+            parameters.pop(name, None)
     return replace(
         a, T_map_place=T_map_place, place_street=streets_of(streets, T_map_place), streets=streets, parameters=parameters,
         view_place=views_of(len(T_map_place), a.headings), descriptors=np.concatenate([a.descriptors, fresh.descriptors]),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from model_training.datasets.dataset import Dataset
+from model_training.mapping.align_survey import aligned
 from model_training.mapping.area import Area, covered_by, polygon_of
 from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
@@ -78,6 +79,9 @@ def update_map(
             bundle,
             dataset,
         )
+        if settings.align_survey:
+            given = poses
+            poses = work.part("poses", lambda: {"aligned": aligned(dataset, given, kept, report=report)})["aligned"]
         drive = Drive(dataset, poses, kept, settings, encoder, bundle.grid, bundle.rows_seen)
         cloud = voxels_of(bundle)
         fresh = VoxelMap(cloud.voxel_m, cloud.origin)

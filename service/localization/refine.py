@@ -6,15 +6,16 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.rigid import Transform, transform_from
+from service.geometry.rigid import Transform, heading_of_camera, transform_from
 from service.localization.frames import Frame
 from service.localization.prior import Prior
 from service.localization.similar import similarities_at
 from service.localization.starts import Likeness, StartSettings, level_from, starts_from
 from service.maps.reader import MapBundle
-from service.registration.covariance import covariance_of
+from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
 from service.registration.kernel import QueryPoints
-from service.registration.points import PointSettings, points_of
+from service.registration.points import DepthBlocks, PointSettings, blocks_of, points_from
+from service.registration.rays import RayPicture, RaySettings, adjust
 from service.registration.register import Registered, RegistrationSettings, register
 from service.registration.rendered import Agreement, Seen, agreement, seen_by
 from service.registration.scatter import disagreement, scatter_of
@@ -45,6 +46,7 @@ class RefineSettings:
     starts: StartSettings = field(default_factory=StartSettings)
     points: PointSettings = field(default_factory=PointSettings)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    rays: RaySettings = field(default_factory=RaySettings)
 
 
 def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> RefineSettings:
@@ -121,7 +123,8 @@ def refine(
     reference = frames[0]
     if reference.query.baseline_m is not None:
         settings = settings_for_rig(settings, reference.focal_px * reference.query.baseline_m)
-    each = [_points(frame, settings) for frame in frames]
+    blocks = [blocks_of(f.query.depth_m, f.query.camera, settings.points, noise=f.noise) for f in frames]
+    each = [_points(frame, own, settings) for frame, own in zip(frames, blocks, strict=True)]
     merged = each[0] if len(each) == 1 else _merged(frames, each)
     seen = [
         seen_by(points, frame.query.camera, frame.R_level_camera) for frame, points in zip(frames, each, strict=True)
@@ -137,22 +140,36 @@ def refine(
     noise = float(np.median([frame.noise for frame in frames]))
     candidates.sort(key=lambda candidate: -candidate.support)
     best = candidates[0].registered
-    scatter = scatter_of(cloud, merged, best, settings.registration)
-    covariance = covariance_of(best.information, scatter, noise)
+    pictures = _pictures(frames, blocks, settings)
+    adjusted = adjust(cloud, pictures, best, settings.rays)
+    if adjusted is None:
+        scatter, model = scatter_of(cloud, merged, best, settings.registration), OF_POINTS
+    else:
+        (best, scatter), model = adjusted, OF_RAYS
+        T_map_camera = transform_from(best.R_map_level @ reference.R_level_camera, best.camera_m)
+        candidates[0] = replace(candidates[0], T_map_camera=T_map_camera, registered=best)
+    heading = heading_of_camera(candidates[0].T_map_camera)
+    covariance = covariance_of(best.information, scatter, noise, heading, model)
     return Refined(tuple(candidates), covariance, len(merged), disagreement(best.information, scatter))
 
 
-def _points(frame: Frame, settings: RefineSettings) -> QueryPoints:
-    query = frame.query
-    return points_of(
-        query.depth_m,
-        query.camera,
-        frame.R_level_camera,
-        frame.views.height_m,
-        settings.points,
-        noise=frame.noise,
+def _points(frame: Frame, blocks: DepthBlocks, settings: RefineSettings) -> QueryPoints:
+    return points_from(
+        blocks, frame.R_level_camera, frame.views.height_m, settings.points, noise=frame.noise,
         focal_baseline_px_m=settings.focal_baseline_px_m,
-    )
+    )  # fmt: skip
+
+
+def _pictures(frames: tuple[Frame, ...], blocks: list[DepthBlocks], settings: RefineSettings) -> list[RayPicture]:
+    """What the rays of every frame measured, seen from the reference's level frame."""
+    rig = None if frames[0].query.baseline_m is None else settings.focal_baseline_px_m
+    pictures = []
+    for frame, own in zip(frames, blocks, strict=True):
+        T = level_from(frame.T_reference_camera, frame.R_level_camera, frames[0].R_level_camera)
+        T_level_camera = T @ transform_from(frame.R_level_camera, np.zeros(3))
+        inverse = np.divide(1.0, own.z_m, out=np.zeros_like(own.z_m), where=own.z_m > 0)
+        pictures.append(RayPicture(inverse, own.camera, T_level_camera, frame.noise, rig))
+    return pictures
 
 
 def _merged(frames: tuple[Frame, ...], each: list[QueryPoints]) -> QueryPoints:

@@ -8,14 +8,11 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "surfel.h"
+
 #define UNKNOWNS 8
 #define BLOCK 8
 #define BLOCK_CELLS (BLOCK * BLOCK * BLOCK)
-
-typedef struct {
-    float x, y, z, nx, ny, nz, thickness;
-    uint32_t points;
-} Surfel;
 
 typedef struct {
     double ox, oy, oz, cell;     /* corner of the grid, metres; edge of a cell */

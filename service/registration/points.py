@@ -86,6 +86,47 @@ def inverse_depth_noise(depth_m: Float32[NDArray[np.float32], "H W"]) -> float:
     return float(1.4826 * np.median(room[:known]) / np.sqrt(6.0))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthBlocks:
+    """A depth picture thinned to blocks.
+
+    Attributes:
+        z_m: of each block the depth whose inverse is the median; 0 where too little was measured, on an edge, or beyond the reach.
+        camera: of which every block is a pixel.
+    """
+
+    z_m: Float32[NDArray[np.float32], "H W"]
+    camera: PinholeCamera
+
+
+def blocks_of(
+    depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, settings: PointSettings, *, noise: float
+) -> DepthBlocks:
+    """Thin a depth picture to blocks.
+
+    Args:
+        depth_m: z, metres, 0 where nothing was measured.
+        camera: of the same aspect.
+        settings: how many blocks, and what makes an edge.
+        noise: standard deviation of one pixel's inverse depth, 1/m.
+    """
+    height, width = depth_m.shape
+    own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
+    size = max(1, width // settings.columns)
+    rows, columns = height // size, width // size
+    skip = max(1, size // 4)  # so at most 49 pixels of a block are read
+    depth_m, z = np.ascontiguousarray(depth_m, np.float32), np.empty((rows, columns), np.float32)
+    _library().streetfix_blocks(
+        depth_m.ctypes.data, byref(_Blocks(width, size, skip, rows, columns, settings.edge, noise, settings.reach_m)),
+        z.ctypes.data,
+    )  # fmt: skip
+    centre_px = float(np.arange(0, size, skip).mean())  # of the pixels that were read, not of the block
+    small = PinholeCamera(
+        columns, rows, own.fx / size, own.fy / size, (own.cx - centre_px) / size, (own.cy - centre_px) / size
+    )
+    return DepthBlocks(z, small)
+
+
 def points_of(
     depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R_level_camera: Rotation, height_m: float,
     settings: PointSettings, *, noise: float | None = None, focal_baseline_px_m: float = 80.0,
@@ -101,21 +142,19 @@ def points_of(
         noise: standard deviation of one pixel's inverse depth, 1/m; read off the picture where it is not given.
         focal_baseline_px_m: of the camera; only scales the unit of the disparity offset.
     """
-    height, width = depth_m.shape
-    own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
-    size = max(1, width // settings.columns)
-    rows, columns = height // size, width // size
-    skip = max(1, size // 4)  # so at most 49 pixels of a block are read
     noise = inverse_depth_noise(depth_m) if noise is None else noise
-    depth_m, z = np.ascontiguousarray(depth_m, np.float32), np.empty(rows * columns, np.float32)
-    _library().streetfix_blocks(
-        depth_m.ctypes.data, byref(_Blocks(width, size, skip, rows, columns, settings.edge, noise, settings.reach_m)),
-        z.ctypes.data,
-    )  # fmt: skip
+    blocks = blocks_of(depth_m, camera, settings, noise=noise)
+    return points_from(blocks, R_level_camera, height_m, settings, noise=noise, focal_baseline_px_m=focal_baseline_px_m)
+
+
+def points_from(
+    blocks: DepthBlocks, R_level_camera: Rotation, height_m: float, settings: PointSettings, *, noise: float,
+    focal_baseline_px_m: float,
+) -> QueryPoints:  # fmt: skip
+    """Points of a level frame from a picture's blocks; arguments as in ``points_of``."""
+    own, z = blocks.camera, blocks.z_m.ravel()
     kept = np.flatnonzero(z)
-    z, (v, u) = z[kept], np.divmod(kept, columns)
-    centre_px = float(np.arange(0, size, skip).mean())  # of the pixels that were read, not of the block
-    u, v = u * size + centre_px, v * size + centre_px
+    z, (v, u) = z[kept], np.divmod(kept, own.width)
     rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
     level: Float64[NDArray[np.float64], "n 3"] = rays @ R_level_camera.T
     xyz = z[:, None] * level

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.build import BuildSettings, build_map
 
-SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None)
+#: Its poses are exact, and what is merged is compared with what is built at once; bringing scans into agreement has tests of its own.
+SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False)
 
 
 class Part(Dataset):

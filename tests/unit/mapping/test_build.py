@@ -13,7 +13,7 @@ from service.localization.localizer import Localizer
 from service.localization.query import Query
 from service.maps.reader import MapBundle
 
-SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None)
+SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Work
 from service.geometry.rigid import transform_from, transform_points
 
-SETTINGS = BuildSettings(name="street", spacing_m=4.0, calibration=None)
+SETTINGS = BuildSettings(name="street", spacing_m=4.0, calibration=None, align_survey=False)
 LIDAR_M = 1.8
 BOX = (np.array([27.0, 3.0, 0.0]), np.array([31.0, 4.8, 1.5]))  # a parked car
 POLE = (np.array([40.0, 5.0, 0.0]), np.array([40.08, 5.08, 4.0]))

@@ -13,14 +13,16 @@ def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
 
 
 def slow_surfels(points, *, voxel_m=0.5, origin=(100.0, -50.0, 2.0), fewest=5):
-    """Voxel by voxel: mean of its points; normal and thickness of those in it and its 26 neighbours."""
+    """Voxel by voxel: mean of its points; normal and thickness of those in it and, weighted by how it lies, in its 26 neighbours."""
     cells = np.floor((points - np.array(origin)) / voxel_m).astype(int)
     rows = []
     for cell in np.unique(cells, axis=0):
         own = points[(cells == cell).all(axis=1)]
         around = points[(np.abs(cells - cell) <= 1).all(axis=1)]
         if len(around) >= fewest:
-            variances, axes = np.linalg.eigh(np.cov(around, rowvar=False, bias=True))
+            axes_away = np.abs(cells[(np.abs(cells - cell) <= 1).all(axis=1)] - cell).sum(axis=1)
+            weights = np.array([1.0, 0.3, 0.1, 0.03])[axes_away]
+            variances, axes = np.linalg.eigh(np.cov(around, rowvar=False, ddof=0, aweights=weights))
             rows.append((own.mean(axis=0), axes[:, 0], np.sqrt(max(variances[0], 0)), len(own)))
     return rows
 
@@ -59,6 +61,18 @@ def test_the_normal_of_a_plane_is_square_to_it():
     found = map_of(flat + [100, -50, 2]).surfels(fewest=30)
     assert np.abs(found.normals @ normal).min() > 0.999
     assert found.thickness_m.max() < 1e-3
+
+
+def test_a_corner_is_not_rounded_off():
+    """Two walls that meet: their normals stay their own up to a voxel from it, where a neighbour's points count in full they would not."""
+    rng = np.random.default_rng(4)
+    u, v = rng.uniform(0, 3, (2, 30000))
+    walls = np.concatenate([np.stack([u, 0 * u, v], axis=1)[:15000], np.stack([0 * u, u, v], axis=1)[15000:]])
+    found = map_of(walls + [100.1, -49.9, 2.0]).surfels(fewest=30)
+    inside = (found.positions[:, 2] > 2.6) & (found.positions[:, 2] < 4.4)
+    away = np.min(np.abs(found.positions[:, :2] - [100.1, -49.9]).max(axis=1)[:, None], axis=1)
+    turned = 1 - np.max(np.abs(found.normals[:, :2]), axis=1)
+    assert turned[inside & (away > 0.5)].max() < 0.05
 
 
 def test_thickness_is_the_deviation_across_the_plane():

@@ -17,7 +17,7 @@ from model_training.mapping.work import key_of, work_beside, work_folder
 from service.errors import BundleError, DatasetError
 from service.maps.reader import MapBundle
 
-SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None)
+SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False)
 
 
 class KilledError(Exception):

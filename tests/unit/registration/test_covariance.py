@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -5,23 +7,34 @@ from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
 from service.registration import covariance
-from service.registration.covariance import covariance_of
+from service.registration.covariance import CovarianceModel
 from service.registration.surfel_map import SurfelMap
 
 PRIOR_SIGMA = np.array([30.0, 30.0, 0.3, *np.deg2rad([2.0, 2.0, 10.0])])
 PRIOR = np.diag([*PRIOR_SIGMA, 0.01, 0.3]) ** 2
-FLOOR = np.array([0.02, 0.03, 0.01, *np.deg2rad([0.02, 0.03, 0.05])])
+FLOOR = np.array([0.02, 0.02, 0.01, *np.deg2rad([0.02, 0.03, 0.05])])
 NONE = np.zeros((8, 8))
 #: Of pictures whose deviations are twice those of independent points, and three times those of patches.
 NOISE = 1e-3
+MODEL = CovarianceModel(
+    independent=2.0,
+    independent_power=0.5,
+    shared=3.0,
+    axes=(1.0,) * 6,
+    axes_power=(0.0,) * 6,
+    floor=(0.02, 0.02, 0.01, 0.02, 0.03, 0.05),
+)
+
+
+def covariance_of(information, scatter, noise, model=MODEL, heading_rad=0.0):
+    return covariance.covariance_of(information, scatter, noise, heading_rad, model)
 
 
 @pytest.fixture(autouse=True)
 def counted(monkeypatch):
     """What these tests count on."""
     numbers = {
-        "AT_NOISE": NOISE, "INDEPENDENT": 2.0, "INDEPENDENT_POWER": 0.5, "SHARED": 3.0, "_AXES": np.ones(6),
-        "_AXES_POWER": np.zeros(6), "LEAST": NOISE / 16, "MOST": 16 * NOISE, "_FLOOR": FLOOR,
+        "AT_NOISE": NOISE, "LEAST": NOISE / 16, "MOST": 16 * NOISE,
     }  # fmt: skip
     for name, value in numbers.items():
         monkeypatch.setattr(covariance, name, value)
@@ -39,8 +52,8 @@ informations = st.builds(
 )
 
 
-def without_floor(information, scatter, noise=NOISE):
-    return covariance_of(information, scatter, noise) - np.diag(FLOOR**2)
+def without_floor(information, scatter, noise=NOISE, model=MODEL):
+    return covariance_of(information, scatter, noise, model) - np.diag(FLOOR**2)
 
 
 @pytest.mark.parametrize(
@@ -137,15 +150,27 @@ def test_endless_information_leaves_the_floor_of_each_axis(scatter):
     ("noise", "factors"),
     [(NOISE, [1, 1, 1, 0.5, 0.5, 1]), (16 * NOISE, [1, 1, 0.25, 0.5, 0.5, 2]), (NOISE / 16, [1, 1, 4, 0.5, 0.5, 0.5])],
 )
-def test_axes_are_stretched_by_factors_of_their_own_but_not_their_floor(monkeypatch, noise, factors):
+def test_axes_are_stretched_by_factors_of_their_own_but_not_their_floor(noise, factors):
     """Deviations are; so correlations stay as they are, and so does the floor."""
     information, scatter = random_information(3, 30, 1e3), random_information(4, 30, 1e4)
     plain = without_floor(information, scatter, noise)
-    monkeypatch.setattr(covariance, "_AXES", np.array([1.0, 1.0, 1.0, 0.5, 0.5, 1.0]))
-    monkeypatch.setattr(covariance, "_AXES_POWER", np.array([0.0, 0.0, -0.5, 0.0, 0.0, 0.25]))
-    found = without_floor(information, scatter, noise)
+    stretched = replace(MODEL, axes=(1.0, 1.0, 1.0, 0.5, 0.5, 1.0), axes_power=(0.0, 0.0, -0.5, 0.0, 0.0, 0.25))
+    found = without_floor(information, scatter, noise, stretched)
     np.testing.assert_allclose(found, plain * np.outer(factors, factors), rtol=1e-9, atol=1e-15)
     assert np.abs(plain[0, 3:]).min() > 0  # or what is said of correlations would be of nothing
+
+
+@given(st.integers(0, 10**6), st.floats(-7, 7))
+def test_along_and_across_the_view_are_stretched_wherever_it_points(seed, heading):
+    """Turning all that is known along with the view turns the covariance; and its floor, the same in x and y, stays."""
+    known, patches = random_information(seed, 30, 1e3), random_information(seed + 1, 30, 1e4)
+    model = replace(MODEL, axes=(2.0, 0.5, 1.0, 0.7, 1.4, 1.0))
+    turn = np.eye(8)
+    turn[:6, :6] = np.kron(np.eye(2), rotation_z(heading))
+    ahead = covariance_of(known, patches, NOISE, model) - np.diag(FLOOR**2)
+    turned = covariance_of(turn @ known @ turn.T, turn @ patches @ turn.T, NOISE, model, heading) - np.diag(FLOOR**2)
+    six = turn[:6, :6]
+    np.testing.assert_allclose(turned, six @ ahead @ six.T, rtol=1e-4, atol=1e-6 * np.abs(ahead).max())
 
 
 @pytest.mark.parametrize("disagree", [0.0, 1.0])

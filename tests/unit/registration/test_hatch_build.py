@@ -13,8 +13,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[3]
 C_FILES = tuple(
     f"service/{name}.c"
-    for name in ("registration/kernel", "registration/points", "imaging/gather", "imaging/level", "imaging/depth16")
-)
+    for name in (
+        "registration/kernel", "registration/points", "registration/rays", "imaging/gather", "imaging/level", "imaging/depth16"
+    )
+)  # fmt: skip
+HEADERS = ("service/registration/surfel.h",)
 T = TypeVar("T")
 
 
@@ -78,7 +81,7 @@ def test_only_a_machine_without_a_compiler_needs_one_from_the_package_index(hook
 @pytest.fixture
 def tree(tmp_path):
     """A source tree of the C files alone."""
-    for source in C_FILES:
+    for source in (*C_FILES, *HEADERS):
         (tmp_path / source).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / source, tmp_path / source)
     return tmp_path
@@ -117,6 +120,7 @@ def test_each_file_is_compiled_beside_its_source(hook, machine, commands, tree, 
     assert data["artifacts"] == [
         "/service/registration/_kernel.so",
         "/service/registration/_points.so",
+        "/service/registration/_rays.so",
         "/service/imaging/_gather.so",
         "/service/imaging/_level.so",
         "/service/imaging/_depth16.so",

@@ -1,0 +1,106 @@
+"""Survey poses brought into agreement: every scan is registered on the map that all of them make, over and over.
+
+Poses of a survey are off by centimetres, differently at every visit and every few dozen metres, so the map of them is thicker than its
+walls. Scans themselves are measured better than that. Each round builds a coarse map of all scans where they are said to stand and
+moves each onto it; errors average out over what scans see in common. The drive as a whole stays where it was: what all scans have
+in common no scan can tell, and each is held near its given pose.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy.typing import NDArray
+
+from model_training.datasets.dataset import Dataset
+from model_training.mapping.voxel_map import VoxelMap, lattice_origin
+from service.geometry.rigid import inverse, transform_points
+from service.registration.kernel import STATE, QueryPoints, SolverOptions, align
+from service.registration.surfel_map import SurfelMap
+
+ROUNDS = 4
+#: Points of a scan that take part, and their ranges: nearer ones are the vehicle, further ones tell more of its angles than of its place.
+POINTS, NEAREST_M, REACH_M = 3000, 2.5, 40.0
+VOXEL_M = 0.4
+#: Noise of a LiDAR's range, and roughness of surfaces, metres.
+SIGMA_M, SURFACE_M = 0.02, 0.02
+#: Of the given poses, metres and radians: what they are held with, as if so many points said so.
+POSITION_M, TILT_RAD, HELD_BY = 0.03, float(np.deg2rad(0.05)), 10.0
+#: Points further off the map than this say nothing: the given poses are surveyed ones.
+OFF_M = 0.5
+_SOLVER = SolverOptions(
+    iterations=6, reach=OFF_M, robust_first=0.1, robust_last=0.05, surface=SURFACE_M, prior_weight=HELD_BY / POINTS, tilt=TILT_RAD,
+    height=POSITION_M, position=POSITION_M, free_scale=False,
+)  # fmt: skip
+
+_TOGETHER = 64  # scans whose points are summed up at once
+
+Poses = Float64[NDArray[np.float64], "N 4 4"]
+Report = Callable[[str, int, int], None]
+
+
+def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: Report = lambda *_: None) -> Poses:
+    """T_map_lidar of every scan, brought into agreement; those between two kept ones move as the one before.
+
+    Args:
+        dataset: with the scans.
+        poses: as the survey gives them.
+        kept: numbers of the scans that take part.
+        report: told after every scan that was read, and every one that was registered.
+    """
+    steps = len(kept) * (1 + ROUNDS)
+    scans = []
+    for done, number in enumerate(kept):
+        scans.append(_thinned(dataset.scan(int(number))[:, :3], int(number)))
+        report("survey", done + 1, steps)
+    now = poses[kept].copy()
+    for done in range(ROUNDS):
+        cloud = _map_of(scans, now)
+        if cloud is None:
+            break
+        for k, points in enumerate(scans):
+            if len(points.sigma):
+                now[k] = _registered(cloud, points, now[k], poses[kept[k]])
+            report("survey", len(kept) * (1 + done) + k + 1, steps)
+    owner = np.clip(np.searchsorted(kept, np.arange(len(poses)), side="right") - 1, 0, len(kept) - 1)
+    moved: Poses = (now @ inverse_each(poses[kept]))[owner] @ poses
+    return moved
+
+
+def inverse_each(T: Poses) -> Poses:
+    """Inverse of each of several transforms."""
+    return np.stack([inverse(each) for each in T])
+
+
+def _thinned(points: Float32[NDArray[np.float32], "n 3"], number: int) -> QueryPoints:
+    """Some of a scan, drawn with its range, since near ones are the most; the same whenever it is read."""
+    range_m = np.linalg.norm(points, axis=1)
+    points, range_m = (each[(range_m > NEAREST_M) & (range_m < REACH_M)] for each in (points, range_m))
+    if len(points) > POINTS:
+        chance = range_m.astype(np.float64) / range_m.sum(dtype=np.float64)
+        chosen = np.random.default_rng(number).choice(len(points), POINTS, replace=False, p=chance / chance.sum())
+        points, range_m = points[chosen], range_m[chosen]
+    one = np.ones(len(points), np.float32)
+    points = np.ascontiguousarray(points, np.float32)
+    return QueryPoints(points, points / range_m[:, None].astype(np.float32), np.float32(SIGMA_M) * one, one, 0 * one)
+
+
+def _map_of(scans: list[QueryPoints], poses: Poses) -> SurfelMap | None:
+    voxels = VoxelMap(VOXEL_M, lattice_origin(VOXEL_M, poses[:, :3, 3].mean(axis=0)))
+    for first in range(0, len(scans), _TOGETHER):
+        some = zip(poses[first : first + _TOGETHER], scans[first : first + _TOGETHER], strict=True)
+        voxels.add(np.concatenate([transform_points(T, points.xyz.astype(np.float64)) for T, points in some]))
+    surfels = voxels.surfels()
+    return SurfelMap.prepare(voxels.origin, *voxels.tiles(surfels)) if len(surfels.positions) else None
+
+
+def _registered(
+    cloud: SurfelMap, points: QueryPoints, T: NDArray[np.float64], T_given: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    state = np.zeros(1, STATE)
+    state["R"], state["t"] = T[:3, :3], T[:3, 3] - cloud.origin_m
+    state["anchor"], state["up"] = T_given[:3, 3] - cloud.origin_m, T_given[:3, 2]
+    align(cloud.grid, cloud.surfels, points, state, _SOLVER)
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = state["R"][0], state["t"][0] + cloud.origin_m
+    return found

@@ -1,0 +1,297 @@
+"""The last stage of registration: the map's surface on each pixel's own ray, residuals in inverse depth.
+
+Looked up where it was measured, a noisy point finds whatever surface happens to be near: by a stereo rig metres off. Where its ray
+meets the map does not depend on its noise, and the residual is in the unit that a triangulating camera errs evenly in. What neighbouring
+pixels err alike (of block matching, or a car that has moved) is one more unknown for each patch of the picture.
+"""
+
+import ctypes
+from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32
+from numpy.typing import NDArray
+
+from service.compiled import load
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import Rotation, Transform, transform_from
+from service.registration.kernel import UNKNOWNS
+from service.registration.register import Registered
+from service.registration.surfel_map import TILE_M, SurfelMap
+
+LIBRARY = Path(__file__).with_name("_rays.so")
+MOST_PATCH = 16  # pixels along its edge; as in ``rays.c``
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RaySettings:
+    """Ours, November 2026; chosen on watch cities.
+
+    Attributes:
+        rounds: of looking up what the rays meet, and
+        steps: of the solver in each.
+        radius_m: of the disc that a surfel is taken for.
+        behind_m: discs so far behind the first one on a ray may be the same surface.
+        grazing: cosine; discs seen flatter are not met.
+        nearest_m: of depths that count, and
+        reach_m: the furthest.
+        surface_m: how far the map's surfaces may be off along a ray.
+        robust: standard deviations at which the robust kernel (Geman and McClure) takes three quarters off a pixel's weight.
+        patch: pixels of the small picture along the edge of a patch.
+        shared: standard deviation of what a patch's pixels err alike, in units of one pixel's noise.
+        alike: so many pixels tell as much as one; against the priors.
+        position_m: standard deviations of the priors about the pose that is adjusted,
+        turn_rad: likewise;
+        scale: and of the depth's scale, which is 1;
+        offset_px: and of a rig's disparity offset, which is 0.
+        fewest: pictures of which fewer pixels meet the map adjust nothing.
+    """
+
+    rounds: int = 2
+    steps: int = 2
+    radius_m: float = 0.2
+    behind_m: float = 0.3
+    grazing: float = 0.05
+    nearest_m: float = 0.5
+    reach_m: float = 40.0
+    surface_m: float = 0.05
+    robust: float = 1.5
+    patch: int = 6
+    shared: float = 1.0
+    alike: float = 8.0
+    position_m: float = 1.0
+    turn_rad: float = float(np.deg2rad(2.0))
+    scale: float = 0.01
+    offset_px: float = 0.6
+    fewest: int = 300
+
+    def __post_init__(self) -> None:
+        """Refuse patches that the kernel has no room for."""
+        if not 1 <= self.patch <= MOST_PATCH:
+            raise ValueError(f"patch: {self.patch} is not from 1 to {MOST_PATCH}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayPicture:
+    """A small picture of inverse depths.
+
+    Attributes:
+        inverse: 1/m, 0 where nothing was measured.
+        camera: of the small picture.
+        T_level_camera: of the camera against the reference's level frame.
+        noise: standard deviation of an inverse depth, 1/m.
+        focal_baseline_px_m: of a stereo rig; None where the depth has no disparity.
+    """
+
+    inverse: Float32[NDArray[np.float32], "H W"]
+    camera: PinholeCamera
+    T_level_camera: Transform
+    noise: float
+    focal_baseline_px_m: float | None
+
+
+#: Room for one surfel in the camera's axes: position, normal, number, the pixels that it may cover.
+_DISC = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("number", "<i4"), ("box", "<i2", (4,))])
+
+
+class _View(Structure):
+    _fields_ = [("R", c_double * 9), ("t", c_double * 3), *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
+                ("width", c_int64), ("height", c_int64)]  # fmt: skip
+
+
+class _Discs(Structure):
+    _fields_ = [(name, c_double) for name in ("radius", "nearest", "reach", "behind", "grazing")]
+
+
+class _Asked(Structure):
+    _fields_ = [("about", c_double * 3), *((name, c_double) for name in (
+        "scale", "offset", "unit", "noise", "surface", "robust", "shared", "nearest", "reach", "grazing")), ("patch", c_int64)]  # fmt: skip
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    library = load(LIBRARY)
+    library.streetfix_meet.argtypes = [
+        c_void_p, c_void_p, c_int64, POINTER(_View), POINTER(_Discs), c_void_p, c_void_p, c_void_p, c_void_p
+    ]  # fmt: skip
+    library.streetfix_meet.restype = None
+    library.streetfix_pull.argtypes = [
+        c_void_p, POINTER(_View), c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p
+    ]  # fmt: skip
+    library.streetfix_pull.restype = c_int64
+    return library
+
+
+def meet(
+    cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera, settings: RaySettings
+) -> Int32[NDArray[np.int32], "H W"]:
+    """Number of the surfel that each pixel's ray meets, -1 for none.
+
+    Args:
+        cloud: the map's.
+        T_map_camera: in the surfels' frame.
+        camera: of a small picture.
+        settings: of the discs.
+    """
+    parts, room = _in_view(cloud, T_map_camera, camera, settings)
+    view = _view(T_map_camera, camera)
+    seen, met = np.empty(room, _DISC), np.empty((camera.height, camera.width), np.int32)
+    first, middle = np.empty((2, camera.height * camera.width), np.float32)
+    discs = _Discs(settings.radius_m, settings.nearest_m, settings.reach_m, settings.behind_m, settings.grazing)
+    _library().streetfix_meet(
+        cloud.surfels.ctypes.data, parts.ctypes.data, len(parts), byref(view), byref(discs), seen.ctypes.data, first.ctypes.data,
+        middle.ctypes.data, met.ctypes.data,
+    )  # fmt: skip
+    return met
+
+
+def _in_view(
+    cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera, settings: RaySettings
+) -> tuple[NDArray[np.int64], int]:
+    """First surfel and count of the tiles that a camera may see, and how many surfels they hold.
+
+    Seen from above, its field of view lies in the hull of where it stands and of what is furthest in its corners.
+    """
+    u, v = (np.array([-0.5, side - 0.5]) for side in (camera.width, camera.height))
+    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    corners = settings.reach_m * np.stack([x.ravel(), y.ravel(), np.ones(4)], axis=1) @ T_map_camera[:3, :3].T
+    hull = np.vstack([np.zeros(2), corners[:, :2]])
+    away = cloud.tiles[:, :2] - T_map_camera[:2, 3]
+    half = TILE_M / np.sqrt(2) + settings.radius_m
+    seen = np.ones(len(away), bool)
+    for one, other in combinations(range(len(hull)), 2):
+        along = hull[other] - hull[one]
+        length = np.hypot(*along)
+        if length < 1e-6:
+            continue
+        outward = np.array([along[1], -along[0]]) / length
+        sides = (hull - hull[one]) @ outward
+        for sign in (1.0, -1.0):
+            if (sign * sides <= 1e-6).all():  # all of it lies on the other side of this edge
+                seen &= sign * ((away - hull[one]) @ outward) <= half
+    parts = np.ascontiguousarray(cloud.tiles[seen, 2:4].astype(np.int64))
+    return parts, int(parts[:, 1].sum())
+
+
+def _view(T_map_camera: Transform, camera: PinholeCamera) -> _View:
+    return _View(
+        (c_double * 9)(*T_map_camera[:3, :3].ravel()), (c_double * 3)(*T_map_camera[:3, 3]), camera.fx, camera.fy, camera.cx,
+        camera.cy, camera.width, camera.height,
+    )  # fmt: skip
+
+
+@dataclass(slots=True)
+class _State:
+    """What is adjusted: pose of the reference's level frame in the surfels' frame, log scale, disparity offset (px)."""
+
+    R: Rotation
+    t: Float64[NDArray[np.float64], "3"]
+    log_scale: float
+    offset: float
+
+    def moved(self, step: Float64[NDArray[np.float64], "8"]) -> "_State":
+        return _State(
+            _turned_by(step[3:6]) @ self.R, self.t + step[:3], self.log_scale + float(step[6]), self.offset + float(step[7])
+        )  # fmt: skip
+
+    def camera_of(self, picture: RayPicture) -> Transform:
+        T: Transform = transform_from(self.R, self.t) @ picture.T_level_camera
+        return T
+
+
+@dataclass(frozen=True, slots=True)
+class _Pull:
+    """Normal equations of all pixels, the scatter of their patches' pulls (where asked for), and how many pixels took part."""
+
+    H: Float64[NDArray[np.float64], "8 8"]
+    b: Float64[NDArray[np.float64], "8"]
+    scatter: Float64[NDArray[np.float64], "8 8"]
+    pixels: int
+
+
+def adjust(
+    cloud: SurfelMap, pictures: list[RayPicture], found: Registered, settings: RaySettings
+) -> tuple[Registered, Float64[NDArray[np.float64], "8 8"]] | None:
+    """Move a registered pose to where the rays of all pictures agree best with the map; None where too little is met.
+
+    Args:
+        cloud: the map's.
+        pictures: the reference's first.
+        found: of the reference's level frame.
+        settings: of the solver.
+
+    Returns:
+        The pose, its ``information`` that of the pixels alone, and the sum over patches of the outer products of their pulls
+        (as in ``scatter_of``).
+    """
+    state = _State(found.R_map_level, found.camera_m - cloud.origin_m, float(np.log(found.scale)), found.offset)
+    free = np.ones(UNKNOWNS, bool)
+    free[7] = pictures[0].focal_baseline_px_m is not None
+    sigma = np.r_[np.full(3, settings.position_m), np.full(3, settings.turn_rad), settings.scale, settings.offset_px]
+    prior, moved = np.diag(sigma**-2.0), np.zeros(UNKNOWNS)
+    moved[6:] = state.log_scale, state.offset  # these priors are about none, the pose's about what was registered
+    for _ in range(settings.rounds):
+        met = [meet(cloud, state.camera_of(picture), picture.camera, settings) for picture in pictures]
+        for _ in range(settings.steps):
+            pull = _pull(cloud, pictures, met, state, settings)
+            if pull.pixels < settings.fewest:
+                return None
+            told, wanted = pull.H / settings.alike + prior, pull.b / settings.alike - prior @ moved
+            step = np.zeros(UNKNOWNS)
+            step[free] = np.linalg.solve(told[np.ix_(free, free)], wanted[free])
+            state, moved = state.moved(step), moved + step
+    pull = _pull(cloud, pictures, met, state, settings, scattered=True)
+    pose = replace(
+        found, R_map_level=state.R, camera_m=state.t + cloud.origin_m, scale=float(np.exp(state.log_scale)),
+        offset=state.offset, information=pull.H,
+    )  # fmt: skip
+    return pose, pull.scatter
+
+
+def _pull(
+    cloud: SurfelMap, pictures: list[RayPicture], met: list[Int32[NDArray[np.int32], "H W"]], state: _State, settings: RaySettings, *,
+    scattered: bool = False,
+) -> _Pull:  # fmt: skip
+    H, b, scatter, pixels = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS), np.zeros((UNKNOWNS, UNKNOWNS)), 0
+    for picture, surfels in zip(pictures, met, strict=True):
+        camera, rig = picture.camera, picture.focal_baseline_px_m
+        down, across = (-(-side // settings.patch) for side in (camera.height, camera.width))
+        pulls = np.zeros((down, across, UNKNOWNS))
+        asked = _Asked(
+            (c_double * 3)(*state.t), float(np.exp(state.log_scale)), state.offset, 0.0 if rig is None else 1.0 / rig,
+            picture.noise, settings.surface_m, settings.robust, settings.shared * picture.noise, settings.nearest_m,
+            settings.reach_m, settings.grazing, settings.patch,
+        )  # fmt: skip
+        view = _view(state.camera_of(picture), camera)
+        pixels += _library().streetfix_pull(
+            cloud.surfels.ctypes.data, byref(view), surfels.ctypes.data, picture.inverse.ctypes.data, byref(asked), H.ctypes.data,
+            b.ctypes.data, pulls.ctypes.data,
+        )  # fmt: skip
+        if scattered:
+            scatter += _scattered(pulls)
+    return _Pull(H, b, scatter, int(pixels))
+
+
+def _scattered(pulls: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum of the outer products of what 2 x 2 patches pull together: a car that has moved is as wide."""
+    padded = np.pad(pulls, [(0, pulls.shape[0] % 2), (0, pulls.shape[1] % 2), (0, 0)])
+    joint = (padded[0::2, 0::2] + padded[1::2, 0::2] + padded[0::2, 1::2] + padded[1::2, 1::2]).reshape(-1, UNKNOWNS)
+    told = int((joint != 0).any(axis=1).sum())
+    return joint.T @ joint * (told / max(told - UNKNOWNS, 1))
+
+
+def _turned_by(vector_rad: Float64[NDArray[np.float64], "3"]) -> Rotation:
+    """Right-handed rotation about a vector, by its length in radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector_rad))
+    x, y, z = vector_rad
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # Near zero both quotients by their series: neither loses digits nor divides by nothing.
+    small = angle < 1e-4
+    first = 1 - angle**2 / 6 if small else np.sin(angle) / angle
+    second = 0.5 - angle**2 / 24 if small else (1 - np.cos(angle)) / angle**2
+    turned: Rotation = np.eye(3) + first * cross + second * (cross @ cross)
+    return turned

@@ -1,0 +1,260 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
+from service.registration import rays
+from service.registration.kernel import SURFEL
+from service.registration.rays import RayPicture, RaySettings, adjust, meet
+from service.registration.register import Registered
+from service.registration.surfel_map import TILE_M, SurfelMap
+
+CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+SETTINGS = RaySettings(radius_m=0.25, fewest=100)
+R_LEVEL_CAMERA = rotation_y(np.deg2rad(4.0)) @ R_BODY_OPTICAL
+NOISE = 1e-3
+ORIGIN = np.array([500.0, -300.0, 40.0])
+
+
+def wall(x, *, y=(-20, 20), z=(-20, 20), step=0.2, normal=(1, 0, 0)):
+    ys, zs = (np.arange(low + step / 2, high, step) for low, high in (y, z))
+    grid = np.stack(np.meshgrid([float(x)], ys, zs, indexing="ij"), axis=-1).reshape(-1, 3)
+    surfels = np.zeros(len(grid), SURFEL)
+    surfels["xyz"], surfels["normal"] = grid, normal
+    return surfels
+
+
+def cloud_of(*parts):
+    """By tiles, as a map is."""
+    surfels = np.concatenate(parts)
+    tile = np.floor(surfels["xyz"][:, :2].astype(float) / TILE_M).astype(int)
+    order = np.lexsort((tile[:, 1], tile[:, 0]))
+    corners, first, count = np.unique(tile[order], axis=0, return_index=True, return_counts=True)
+    return SurfelMap.prepare(ORIGIN, surfels[order], np.c_[(corners + 0.5) * TILE_M, first, count])
+
+
+def looking_ahead(x=0.0, y=0.0, z=0.0):
+    return transform_from(R_BODY_OPTICAL, np.array([x, y, z]))
+
+
+def test_every_ray_meets_the_surfel_nearest_to_where_it_passes():
+    cloud = cloud_of(wall(10))
+    met = meet(cloud, looking_ahead(), CAMERA, SETTINGS)
+    hits = 10 * CAMERA.rays_of_pixels()
+    where = np.stack([-hits[..., 0], -hits[..., 1]], axis=-1)  # y is to the left, z up
+    assert (met >= 0).all()
+    away = np.linalg.norm(cloud.surfels["xyz"][met][..., 1:] - where, axis=-1)
+    assert away.max() <= 0.1 * np.sqrt(2) + 1e-5
+
+
+def test_what_is_nearer_hides_what_is_behind_and_gaps_are_looked_through():
+    cloud = cloud_of(wall(10), wall(5, y=(-1, 1)))
+    x = cloud.surfels["xyz"][meet(cloud, looking_ahead(), CAMERA, SETTINGS)][..., 0]
+    # A metre at 5 m is 6.4 pixels, and a disc's radius 1.6.
+    np.testing.assert_array_equal(x[:, 26:38], 5)
+    np.testing.assert_array_equal(x[:, [*range(23), *range(41, 64)]], 10)
+
+
+def test_of_surfaces_close_behind_each_other_the_one_passed_nearest_is_met():
+    """Discs overlap; the one that happens to lie a little nearer must not win everywhere."""
+    one, other = wall(10, y=(-0.1, 0.1), z=(-0.1, 0.1)), wall(9.9, y=(0.1, 0.3), z=(-0.1, 0.1))
+    cloud = cloud_of(one, other)
+    camera = PinholeCamera(1, 1, 32.0, 32.0, 0.0, 0.0)
+    assert cloud.surfels["xyz"][meet(cloud, looking_ahead(), camera, SETTINGS)[0, 0], 0] == 10
+    alone = meet(cloud, looking_ahead(), camera, replace(SETTINGS, behind_m=0.05))
+    assert cloud.surfels["xyz"][alone[0, 0], 0] == pytest.approx(9.9)
+
+
+@pytest.mark.parametrize(("x", "is_met"), [(0.3, False), (0.7, True), (39.0, True), (41.0, False), (-5.0, False)])
+def test_what_is_too_near_too_far_or_behind_is_not_met(x, is_met):
+    met = meet(cloud_of(wall(x)), looking_ahead(), CAMERA, SETTINGS)
+    assert (met[20:28, 28:36] >= 0).all() == is_met
+
+
+def test_discs_seen_edge_on_are_not_met():
+    edge_on = wall(10, normal=(0, 1, 0), y=(-0.1, 0.1), z=(-5, 5))
+    assert (meet(cloud_of(edge_on), looking_ahead(y=0.2), CAMERA, SETTINGS) < 0).all()
+    assert (meet(cloud_of(edge_on), looking_ahead(y=3.0), CAMERA, SETTINGS) >= 0).any()
+
+
+@given(st.integers(0, 10**6), st.floats(-180, 180), st.floats(-80, 80), st.floats(-30, 30))
+@settings(max_examples=60)
+def test_tiles_out_of_sight_hold_nothing_that_would_have_been_met(seed, heading, pitch, roll):
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(-60, 60, (40, 3)) * [1, 1, 0.3]
+    cloud = cloud_of(*(np.concatenate([wall(x, y=(y, y + 4), z=(z, z + 4))]) for x, y, z in low))
+    R = Rotation.from_euler("zyx", [heading, pitch, roll], degrees=True).as_matrix() @ R_BODY_OPTICAL
+    T = transform_from(R, rng.uniform(-5, 5, 3))
+    everything = SurfelMap(cloud.origin_m, cloud.surfels, np.array([[*T[:2, 3], 0.0, len(cloud.surfels)]]), cloud.grid)
+    np.testing.assert_array_equal(meet(cloud, T, CAMERA, SETTINGS), meet(everything, T, CAMERA, SETTINGS))
+
+
+@pytest.fixture(scope="module")
+def city(street):
+    """The street told from another origin than its own."""
+    surfels = street.surfels()
+    return SurfelMap.prepare(ORIGIN, surfels, np.array([[9.0, 0.0, 0.0, len(surfels)]]))
+
+
+def picture_of(
+    street, pose, *, noise=0.0, scale=1.0, offset=0.0, rig=80.0, seed=1, R_level_camera=R_LEVEL_CAMERA, aside_m=0.0
+):
+    """Inverse depths as a camera of this scale, offset and noise measures them, ``aside_m`` to the left of the reference."""
+    R, t = pose
+    T_level_camera = transform_from(R_level_camera, np.array([0.0, aside_m, 0.0]))
+    z = street.depth(CAMERA, transform_from(R, t) @ T_level_camera).astype(float)
+    inverse = np.where(z > 0, scale / np.where(z > 0, z, 1) - (offset / rig if rig else 0.0), 0)
+    inverse += noise * np.random.default_rng(seed).normal(size=z.shape) * (inverse > 0)
+    return RayPicture(inverse.astype(np.float32), CAMERA, T_level_camera, max(noise, NOISE), rig)
+
+
+def found_at(pose, *, away=(0.0, 0.0, 0.0), turned=(0.0, 0.0, 0.0)):
+    R, t = pose
+    return Registered(Rotation.from_rotvec(turned).as_matrix() @ R, ORIGIN + t + away, 1.0, 0.0, 0.9, np.eye(8), 3)
+
+
+@given(
+    st.tuples(*[st.floats(-0.25, 0.25)] * 2, st.floats(-0.1, 0.1)),
+    st.tuples(*[st.floats(-0.01, 0.01)] * 2, st.floats(-0.03, 0.03)),
+)
+@settings(max_examples=25)
+def test_a_faultless_picture_is_put_where_it_was_taken(city, street, pose, away, turned):
+    many = replace(SETTINGS, rounds=6, steps=3)
+    got, _ = adjust(city, [picture_of(street, pose)], found_at(pose, away=away, turned=turned), many)
+    assert np.linalg.norm(got.camera_m - ORIGIN - pose[1]) < 0.02
+    assert Rotation.from_matrix(got.R_map_level @ pose[0].T).magnitude() < np.deg2rad(0.15)
+    assert (got.hypothesis, got.inliers) == (3, 0.9)
+
+
+def test_what_was_found_before_stays_as_it_is(city, street, pose):
+    start = found_at(pose, away=(0.2, 0.1, 0))
+    before = start.camera_m.copy(), start.R_map_level.copy()
+    adjust(city, [picture_of(street, pose)], start, SETTINGS)
+    np.testing.assert_array_equal(start.camera_m, before[0])
+    np.testing.assert_array_equal(start.R_map_level, before[1])
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.01, 0.0), (1.0, 0.5), (0.99, -0.4)])
+def test_scale_and_offset_of_a_rig_are_found(city, street, pose, scale, offset):
+    many = replace(SETTINGS, rounds=6, steps=3, scale=0.1, offset_px=5.0)
+    got, _ = adjust(city, [picture_of(street, pose, scale=scale, offset=offset)], found_at(pose), many)
+    assert got.scale == pytest.approx(scale, abs=0.004)
+    assert got.offset == pytest.approx(offset, abs=0.1)
+
+
+def test_a_camera_that_is_no_rig_has_no_offset(city, street, pose):
+    start = replace(found_at(pose), offset=0.0)
+    got, _ = adjust(city, [picture_of(street, pose, rig=None)], start, SETTINGS)
+    assert got.offset == 0.0
+    assert not got.information[7].any()
+
+
+def test_a_common_error_of_patches_is_not_the_pose_s(city, street, pose):
+    """Every other patch on the left is off by several pixels' noise, all one way: counted pixel by pixel, that pulls further."""
+    picture = picture_of(street, pose, rig=None)
+    wrong = picture.inverse.copy()
+    for row in range(0, 48, 12):
+        for column in range(0, 30, 12):
+            wrong[row : row + 6, column : column + 6] += 5 * NOISE
+    picture = replace(picture, inverse=np.where(picture.inverse > 0, wrong, 0).astype(np.float32))
+    known = replace(SETTINGS, robust=10.0, rounds=4, scale=1e-4)
+    off = {}
+    for shared in (0.0, 5.0):
+        got, _ = adjust(city, [picture], found_at(pose), replace(known, shared=shared))
+        off[shared] = np.linalg.norm(got.camera_m - ORIGIN - pose[1])
+    assert off[5.0] < 0.6 * off[0.0], off
+
+
+def test_two_cameras_of_one_rig_are_one_picture(city, street, pose):
+    """One looks back: what it sees holds the street's length, and both are said in the reference's frame."""
+    back = rotation_z(np.pi) @ R_LEVEL_CAMERA
+    pictures = [picture_of(street, pose), picture_of(street, pose, R_level_camera=back, aside_m=0.3, rig=80.0)]
+    many = replace(SETTINGS, rounds=6, steps=3)
+    got, _ = adjust(city, pictures, found_at(pose, away=(0.1, -0.1, 0.05), turned=(0, 0, 0.02)), many)
+    assert np.linalg.norm(got.camera_m - ORIGIN - pose[1]) < 0.02
+
+
+def test_a_picture_that_meets_too_little_adjusts_nothing(city, street, pose):
+    picture = picture_of(street, pose)
+    few = np.zeros_like(picture.inverse)
+    few[20:29, 20:30] = picture.inverse[20:29, 20:30]
+    assert adjust(city, [replace(picture, inverse=few)], found_at(pose), SETTINGS) is None
+    assert adjust(city, [picture], found_at(pose, away=(500.0, 0, 0)), SETTINGS) is None
+
+
+def plain(city, picture, met, R, t, *, scale, offset, s):
+    """Residual, gradient by finite differences, weight and patch of every pixel that counts."""
+    v, u = np.nonzero((met >= 0) & (picture.inverse > 0))
+    ray = CAMERA.rays_of_pixels()[v, u]
+    surfels = city.surfels[met[v, u]]
+    n, x = surfels["normal"].astype(float), surfels["xyz"].astype(float)
+
+    def predicted(change):
+        T = transform_from(Rotation.from_rotvec(change[3:6]).as_matrix() @ R, t + change[:3]) @ picture.T_level_camera
+        inverse_z = np.einsum("ij,ij->i", n, ray @ T[:3, :3].T) / np.einsum("ij,ij->i", n, x - T[:3, 3])
+        return scale * np.exp(change[6]) * inverse_z - (offset + change[7]) / picture.focal_baseline_px_m
+
+    J = np.stack([(predicted(step) - predicted(-step)) / 2e-6 for step in 1e-6 * np.eye(8)], axis=1)
+    r = picture.inverse[v, u].astype(float) - predicted(np.zeros(8))
+    z = scale / (predicted(np.zeros(8)) + offset / picture.focal_baseline_px_m)
+    T = transform_from(R, t) @ picture.T_level_camera
+    flat = np.abs(np.einsum("ij,ij->i", n, ray @ T[:3, :3].T)) >= s.grazing
+    counts = flat & (z >= s.nearest_m) & (z <= s.reach_m)
+    variance = picture.noise**2 + (s.surface_m / z**2) ** 2
+    w = np.where(counts, (1 + r**2 / (s.robust**2 * variance)) ** -2.0 / variance, 0)
+    return J, r, w, v // s.patch * 100 + u // s.patch
+
+
+@given(st.integers(0, 10**6), st.sampled_from([0.0, 0.5, 2.0]), st.integers(1, 16), st.booleans())
+@settings(max_examples=30)
+def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
+    city, street, pose, seed, shared, patch, again
+):
+    """Solved whole by plain linear algebra, patches' errors among the unknowns; and added to what was there before."""
+    rng = np.random.default_rng(seed)
+    s = replace(SETTINGS, shared=shared, patch=patch, radius_m=0.3)
+    R, t = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix() @ pose[0], pose[1] + rng.normal(0, 0.1, 3)
+    scale, offset = np.exp(rng.normal(0, 0.01)), rng.normal(0, 0.2)
+    picture = picture_of(street, pose, noise=2e-3, seed=seed)
+    pictures = [picture] * (2 if again else 1)
+    state = rays._State(R, t, float(np.log(scale)), float(offset))
+    met = [meet(city, state.camera_of(picture), CAMERA, s)] * len(pictures)
+    got = rays._pull(city, pictures, met, state, s, scattered=True)
+    J, r, w, patches = plain(city, picture, met[0], R, t, scale=scale, offset=offset, s=s)
+    H, b = J.T @ (J * w[:, None]), J.T @ (w * r)
+    if shared:
+        for own in np.unique(patches):
+            of = patches == own
+            h, own_w, own_r = J[of].T @ w[of], w[of].sum(), w[of] @ r[of]
+            share = 1 / (own_w + (shared * picture.noise) ** -2.0)
+            H, b = H - share * np.outer(h, h), b - share * h * own_r
+    np.testing.assert_allclose(got.H, len(pictures) * H, rtol=1e-4, atol=1e-5 * np.abs(H).max())
+    np.testing.assert_allclose(got.b, len(pictures) * b, rtol=1e-4, atol=1e-5 * np.abs(J.T * w * r).sum(axis=1).max())
+    assert got.pixels == len(pictures) * (w > 0).sum()
+    assert np.linalg.eigvalsh(got.scatter).min() > -1e-6 * np.abs(got.scatter).max()
+
+
+def test_neighbouring_patches_scatter_as_one():
+    """Two by two; what pulls one way in one and the other way in the next cancels, and unequal sides lose nothing."""
+    pulls = np.zeros((3, 5, 8))
+    pulls[0, 0, 0], pulls[0, 1, 0] = 2.0, -2.0
+    assert not rays._scattered(pulls).any()
+    pulls[2, 4, 1] = 3.0
+    np.testing.assert_allclose(rays._scattered(pulls), np.diag([0, 9.0, 0, 0, 0, 0, 0, 0]))
+
+
+@given(st.tuples(*[st.floats(-3, 3)] * 3), st.sampled_from([1.0, 1e-3, 1e-6, 0.0]))
+def test_a_turn_is_that_of_its_vector(vector, size):
+    turn = size * np.array(vector)
+    np.testing.assert_allclose(rays._turned_by(turn), Rotation.from_rotvec(turn).as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("patch", [0, -1, 17])
+def test_patches_that_the_kernel_has_no_room_for_are_refused(patch):
+    with pytest.raises(ValueError, match=f"patch: {patch} is not from 1 to 16"):
+        RaySettings(patch=patch)
