@@ -15,7 +15,7 @@ from service.maps.reader import MapBundle
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
 from service.registration.kernel import QueryPoints
 from service.registration.points import DepthBlocks, PointSettings, blocks_of, points_from
-from service.registration.rays import RayPicture, RaySettings, adjust
+from service.registration.rays import RayPicture, RaySettings, adjust, picture_of
 from service.registration.register import Registered, RegistrationSettings, register
 from service.registration.rendered import Agreement, Seen, agreement, seen_by
 from service.registration.scatter import disagreement, scatter_of
@@ -167,8 +167,7 @@ def _pictures(frames: tuple[Frame, ...], blocks: list[DepthBlocks], settings: Re
     for frame, own in zip(frames, blocks, strict=True):
         T = level_from(frame.T_reference_camera, frame.R_level_camera, frames[0].R_level_camera)
         T_level_camera = T @ transform_from(frame.R_level_camera, np.zeros(3))
-        inverse = np.divide(1.0, own.z_m, out=np.zeros_like(own.z_m), where=own.z_m > 0)
-        pictures.append(RayPicture(inverse, own.camera, T_level_camera, frame.noise, rig))
+        pictures.append(picture_of(own, T_level_camera, noise=frame.noise, focal_baseline_px_m=rig))
     return pictures
 
 

@@ -33,19 +33,19 @@ typedef struct {
 typedef struct {
     float x, y, z, nx, ny, nz;
     int32_t number;
-    int16_t left, right, top, bottom;
+    int32_t left, right, top, bottom;
 } Disc;
 
 /* From the least whole number that is not below a number, and not below 0. */
-static inline int16_t from(double edge)
+static inline int32_t from(double edge)
 {
-    const int16_t whole = edge > 0 ? (int16_t)edge : 0;
-    return (int16_t)(whole + ((double)whole < edge));
+    const int32_t whole = edge > 0 ? (int32_t)edge : 0;
+    return whole + ((double)whole < edge);
 }
 
-static inline int16_t up_to(double edge, int64_t size)
+static inline int32_t up_to(double edge, int64_t size)
 {
-    return (int16_t)(edge < (double)(size - 1) ? edge : (double)(size - 1));
+    return (int32_t)(edge < (double)(size - 1) ? edge : (double)(size - 1));
 }
 
 /* met (height, width): the surfel on each pixel's ray, -1 for none; of discs that overlap near the first one met, that whose middle is
@@ -59,18 +59,19 @@ WIDE void streetfix_meet(const Surfel *surfels, const int64_t *parts, int64_t pa
         first[i] = middle[i] = INFINITY;
         met[i] = -1;
     }
-    /* What is beside the picture is left out before anything is divided: the slack is a disc's radius seen at an angle. */
-    const double *R = v->R, slack = 4.0 * o->radius;
+    /* What is beside the picture is left out before anything is divided; a disc reaches its radius over its middle, across and ahead. */
+    const double *R = v->R;
     const double left = -v->cx / v->fx, right = ((double)(v->width - 1) - v->cx) / v->fx;
     const double top = -v->cy / v->fy, bottom = ((double)(v->height - 1) - v->cy) / v->fy;
+    const double beside = o->radius * (1.0 + fmax(-left, right)), above = o->radius * (1.0 + fmax(-top, bottom));
     int64_t count = 0;
     for (int64_t p = 0; p < part_count; p++)
         for (int64_t k = parts[2 * p]; k < parts[2 * p] + parts[2 * p + 1]; k++) {
             const Surfel *m = surfels + k;
             const double dx = m->x - v->t[0], dy = m->y - v->t[1], dz = m->z - v->t[2];
             const double z = R[2] * dx + R[5] * dy + R[8] * dz, x = R[0] * dx + R[3] * dy + R[6] * dz, y = R[1] * dx + R[4] * dy + R[7] * dz;
-            if (!((z >= o->nearest) & (z <= o->reach) & (x >= left * z - slack) & (x <= right * z + slack) & (y >= top * z - slack) &
-                  (y <= bottom * z + slack))) continue;
+            if (!((z >= o->nearest) & (z <= o->reach) & (x >= left * z - beside) & (x <= right * z + beside) & (y >= top * z - above) &
+                  (y <= bottom * z + above))) continue;
             const double nx = R[0] * m->nx + R[3] * m->ny + R[6] * m->nz, ny = R[1] * m->nx + R[4] * m->ny + R[7] * m->nz;
             const double nz = R[2] * m->nx + R[5] * m->ny + R[8] * m->nz, off = nx * x + ny * y + nz * z;
             if (off * off < o->grazing * o->grazing * (x * x + y * y + z * z)) continue;
@@ -111,7 +112,7 @@ typedef struct {
     double unit;            /* of the offset, 1/m */
     double noise;           /* standard deviation of an inverse depth, 1/m */
     double surface;         /* m: how far the map's surfaces may be off along a ray */
-    double robust;          /* standard deviations at which a residual has half its pull */
+    double robust;          /* standard deviations at which a residual weighs a quarter */
     double shared;          /* standard deviation of the error that a patch has in common, 1/m */
     double nearest, reach;  /* m */
     double grazing;         /* cosine, as in Discs */

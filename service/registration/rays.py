@@ -20,6 +20,7 @@ from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, Transform, transform_from
 from service.registration.kernel import UNKNOWNS
+from service.registration.points import DepthBlocks
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
 
@@ -95,7 +96,15 @@ class RayPicture:
 
 
 #: Room for one surfel in the camera's axes: position, normal, number, the pixels that it may cover.
-_DISC = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("number", "<i4"), ("box", "<i2", (4,))])
+_DISC = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("number", "<i4"), ("box", "<i4", (4,))])
+
+
+def picture_of(
+    blocks: DepthBlocks, T_level_camera: Transform, *, noise: float, focal_baseline_px_m: float | None
+) -> RayPicture:
+    """What the rays of a thinned depth picture measured; arguments as in ``RayPicture``."""
+    inverse = np.divide(1.0, blocks.z_m, out=np.zeros_like(blocks.z_m), where=blocks.z_m > 0)
+    return RayPicture(inverse, blocks.camera, T_level_camera, noise, focal_baseline_px_m)
 
 
 class _View(Structure):

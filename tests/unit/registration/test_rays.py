@@ -94,6 +94,35 @@ def test_tiles_out_of_sight_hold_nothing_that_would_have_been_met(seed, heading,
     np.testing.assert_array_equal(meet(cloud, T, CAMERA, SETTINGS), meet(everything, T, CAMERA, SETTINGS))
 
 
+@given(st.integers(0, 10**6), st.sampled_from([5.0, 20.0, 80.0]))
+@settings(max_examples=40)
+def test_the_kernel_meets_what_plain_numpy_meets(seed, focal_px):
+    """Discs anywhere and any way round, through lenses of 135 to 17 degrees; every disc asked of every ray."""
+    rng, s = np.random.default_rng(seed), replace(SETTINGS, radius_m=0.4)
+    camera = PinholeCamera(24, 18, focal_px, focal_px, 11.0, 9.5)
+    discs = np.zeros(400, SURFEL)
+    discs["xyz"] = rng.uniform([0, -8, -8], [16, 8, 8], (400, 3))
+    discs["normal"] = rng.normal(size=(400, 3))
+    discs["normal"] /= np.linalg.norm(discs["normal"], axis=1, keepdims=True)
+    cloud = cloud_of(discs)
+    ray = camera.rays_of_pixels().reshape(-1, 3)
+    x, n = (cloud.surfels[name].astype(float) @ R_BODY_OPTICAL for name in ("xyz", "normal"))
+    off = (n * x).sum(axis=1)
+    z = off / (ray @ n.T)
+    apart2 = ((ray[:, None] * z[..., None] - x) ** 2).sum(axis=2)
+    flat = np.abs(off) < s.grazing * np.linalg.norm(x, axis=1)
+    there = (apart2 <= s.radius_m**2) & ~flat & (x[:, 2] >= s.nearest_m) & (x[:, 2] <= s.reach_m)
+    first = np.where(there, z, np.inf).min(axis=1, keepdims=True)
+    among = np.where(there & (z <= first + s.behind_m), apart2, np.inf)
+    expected = np.where(np.isfinite(among.min(axis=1)), among.argmin(axis=1), -1)
+    met = meet(cloud, looking_ahead(), camera, s).ravel()
+    # Single precision may decide otherwise what lies on a rim, or as near as another.
+    assert (met == expected).mean() > 0.99
+    nearest = np.sort(apart2, axis=1)
+    clear = (np.abs(apart2 - s.radius_m**2) > 1e-4).all(axis=1) & (nearest[:, 1] - nearest[:, 0] > 1e-4)
+    np.testing.assert_array_equal(met[clear], expected[clear])
+
+
 @pytest.fixture(scope="module")
 def city(street):
     """The street told from another origin than its own."""
