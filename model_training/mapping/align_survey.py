@@ -28,6 +28,8 @@ SIGMA_M, SURFACE_M = 0.02, 0.02
 POSITION_M, TILT_RAD, HELD_BY = 0.03, float(np.deg2rad(0.05)), 10.0
 #: Points further off the map than this say nothing: the given poses are surveyed ones.
 OFF_M = 0.5
+#: Scans of which fewer points lie where another scan has measured too stay where they are.
+FEWEST = 300
 _SOLVER = SolverOptions(
     iterations=6, reach=OFF_M, robust_first=0.1, robust_last=0.05, surface=SURFACE_M, prior_weight=HELD_BY / POINTS, tilt=TILT_RAD,
     height=POSITION_M, position=POSITION_M, free_scale=False,
@@ -55,12 +57,15 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
         report("survey", done + 1, steps)
     now = poses[kept].copy()
     for done in range(ROUNDS):
-        cloud = _map_of(scans, now)
-        if cloud is None:
+        voxels, shared = _map_of(scans, now)
+        surfels = voxels.surfels()
+        if not len(surfels.positions):
             break
+        cloud = SurfelMap.prepare(voxels.origin, *voxels.tiles(surfels))
         for k, points in enumerate(scans):
-            if len(points.sigma):
-                now[k] = _registered(cloud, points, now[k], poses[kept[k]])
+            common = points.subset(np.flatnonzero(_are_of(voxels.keys_of(_placed(points, now[k])), shared)))
+            if len(common) >= FEWEST:
+                now[k] = _registered(cloud, common, now[k], poses[kept[k]])
             report("survey", len(kept) * (1 + done) + k + 1, steps)
     owner = np.clip(np.searchsorted(kept, np.arange(len(poses)), side="right") - 1, 0, len(kept) - 1)
     moved: Poses = (now @ inverse_each(poses[kept]))[owner] @ poses
@@ -85,13 +90,30 @@ def _thinned(points: Float32[NDArray[np.float32], "n 3"], number: int) -> QueryP
     return QueryPoints(points, points / range_m[:, None].astype(np.float32), np.float32(SIGMA_M) * one, one, 0 * one)
 
 
-def _map_of(scans: list[QueryPoints], poses: Poses) -> SurfelMap | None:
+def _placed(points: QueryPoints, T: NDArray[np.float64]) -> NDArray[np.float64]:
+    return transform_points(T, points.xyz.astype(np.float64))
+
+
+def _map_of(scans: list[QueryPoints], poses: Poses) -> tuple[VoxelMap, NDArray[np.int64]]:
+    """The map that scans make, and the keys of its voxels that more than one of them has points in, sorted.
+
+    On surfaces that it alone has seen a scan lies as it is, and rounding of its own would make it wander.
+    """
     voxels = VoxelMap(VOXEL_M, lattice_origin(VOXEL_M, poses[:, :3, 3].mean(axis=0)))
+    each_once: list[NDArray[np.int64]] = []
     for first in range(0, len(scans), _TOGETHER):
-        some = zip(poses[first : first + _TOGETHER], scans[first : first + _TOGETHER], strict=True)
-        voxels.add(np.concatenate([transform_points(T, points.xyz.astype(np.float64)) for T, points in some]))
-    surfels = voxels.surfels()
-    return SurfelMap.prepare(voxels.origin, *voxels.tiles(surfels)) if len(surfels.positions) else None
+        placed = [_placed(points, T) for points, T in zip(scans[first:][:_TOGETHER], poses[first:], strict=False)]
+        voxels.add(np.concatenate(placed))
+        each_once += [np.unique(voxels.keys_of(each)) for each in placed]
+    keys, times = np.unique(np.concatenate(each_once), return_counts=True)
+    return voxels, keys[times > 1]
+
+
+def _are_of(keys: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which keys are among some that are sorted."""
+    at = np.minimum(np.searchsorted(some, keys), max(len(some) - 1, 0))
+    found: NDArray[np.bool_] = some[at] == keys if len(some) else np.zeros(len(keys), bool)
+    return found
 
 
 def _registered(

@@ -33,8 +33,10 @@ class RaySettings:
     """Ours, November 2026; chosen on watch cities.
 
     Attributes:
-        rounds: of looking up what the rays meet, and
+        rounds: of looking up what the rays meet, at most, and
         steps: of the solver in each.
+        still_m: a round that moves the pose by less, and
+        still_rad: turns it by less, is the last.
         radius_m: of the disc that a surfel is taken for.
         behind_m: discs so far behind the first one on a ray may be the same surface.
         grazing: cosine; discs seen flatter are not met.
@@ -52,8 +54,10 @@ class RaySettings:
         fewest: pictures of which fewer pixels meet the map adjust nothing.
     """
 
-    rounds: int = 2
+    rounds: int = 5
     steps: int = 2
+    still_m: float = 0.02
+    still_rad: float = 1e-3
     radius_m: float = 0.2
     behind_m: float = 0.3
     grazing: float = 0.05
@@ -244,6 +248,7 @@ def adjust(
     prior, moved = np.diag(sigma**-2.0), np.zeros(UNKNOWNS)
     moved[6:] = state.log_scale, state.offset  # these priors are about none, the pose's about what was registered
     for _ in range(settings.rounds):
+        before = moved
         met = [meet(cloud, state.camera_of(picture), picture.camera, settings) for picture in pictures]
         for _ in range(settings.steps):
             pull = _pull(cloud, pictures, met, state, settings)
@@ -253,6 +258,9 @@ def adjust(
             step = np.zeros(UNKNOWNS)
             step[free] = np.linalg.solve(told[np.ix_(free, free)], wanted[free])
             state, moved = state.moved(step), moved + step
+        went = np.linalg.norm((moved - before)[:6].reshape(2, 3), axis=1)
+        if went[0] < settings.still_m and went[1] < settings.still_rad:
+            break
     pull = _pull(cloud, pictures, met, state, settings, scattered=True)
     pose = replace(
         found, R_map_level=state.R, camera_m=state.t + cloud.origin_m, scale=float(np.exp(state.log_scale)),

@@ -160,6 +160,26 @@ def test_a_faultless_picture_is_put_where_it_was_taken(city, street, pose, away,
     assert (got.hypothesis, got.inliers) == (3, 0.9)
 
 
+@pytest.mark.parametrize(
+    ("away", "still_m", "rounds", "looked_up"),
+    [
+        (0.0, 0.02, 5, (1, 1)),
+        (0.1, 0.02, 9, (2, 8)),
+        (0.3, 1e-12, 5, (5, 5)),
+        (0.3, 1e-12, 3, (3, 3)),
+        (0.3, 9.0, 5, (1, 1)),
+    ],
+)
+def test_rays_are_looked_up_until_the_pose_stands_still(
+    city, street, pose, monkeypatch, away, still_m, rounds, looked_up
+):
+    asked, kept = [], rays.meet
+    monkeypatch.setattr(rays, "meet", lambda *given: (asked.append(given), kept(*given))[1])
+    s = replace(SETTINGS, rounds=rounds, still_m=still_m, still_rad=1e9)
+    adjust(city, [picture_of(street, pose)], found_at(pose, away=(away, 0, 0)), s)
+    assert looked_up[0] <= len(asked) <= looked_up[1]
+
+
 def test_what_was_found_before_stays_as_it_is(city, street, pose):
     start = found_at(pose, away=(0.2, 0.1, 0))
     before = start.camera_m.copy(), start.R_map_level.copy()
