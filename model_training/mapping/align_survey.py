@@ -38,6 +38,7 @@ _SOLVER = SolverOptions(
 _TOGETHER = 64  # scans whose points are summed up at once
 
 Poses = Float64[NDArray[np.float64], "N 4 4"]
+Points = Float32[NDArray[np.float32], "n 3"]
 Report = Callable[[str, int, int], None]
 
 
@@ -63,7 +64,7 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
             break
         cloud = SurfelMap.prepare(voxels.origin, *voxels.tiles(surfels))
         for k, points in enumerate(scans):
-            common = points.subset(np.flatnonzero(_are_of(voxels.keys_of(_placed(points, now[k])), shared)))
+            common = points[_are_of(voxels.keys_of(_placed(points, now[k])), shared)]
             if len(common) >= FEWEST:
                 now[k] = _registered(cloud, common, now[k], poses[kept[k]])
             report("survey", len(kept) * (1 + done) + k + 1, steps)
@@ -77,24 +78,22 @@ def inverse_each(T: Poses) -> Poses:
     return np.stack([inverse(each) for each in T])
 
 
-def _thinned(points: Float32[NDArray[np.float32], "n 3"], number: int) -> QueryPoints:
+def _thinned(points: Points, number: int) -> Points:
     """Some of a scan, drawn with its range, since near ones are the most; the same whenever it is read."""
     range_m = np.linalg.norm(points, axis=1)
     points, range_m = (each[(range_m > NEAREST_M) & (range_m < REACH_M)] for each in (points, range_m))
     if len(points) > POINTS:
         chance = range_m.astype(np.float64) / range_m.sum(dtype=np.float64)
         chosen = np.random.default_rng(number).choice(len(points), POINTS, replace=False, p=chance / chance.sum())
-        points, range_m = points[chosen], range_m[chosen]
-    one = np.ones(len(points), np.float32)
-    points = np.ascontiguousarray(points, np.float32)
-    return QueryPoints(points, points / range_m[:, None].astype(np.float32), np.float32(SIGMA_M) * one, one, 0 * one)
+        points = points[chosen]
+    return np.ascontiguousarray(points, np.float32)
 
 
-def _placed(points: QueryPoints, T: NDArray[np.float64]) -> NDArray[np.float64]:
-    return transform_points(T, points.xyz.astype(np.float64))
+def _placed(points: Points, T: NDArray[np.float64]) -> NDArray[np.float64]:
+    return transform_points(T, points.astype(np.float64))
 
 
-def _map_of(scans: list[QueryPoints], poses: Poses) -> tuple[VoxelMap, NDArray[np.int64]]:
+def _map_of(scans: list[Points], poses: Poses) -> tuple[VoxelMap, NDArray[np.int64]]:
     """The map that scans make, and the keys of its voxels that more than one of them has points in, sorted.
 
     On surfaces that it alone has seen a scan lies as it is, and rounding of its own would make it wander.
@@ -117,12 +116,15 @@ def _are_of(keys: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.bool
 
 
 def _registered(
-    cloud: SurfelMap, points: QueryPoints, T: NDArray[np.float64], T_given: NDArray[np.float64]
+    cloud: SurfelMap, points: Points, T: NDArray[np.float64], T_given: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     state = np.zeros(1, STATE)
     state["R"], state["t"] = T[:3, :3], T[:3, 3] - cloud.origin_m
     state["anchor"], state["up"] = T_given[:3, 3] - cloud.origin_m, T_given[:3, 2]
-    align(cloud.grid, cloud.surfels, points, state, _SOLVER)
+    one = np.ones(len(points), np.float32)
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    measured = QueryPoints(points, ray, np.float32(SIGMA_M) * one, one, 0 * one)
+    align(cloud.grid, cloud.surfels, measured, state, _SOLVER)
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = state["R"][0], state["t"][0] + cloud.origin_m
     return found
