@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.voxel_map import VoxelMap, lattice_origin
-from service.geometry.rigid import inverse, transform_points
+from service.geometry.rigid import transform_points
 from service.registration.kernel import STATE, QueryPoints, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 
@@ -69,13 +69,8 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
                 now[k] = _registered(cloud, common, now[k], poses[kept[k]])
             report("survey", len(kept) * (1 + done) + k + 1, steps)
     owner = np.clip(np.searchsorted(kept, np.arange(len(poses)), side="right") - 1, 0, len(kept) - 1)
-    moved: Poses = (now @ inverse_each(poses[kept]))[owner] @ poses
+    moved: Poses = (now @ np.linalg.inv(poses[kept]))[owner] @ poses
     return moved
-
-
-def inverse_each(T: Poses) -> Poses:
-    """Inverse of each of several transforms."""
-    return np.stack([inverse(each) for each in T])
 
 
 def _thinned(points: Points, number: int) -> Points:

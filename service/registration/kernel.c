@@ -9,6 +9,7 @@
 #include <string.h>
 
 #include "surfel.h"
+#include "wide.h"
 
 #define UNKNOWNS 8
 #define BLOCK 8
@@ -51,14 +52,6 @@ typedef struct {
 #define HEIGHT 60.0 /* m */
 #define AHEAD 32 /* points whose memory is fetched together: one by one, most of the time would go into waiting for it */
 #define LANES 8  /* sums that run side by side; the same on every machine, so that all get the same answer */
-
-/* Compiled twice, once for processors with wider registers; which one runs is decided when the library is loaded. Neither contracts
- * products and sums (ISO C), so their answers are equal. */
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define WIDE __attribute__((flatten, target_clones("avx2", "default")))
-#else
-#define WIDE
-#endif
 
 /* Cholesky solution of A x = b in place; 0 where A is not positive definite. */
 static int solve(double A[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])

@@ -6,13 +6,7 @@
 #include <string.h>
 
 #include "surfel.h"
-
-/* Compiled twice, as in kernel.c: the same sums for every processor, wider where it can. */
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define WIDE __attribute__((flatten, target_clones("avx2", "default")))
-#else
-#define WIDE
-#endif
+#include "wide.h"
 
 #define UNKNOWNS 8 /* translation, rotation (left increment about the reference), log scale, disparity offset */
 

@@ -17,7 +17,7 @@ C_FILES = tuple(
         "registration/kernel", "registration/points", "registration/rays", "imaging/gather", "imaging/level", "imaging/depth16"
     )
 )  # fmt: skip
-HEADERS = ("service/registration/surfel.h",)
+HEADERS = ("service/registration/surfel.h", "service/registration/wide.h")
 T = TypeVar("T")
 
 
