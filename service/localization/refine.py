@@ -71,7 +71,7 @@ class Candidate:
 
     Attributes:
         T_map_camera: of the reference camera.
-        registered: as the solver left it.
+        registered: as the solver left it; the best one adjusted along its rays, by centimetres, after all below was told.
         similarity: to the places around the pose, mean over the frames.
         place_m: how far those places are, mean over the frames.
         agreement: with the map as drawn at the pose, mean over the frames.
