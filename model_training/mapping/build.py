@@ -152,7 +152,7 @@ def _checked(
     name = f"site-{sha256(calibration.model_dump_json().encode()).hexdigest()[:16]}"
     site = Site.model_validate_json(work.part(name, asked)["site"].tobytes())
     for scan in held:
-        cloud.add(near(scan.points, scan.T_map_level))
+        cloud.add(*near(scan.points, scan.T_map_level))
     return site
 
 

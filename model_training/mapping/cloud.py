@@ -14,10 +14,12 @@ from service.registration.surfel_map import SurfelMap
 CLOUD_REACH_M = 40.0
 
 
-def near(points: NDArray[np.float32], T_map_level: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What of a levelled scan goes into the cloud, map frame."""
-    xyz = points[:, :3]
-    return transform_points(T_map_level, xyz[np.linalg.norm(xyz, axis=1) < CLOUD_REACH_M].astype(np.float64))
+def near(
+    points: NDArray[np.float32], T_map_level: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """What of a levelled scan (n, 4) goes into the cloud: positions, map frame, and intensities."""
+    reached = points[np.linalg.norm(points[:, :3], axis=1) < CLOUD_REACH_M]
+    return transform_points(T_map_level, reached[:, :3].astype(np.float64)), reached[:, 3]
 
 
 def prepared(cloud: VoxelMap, surfels: Surfels | None = None) -> SurfelMap | None:

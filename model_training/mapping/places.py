@@ -100,7 +100,7 @@ class Drive:
             descriptors.append(self.encoder.encode(planes, "survey"))
             headings.append((heading_of_body(T) + scan.start_rad + turns + np.pi) % (2 * np.pi) - np.pi)
             if first + k not in apart:
-                points.add(near(scan.points, T))
+                points.add(*near(scan.points, T))
             T_map_level[k], heights[k] = T, scan.level.height_m
             report("places", first + k + 1, len(self.kept))
         keys, moments = points.sums()

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.mapping.voxel_map import VOXEL, VoxelMap, lattice_origin
+from model_training.mapping.voxel_map import VOXEL, VOXEL_WITHOUT_BRIGHTNESS, VoxelMap, lattice_origin
 from service.errors import BundleError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.maps import content as parts
@@ -86,9 +86,10 @@ def read_statistics(bundle: MapBundle) -> NDArray[Any]:
         found = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, *NPY_HEADER_ERRORS) as error:
         raise _defect(bundle, f"it is no array of ours ({error})") from error
-    if found.dtype != VOXEL or found.ndim != 1:
+    if found.dtype not in (VOXEL, VOXEL_WITHOUT_BRIGHTNESS) or found.ndim != 1:
         raise _defect(bundle, f"it holds {found.dtype} in {found.ndim} dimensions")
-    if not np.isfinite(found["sums"]).all() or not (found["points"] > 0).all():
+    numbers = [found[name] for name in ("sums", "brightness") if name in (found.dtype.names or ())]
+    if not all(np.isfinite(each).all() for each in numbers) or not (found["points"] > 0).all():
         raise _defect(bundle, "a voxel has no points, or a sum that is not finite")
     return np.asarray(found)
 

@@ -15,7 +15,9 @@ from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M
 
 _SPAN = 1 << 20  # cells along an axis: a key is 3 x 20 bits
-_MOMENTS = 10  # count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre
+_SECOND = slice(4, 10)
+#: Count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre; brightness, and how many points have one.
+_MOMENTS, _BRIGHT = 12, slice(10, 12)
 #: What a neighbour's points count for in a normal, by the number of axes it is away along: all alike, balconies and recesses of a facade
 #: melt into one slope. Watch cities; fewer still (0.1, 0.02, 0.005) follow the survey's own noise.
 _NEIGHBOUR = (1.0, 0.3, 0.1, 0.03)
@@ -23,18 +25,24 @@ _WAITING = 1 << 20  # rows of sums that wait to be merged, at least
 
 #: What a bundle keeps of a voxel, so that maps can be merged: its cell (voxels of all maps of one edge lie on one lattice through
 #: the map frame's zero), how many points it has, and their sums and sums of products about its centre (m, m2).
-VOXEL = np.dtype([("cell", "<i4", (3,)), ("points", "<u4"), ("sums", "<f4", (9,))])
+#: Last the sum of their brightnesses and the number of points that have one; older maps lack these two.
+VOXEL_WITHOUT_BRIGHTNESS = np.dtype([("cell", "<i4", (3,)), ("points", "<u4"), ("sums", "<f4", (9,))])
+VOXEL = np.dtype([*VOXEL_WITHOUT_BRIGHTNESS.descr, ("brightness", "<f4"), ("bright_points", "<u4")])
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Surface elements: ``positions`` and unit ``normals`` (n, 3), ``thickness_m`` and ``points`` in the voxel, its ``keys`` (n)."""
+    """Surface elements: ``positions`` and unit ``normals`` (n, 3), ``thickness_m`` and ``points`` in the voxel, its ``keys`` (n).
+
+    ``brightness`` (n) is the mean intensity of the voxel's returns as the sensor gives it, NaN where none was told.
+    """
 
     positions: NDArray[np.float64]
     normals: NDArray[np.float32]
     thickness_m: NDArray[np.float32]
     points: NDArray[np.uint32]
     keys: NDArray[np.int64]
+    brightness: NDArray[np.float32]
 
 
 class VoxelMap:
@@ -52,11 +60,14 @@ class VoxelMap:
         self._moments = np.zeros((0, _MOMENTS))
         self._waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
 
-    def add(self, points_map: NDArray[np.float64]) -> None:
-        """Add points (n, 3), metres, map frame."""
+    def add(self, points_map: NDArray[np.float64], intensity: NDArray[np.floating[Any]] | None = None) -> None:
+        """Add points (n, 3), metres, map frame, with the intensity of their returns (n), if it is known."""
         cell = self._cells(points_map)
         local = (points_map - self.origin) - (cell + 0.5) * self.voxel_m
-        self.add_sums(*_summed(_keys_of_cells(cell), _moments_of(local)))
+        moments = _moments_of(local)
+        if intensity is not None:
+            moments[:, _BRIGHT] = np.stack([intensity, np.ones(len(intensity))], axis=1)
+        self.add_sums(*_summed(_keys_of_cells(cell), moments))
 
     def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.float64]) -> None:
         """Add what ``sums`` of a map of the same voxels and the same origin gave."""
@@ -89,15 +100,18 @@ class VoxelMap:
         keys, moments = self.sums()
         found = np.zeros(len(keys), VOXEL)
         found["cell"] = _cells_of_keys(keys) + self._lattice()
-        found["points"], found["sums"] = moments[:, 0], moments[:, 1:]
+        found["points"], found["sums"] = moments[:, 0], moments[:, 1 : _BRIGHT.start]
+        found["brightness"], found["bright_points"] = moments[:, _BRIGHT].T
         return found
 
     def add_statistics(self, statistics: NDArray[Any]) -> None:
         """Add what ``statistics`` of a map of the same voxels gave; single precision loses less than a micrometre of a mean."""
         keys = _keys_of_cells(statistics["cell"].astype(np.int64) - self._lattice())
-        self.add_sums(
-            *_summed(keys, np.c_[statistics["points"].astype(np.float64), statistics["sums"].astype(np.float64)])
-        )
+        moments = np.zeros((len(keys), _MOMENTS))
+        moments[:, 0], moments[:, 1 : _BRIGHT.start] = statistics["points"], statistics["sums"]
+        if statistics.dtype == VOXEL:
+            moments[:, _BRIGHT] = np.stack([statistics["brightness"], statistics["bright_points"]], axis=1)
+        self.add_sums(*_summed(keys, moments))
 
     def add_moments(self, means: NDArray[np.float64], points: NDArray[Any], covariances: NDArray[np.float64]) -> None:
         """Add groups of points of which only the mean (n, 3; m, map frame), number (n) and covariance (n, 3, 3; m2) are known.
@@ -106,7 +120,7 @@ class VoxelMap:
         """
         cell = self._cells(means)
         moments = _moments_of((means - self.origin) - (cell + 0.5) * self.voxel_m)
-        moments[:, 4:] += covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        moments[:, _SECOND] += covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         self.add_sums(*_summed(_keys_of_cells(cell), moments * points.astype(np.float64)[:, None]))
 
     def _cells(self, points_map: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -143,10 +157,14 @@ class VoxelMap:
         variances, axes = np.linalg.eigh(_covariances(total))
         normals = axes[:, :, 0].astype(np.float32)
         thickness = np.sqrt(np.maximum(variances[:, 0], 0)).astype(np.float32)
-        return Surfels(centre + own[:, 1:4] / own[:, :1], normals, thickness, own[:, 0].astype(np.uint32), keys)
+        bright, told = own[:, _BRIGHT].T
+        brightness = np.divide(bright, told, out=np.full(len(own), np.nan), where=told > 0).astype(np.float32)
+        return Surfels(
+            centre + own[:, 1:4] / own[:, :1], normals, thickness, own[:, 0].astype(np.uint32), keys, brightness
+        )
 
-    def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64]]:
-        """Surfels relative to ``origin``, sorted by tile, and tiles (n, 4): centre x, y (m, same frame), first surfel, count.
+    def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
+        """Surfels relative to ``origin``, sorted by tile; tiles (n, 4): centre x, y (m, same frame), first surfel, count; brightness.
 
         float32 holds a tenth of a millimetre as far as 1 km from the origin, and 1 mm as far as 16 km.
         """
@@ -158,7 +176,7 @@ class VoxelMap:
         surfels["xyz"] = positions[order]
         surfels["normal"], surfels["thickness_m"] = found.normals[order], found.thickness_m[order]
         surfels["points"] = found.points[order]
-        return surfels, np.c_[(corners + 0.5) * TILE_M, first, count]
+        return surfels, np.c_[(corners + 0.5) * TILE_M, first, count], found.brightness[order]
 
 
 def lattice_origin(voxel_m: float, near: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -177,7 +195,8 @@ def _cells_of_keys(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:
     x, y, z = local.T
-    return np.stack([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
+    unknown = np.zeros(len(x))
+    return np.stack([np.ones(len(x)), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z, unknown, unknown], axis=1)
 
 
 def _summed(keys: NDArray[np.int64], moments: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -196,7 +215,7 @@ def _shifted(moments: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArra
     moved[:, 1:4] += n * shift
     x, y, z = s.T
     n0 = moments[:, 0]
-    moved[:, 4:] += np.stack(
+    moved[:, _SECOND] += np.stack(
         [2 * a * x + n0 * a * a, a * y + b * x + n0 * a * b, a * z + c * x + n0 * a * c,
          2 * b * y + n0 * b * b, b * z + c * y + n0 * b * c, 2 * c * z + n0 * c * c], axis=1
     )  # fmt: skip
@@ -206,7 +225,7 @@ def _shifted(moments: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArra
 def _covariances(moments: NDArray[np.float64]) -> NDArray[np.float64]:
     n = moments[:, :1]
     mean = moments[:, 1:4] / n
-    second = moments[:, 4:] / n
+    second = moments[:, _SECOND] / n
     index = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     covariances: NDArray[np.float64] = second[:, index] - mean[:, :, None] * mean[:, None, :]
     return covariances

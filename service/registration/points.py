@@ -93,10 +93,12 @@ class DepthBlocks:
     Attributes:
         z_m: of each block the depth whose inverse is the median; 0 where too little was measured, on an edge, or beyond the reach.
         camera: of which every block is a pixel.
+        covered: share of the picture's width and height that the blocks take, from the left and the top; a rest makes no block.
     """
 
     z_m: Float32[NDArray[np.float32], "H W"]
     camera: PinholeCamera
+    covered: tuple[float, float]
 
 
 def blocks_of(
@@ -124,7 +126,7 @@ def blocks_of(
     small = PinholeCamera(
         columns, rows, own.fx / size, own.fy / size, (own.cx - centre_px) / size, (own.cy - centre_px) / size
     )
-    return DepthBlocks(z, small)
+    return DepthBlocks(z, small, (columns * size / width, rows * size / height))
 
 
 def points_of(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
@@ -20,8 +20,10 @@ CELL_M, REACH_M = 0.4, 1.2
 TILE_M = 40.0
 
 
-_FLOATS, _NUMBERS = np.dtype("<f8"), np.dtype("<i4")
-#: Type and shape of every array; -1 is any length.
+_FLOATS, _NUMBERS, _BRIGHT = np.dtype("<f8"), np.dtype("<i4"), np.dtype("<f4")
+#: Of each surfel, where the survey's sensor told it; maps of earlier releases have none.
+BRIGHTNESS = "brightness"
+#: Type and shape of every other array; -1 is any length.
 _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "origin": (_FLOATS, (3,)), "surfels": (SURFEL, (-1,)), "tiles": (_FLOATS, (-1, 4)),
     "grid_frame": (_FLOATS, (4,)), "grid_block": (_NUMBERS, (-1, -1, -1)), "grid_nearest": (_NUMBERS, (-1, BLOCK**3)),
@@ -37,27 +39,34 @@ class SurfelMap:
         surfels: of dtype ``SURFEL``, sorted by tile.
         tiles: centre x, y (the surfels' frame, m), first surfel, count.
         grid: of the surfel nearest to each cell.
+        brightness: of each surfel: mean intensity of its returns as the sensor gives it, NaN where it told none; None where the map
+            says nothing of it.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
     surfels: NDArray[Any]
     tiles: Float64[NDArray[np.float64], "n 4"]
     grid: NearestGrid
+    brightness: Float32[NDArray[np.float32], " s"] | None = None
 
     @classmethod
     def prepare(
-        cls, origin_m: Float64[NDArray[np.float64], "3"], surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"]
+        cls, origin_m: Float64[NDArray[np.float64], "3"], surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"],
+        brightness: Float32[NDArray[np.float32], " s"] | None = None,
     ) -> "SurfelMap":  # fmt: skip
-        """Build the grid; seconds for a district."""
-        return cls(origin_m, surfels, tiles, nearest_grid(surfels, cell_m=CELL_M, reach_m=REACH_M))
+        """Build the grid; seconds for a district. A brightness that is nowhere above 0, as of a sensor that tells none, is none."""
+        if brightness is not None and not (brightness > 0).any():
+            brightness = None
+        return cls(origin_m, surfels, tiles, nearest_grid(surfels, cell_m=CELL_M, reach_m=REACH_M), brightness)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What is written, by name; ``from_arrays`` reads it again."""
-        return {
+        arrays = {
             "origin": self.origin_m, "surfels": self.surfels, "tiles": self.tiles,
             "grid_frame": np.array([*self.grid.origin_m, self.grid.cell_m]), "grid_block": self.grid.block,
             "grid_nearest": self.grid.nearest,
         }  # fmt: skip
+        return arrays if self.brightness is None else arrays | {BRIGHTNESS: self.brightness}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], *, verify: bool = True) -> "SurfelMap":
@@ -77,9 +86,12 @@ class SurfelMap:
             fits = len(shape) == array.ndim and all(w in (-1, has) for w, has in zip(shape, array.shape, strict=True))
             if array.dtype != dtype or not fits or not array.flags["C_CONTIGUOUS"]:
                 raise _defect(name, f"it holds {array.dtype} of shape {array.shape}")
+        brightness = arrays.get(BRIGHTNESS)
+        if brightness is not None and (brightness.dtype, brightness.shape) != (_BRIGHT, arrays["surfels"].shape):
+            raise _defect(BRIGHTNESS, f"it holds {brightness.dtype} of shape {brightness.shape}")
         frame = np.array(arrays["grid_frame"])
         grid = NearestGrid(frame[:3], float(frame[3]), arrays["grid_block"], arrays["grid_nearest"])
-        found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), grid)
+        found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), grid, brightness)
         if verify:
             found.require_consistent()
         return found
@@ -101,6 +113,8 @@ class SurfelMap:
             raise _defect("tiles", "a tile ends beyond the surfels")
         if not np.isfinite(self.origin_m).all():
             raise _defect("origin", "a coordinate is not finite")
+        if self.brightness is not None and (np.isinf(self.brightness).any() or (self.brightness < 0).any()):
+            raise _defect(BRIGHTNESS, "a brightness is negative or infinite")
         for name in ("xyz", "normal", "thickness_m"):
             if not np.isfinite(self.surfels[name]).all():
                 raise _defect("surfels", f"a number of {name} is not finite")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from model_training.mapping.voxel_map import TILE_M, VOXEL, VoxelMap, lattice_origin
+from model_training.mapping.voxel_map import TILE_M, VOXEL, VOXEL_WITHOUT_BRIGHTNESS, VoxelMap, lattice_origin
 
 
 def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
@@ -92,7 +92,7 @@ def test_tiles_hold_every_surfel_once_and_within_their_edges():
     rng = np.random.default_rng(3)
     voxels = map_of(rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3)), voxel_m=2.0)
     surfels = voxels.surfels()
-    own, rows = voxels.tiles(surfels)
+    own, rows, _ = voxels.tiles(surfels)
     assert rows[:, 3].sum() == len(own) == len(surfels.positions)
     np.testing.assert_array_equal(rows[:, 2], np.r_[0, np.cumsum(rows[:, 3])[:-1]])
     distance, nearest = cKDTree(own["xyz"] + voxels.origin).query(surfels.positions)
@@ -135,6 +135,58 @@ def test_statistics_by_hand():
     assert found["cell"].tolist() == [[2, -1, 0]]
     assert found["points"].tolist() == [2]
     np.testing.assert_allclose(found["sums"], [[0.1, 0, -0.2, 0.01, 0, -0.02, 0, 0, 0.04]], atol=1e-7)
+
+
+def lit(points, intensity, **rest):
+    voxels = map_of(**rest)
+    voxels.add(np.asarray(points, np.float64), np.asarray(intensity, np.float32))
+    return voxels
+
+
+def test_brightness_is_the_mean_over_the_returns_of_a_voxel():
+    """Four of the left voxel, one of the right; of the neighbour's none counts."""
+    points = [[0.1, 0.1, 0.1], [0.2, 0.3, 0.1], [0.3, 0.1, 0.2], [0.4, 0.4, 0.4], [0.6, 0.1, 0.1]]
+    found = lit(points, [0.1, 0.2, 0.3, 0.6, 0.9], origin=(0.0, 0.0, 0.0)).surfels()
+    np.testing.assert_allclose(found.brightness, [0.3, 0.9], rtol=1e-6)
+
+
+def test_points_without_a_brightness_do_not_dim_others():
+    points = np.random.default_rng(5).uniform(0.01, 0.49, (8, 3))
+    voxels = lit(points, np.full(8, 0.5), origin=(0.0, 0.0, 0.0))
+    voxels.add(points)
+    found = voxels.surfels()
+    np.testing.assert_array_equal(found.points, [16])
+    np.testing.assert_allclose(found.brightness, [0.5])
+    assert np.isnan(map_of(points, origin=(0.0, 0.0, 0.0)).surfels().brightness).all()
+
+
+def test_brightness_goes_along_with_its_surfel():
+    rng = np.random.default_rng(6)
+    points = rng.uniform([0, -100, 0], [200, 60, 1], (60000, 3))
+    voxels = lit(points, points[:, 0], voxel_m=2.0)
+    surfels, _, brightness = voxels.tiles(voxels.surfels())
+    assert np.abs(brightness - (surfels["xyz"][:, 0] + voxels.origin[0])).max() < 1e-3
+
+
+def test_statistics_keep_brightness(cloud):
+    intensity = np.random.default_rng(7).uniform(0, 1, len(cloud))
+    near = lattice_origin(0.5, np.array([98.0, -50.0, 1.0]))
+    one, other = (lit(cloud[part], intensity[part], origin=near) for part in (slice(0, 500), slice(500, None)))
+    one.add_statistics(other.statistics())
+    expected = lit(cloud, intensity, origin=near).surfels().brightness
+    np.testing.assert_allclose(one.surfels().brightness, expected, atol=1e-6)
+
+
+def test_statistics_of_an_older_map_say_nothing_of_brightness(cloud):
+    near = lattice_origin(0.5, np.array([98.0, -50.0, 1.0]))
+    whole = lit(cloud, np.ones(len(cloud)), origin=near).statistics()
+    older = np.zeros(len(whole), VOXEL_WITHOUT_BRIGHTNESS)
+    for name in older.dtype.names:
+        older[name] = whole[name]
+    read = VoxelMap(0.5, near)
+    read.add_statistics(older)
+    np.testing.assert_array_equal(read.statistics()["sums"], whole["sums"])
+    assert np.isnan(read.surfels().brightness).all()
 
 
 def test_moments_of_a_group_are_those_of_its_points():

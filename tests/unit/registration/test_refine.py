@@ -12,7 +12,7 @@ from service.localization.refine import RefineSettings, SupportWeights, refine, 
 from service.localization.starts import StartSettings
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
 from service.registration.points import inverse_depth_noise
-from service.registration.rays import RaySettings, adjust
+from service.registration.rays import RaySettings, adjust, meet
 from service.registration.register import RegistrationSettings
 from service.registration.scatter import scatter_of
 
@@ -178,6 +178,64 @@ def test_a_picture_of_too_few_points_is_not_registered(bundle, cloud, depth, bot
     found = refined(bundle, cloud, seen_in(few, both))
     assert found is not None
     assert 30 <= found.points <= 35
+
+
+@pytest.fixture
+def judged(cloud, monkeypatch):
+    """The cloud with some brightness, and what brightness is then said to say of each pose that is asked about: its y."""
+    asked_y_m = []
+
+    def agreement(of_cloud, T_map_camera, *_):
+        assert of_cloud.brightness is not None
+        asked_y_m.append(T_map_camera[1, 3])
+        return float(T_map_camera[1, 3])
+
+    monkeypatch.setattr(refining, "agreement_of_brightness", agreement)
+    return replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32)), asked_y_m
+
+
+def test_brightness_decides_among_candidates_that_are_close(bundle_like, judged, depth, both, seen_in):
+    lit, asked_y_m = judged
+    weights = {"inliers": 1.0, "similarity": 0.0, "likelihood": 0.0, "behind": 5.0}
+    without = refined(bundle_like(0.7, 0.7), lit, seen_in(depth, both), brightness=0.0, **weights)
+    found = refined(bundle_like(0.7, 0.7), lit, seen_in(depth, both), brightness=0.1, **weights)
+    assert without.best.T_map_camera[1, 3] == pytest.approx(0.5, abs=0.1)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(40.5, abs=0.3)
+    assert len(asked_y_m) == 2 * len(found.candidates) > 2
+    support = [candidate.support for candidate in found.candidates]
+    assert support == sorted(support, reverse=True)
+    for each in found.candidates[1:]:  # the first was adjusted after it was judged
+        assert each.support == pytest.approx(each.registered.inliers + 0.1 * each.registered.camera_m[1])
+
+
+def test_who_is_far_behind_is_not_drawn_and_stays_behind(bundle_like, judged, depth, both, seen_in):
+    """By similarity the street beside is 9 nats behind; its brightness, which would make up for that, is not asked."""
+    lit, asked_y_m = judged
+    weights = {"inliers": 1.0, "similarity": 30.0, "likelihood": 0.0, "behind": 5.0}
+    unlit = refined(bundle_like(0.4, 0.7), replace(lit, brightness=None), seen_in(depth, both), **weights)
+    assert asked_y_m == []
+    found = refined(bundle_like(0.4, 0.7), lit, seen_in(depth, both), brightness=10.0, **weights)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(0.5, abs=0.1)
+    assert max(asked_y_m, default=0.0) < 20.0
+    beside = [[c.support - r.best.support for c in r.candidates if c.T_map_camera[1, 3] > 20] for r in (unlit, found)]
+    assert max(beside[1]) <= max(beside[0]) + 1e-9 < -5
+
+
+def test_the_picture_tells_two_streets_apart_that_differ_in_paint_alone(bundle_like, cloud, depth, both, seen_in):
+    """The map's own brightness as the true pose shows it, as a picture of other size and sign."""
+    rng = np.random.default_rng(2)
+    lit = replace(cloud, brightness=rng.uniform(0.05, 1.0, len(cloud.surfels)).astype(np.float32))
+    frame = seen_in(depth, both)
+    camera = CAMERA.scaled_to(160, 120)
+    T = TRUE.copy()
+    T[:3, 3] -= lit.origin_m
+    met = meet(lit, T, camera, RaySettings())
+    grey = np.where(met >= 0, 255 - 200 * lit.brightness[np.maximum(met, 0)], 128).astype(np.uint8)
+    frame = replace(frame, query=replace(frame.query, rgb=np.repeat(grey[..., None], 3, axis=2)))
+    weights = {"inliers": 1.0, "similarity": 2.0, "likelihood": 0.0}
+    blind, found = (refined(bundle_like(0.9, 0.4), each, frame, brightness=30.0, **weights) for each in (cloud, lit))
+    assert blind.best.T_map_camera[1, 3] == pytest.approx(40.5, abs=0.3)
+    np.testing.assert_allclose(found.best.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
 
 
 # A frame 2 m further on that is turned by 20 degrees, leans otherwise, and was levelled otherwise too.

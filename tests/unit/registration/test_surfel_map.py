@@ -5,7 +5,8 @@ from service.errors import BundleError
 from service.registration.kernel import SURFEL, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 
-NAMES = ["origin", "surfels", "tiles", *(f"grid_{array}" for array in ("frame", "block", "nearest"))]
+REQUIRED = ["origin", "surfels", "tiles", *(f"grid_{array}" for array in ("frame", "block", "nearest"))]
+NAMES = [*REQUIRED, "brightness"]
 
 
 @pytest.fixture(scope="module")
@@ -14,7 +15,9 @@ def cloud(scene_of):
     surfels = scene_of(((0, 0, 0), (3, 0, 0), (0, 3, 0)), ((50, 0, 0), (3, 0, 0), (0, 3, 0))).surfels()
     half = len(surfels) // 2
     tiles = np.array([[20.0, 20, 0, half], [60, 20, half, half]])
-    return SurfelMap.prepare(np.array([100.0, 200.0, 30.0]), surfels, tiles)
+    brightness = np.linspace(0, 1, len(surfels), dtype=np.float32)
+    brightness[3] = np.nan  # no return told any
+    return SurfelMap.prepare(np.array([100.0, 200.0, 30.0]), surfels, tiles, brightness)
 
 
 @pytest.fixture
@@ -61,13 +64,13 @@ def test_the_grid_reaches_12_decimetres_from_a_surface(cloud, points_at, start_a
     assert state["seen"][0] == seen
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", REQUIRED)
 def test_a_missing_array_is_named(arrays, name):
     del arrays[name]
     refused(arrays, name, "it is missing")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", REQUIRED)
 def test_an_array_of_another_type_is_named(arrays, name):
     arrays[name] = np.zeros(arrays[name].shape, np.float32)
     refused(arrays, name, "it holds float32")
@@ -150,3 +153,23 @@ def test_a_map_without_tiles_is_consistent(arrays):
 
 def test_a_surfel_takes_32_bytes():
     assert SURFEL.itemsize == 32
+
+
+def test_a_map_of_an_earlier_release_has_no_brightness(arrays):
+    del arrays["brightness"]
+    found = SurfelMap.from_arrays(arrays)
+    assert found.brightness is None
+    assert "brightness" not in found.arrays()
+
+
+@pytest.mark.parametrize(
+    ("damage", "what"),
+    [
+        (lambda b: b[:-1], "it holds float32 of shape"), (lambda b: b.astype(np.float64), "it holds float64"),
+        (lambda b: np.where(np.arange(len(b)) == 5, np.float32(-1), b), "a brightness is negative or infinite"),
+        (lambda b: np.where(np.arange(len(b)) == 5, np.float32(np.inf), b), "a brightness is negative or infinite"),
+    ],
+)  # fmt: skip
+def test_a_brightness_that_is_none_is_refused(arrays, damage, what):
+    arrays["brightness"] = damage(arrays["brightness"])
+    refused(arrays, "brightness", what)
