@@ -245,3 +245,14 @@ def test_a_truncated_file_is_refused(half_maps, tmp_path):
 
 def test_the_manifest_is_of_the_same_format(merged):
     assert json.loads((merged.path / "manifest.json").read_text()).keys() == merged.manifest.model_dump().keys()
+
+
+def test_brightness_of_a_merged_map_is_that_of_both_surveys(merged, whole):
+    """The mean over the returns of both, whichever survey they are of."""
+    distance, nearest = cKDTree(positions(whole)).query(positions(merged))
+    same = distance < 1e-4
+    assert same.mean() > 0.95
+    one, other = merged.cloud.brightness[same], whole.cloud.brightness[nearest[same]]
+    assert np.isfinite(other).all()
+    np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+    assert other.std() > 0.1 * other.mean()
