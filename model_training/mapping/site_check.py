@@ -62,7 +62,8 @@ def site_of(
     """Ask the map without the held scans where they were taken, and compare with the truth.
 
     Args:
-        content: of the whole map, its cloud without the held scans.
+        content: of the whole map, its cloud without the held scans. Its brightness is not asked: the queries' is the survey's own,
+            which agrees with it as no camera's does.
         held: the scans.
         calibration: to be checked.
         report: told after every query.
@@ -103,6 +104,7 @@ def _without(content: BundleContent, places: set[int]) -> BundleContent:
         view_place=np.repeat(np.arange(int(keep.sum()), dtype=np.int32), content.headings),
         view_heading_rad=content.view_heading_rad[views], descriptors=content.descriptors[views],
         calibration={"calibrated": False, "why": "asked to check the calibration"}, preview_webp=b"",
+        cloud=None if content.cloud is None else replace(content.cloud, brightness=None),
     )  # fmt: skip
 
 

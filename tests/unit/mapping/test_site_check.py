@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,6 +10,8 @@ from model_training.mapping.site_check import FEWEST, MOST, HeldScan, held_out, 
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import FEATURES, probability
+from service.registration.kernel import SURFEL
+from service.registration.surfel_map import SurfelMap
 
 GRID = ViewGrid(rows=64, columns=64)
 
@@ -70,7 +74,7 @@ def test_without_some_places_their_views_are_gone_and_the_others_are_renumbered(
     np.testing.assert_array_equal(left.view_heading_rad, content.view_heading_rad[views])
     np.testing.assert_array_equal(left.view_place, np.repeat(np.arange(10), 4))
     assert left.calibration["calibrated"] is False
-    assert left.cloud is content.cloud
+    assert left.cloud.surfels is content.cloud.surfels
     assert len(content.T_map_place) == 12
 
 
@@ -90,6 +94,14 @@ def noiseless(monkeypatch):
 def drawn(points, number, T_map_level=None):
     scan = HeldScan(0, points, np.eye(4) if T_map_level is None else T_map_level)
     return site_check._drawn(scan, GRID, number)
+
+
+def test_the_maps_brightness_is_not_asked(content):
+    """The pictures are drawn of the same sensor's intensities: they would agree as no camera's do."""
+    cloud = SurfelMap.prepare(np.zeros(3), np.zeros(4, SURFEL), np.zeros((0, 4)), np.ones(4, np.float32))
+    lit = replace(content, cloud=cloud)
+    assert site_check._without(lit, {1}).cloud.brightness is None
+    assert lit.cloud.brightness is not None
 
 
 @pytest.mark.parametrize("number", range(4))
