@@ -45,7 +45,7 @@ def off_m(poses, dataset):
 
 
 def test_scans_that_are_said_to_stand_a_little_wrong_are_brought_into_agreement(shifted):
-    """By a third, of eleven scans; which surfel is the nearest turns on rounding, and with it some of that, by processor."""
+    """By a third, of eleven scans: what is left was below 0.65 on one machine and is 0.667 on another, by the same code."""
     found = aligned(shifted, shifted.survey_poses(), every(shifted))
     assert np.sqrt((off_m(found, shifted) ** 2).mean()) < 0.75 * np.sqrt(
         (off_m(shifted.survey_poses(), shifted) ** 2).mean()
