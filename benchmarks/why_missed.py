@@ -24,8 +24,8 @@ _PEERS = (
     "16 % dearer; of the 1.2 that a service adds to the bare retrieval nearly all would have to go"
 )
 _SLOWER = (
-    "measured on a slower machine than the rows before: what was registration until then takes 32.5 and 47.8 ms on it (22.3 and 30.3 "
-    "there); brightness as a judge takes 1.21 (precise) and 1.30 times that, medians of 60 ratios within one run"
+    "measured on a slower machine than the rows before: the code of before takes 37.8 and 50.8 ms on it (22.3 and 30.3 elsewhere); "
+    "brightness as a judge takes 1.21 (precise) and 1.30 times the time without it, medians of 60 ratios within one run"
 )
 WHY_MISSED: dict[str, str] = {
     "paper.streetfix.minutes_for_paper_images": (
