@@ -15,7 +15,7 @@ from model_training.mapping.build import BuildSettings
 from service.geometry.rigid import rotation_z, transform_from, transform_points
 from service.imaging.level import level_camera
 from service.localization.refine import RefineSettings, settings_for_rig
-from service.registration.points import blocks_of, inverse_depth_noise, points_from
+from service.registration.points import blocks_of, inverse_depth_noise, movable_of, points_from
 from service.registration.rays import adjust, picture_of
 from service.registration.register import Start, register
 from service.registration.surfel_map import SurfelMap
@@ -73,7 +73,10 @@ def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.
             blocks, level.R_level_camera, level.height_m, refining.points, noise=noise, focal_baseline_px_m=FOCAL_BASELINE_PX_M
         )  # fmt: skip
         T_level_camera = transform_from(level.R_level_camera, np.zeros(3))
-        picture = picture_of(blocks, T_level_camera, noise=noise, focal_baseline_px_m=FOCAL_BASELINE_PX_M)
+        movable = movable_of(blocks, level.R_level_camera, level.height_m, refining.points)
+        picture = picture_of(
+            blocks, T_level_camera, noise=noise, focal_baseline_px_m=FOCAL_BASELINE_PX_M, movable=movable
+        )
         prepared_s.append(time.process_time() - began)
         rng = np.random.default_rng([140, frame.number])
         R_true = truth[:3, :3] @ level.R_level_camera.T

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform
 from service.localization.hypotheses import Hypothesis
-from service.localization.refine import Candidate
+from service.localization.judge import Candidate
 from service.localization.search import Neighbour
 from service.localization.street_vote import StreetVote
 

@@ -6,35 +6,23 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.rigid import Transform, heading_of_camera, transform_from
+from service.geometry.rigid import heading_of_camera, transform_from
 from service.localization.frames import Frame
+from service.localization.judge import Candidate, Judge, NearWeights, SupportWeights
 from service.localization.prior import Prior
 from service.localization.similar import similarities_at
 from service.localization.starts import Likeness, StartSettings, level_from, starts_from
 from service.maps.reader import MapBundle
+from service.registration.around import AroundSettings, poses_around
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
 from service.registration.kernel import QueryPoints
-from service.registration.photometry import PhotometrySettings, agreement_of_brightness, grey_of
-from service.registration.points import DepthBlocks, PointSettings, blocks_of, points_from
+from service.registration.photometry import PhotometrySettings
+from service.registration.points import DepthBlocks, PointSettings, blocks_of, movable_of, points_from
 from service.registration.rays import RayPicture, RaySettings, adjust, picture_of
-from service.registration.register import Registered, RegistrationSettings, register
-from service.registration.rendered import Agreement, Seen, agreement, seen_by
+from service.registration.register import RegistrationSettings, register
+from service.registration.rendered import seen_by
 from service.registration.scatter import disagreement, scatter_of
 from service.registration.surfel_map import SurfelMap
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SupportWeights:
-    """What speaks for a candidate against its rivals, in nats: a conditional logit over the candidates of the watch cities' queries.
-
-    ``brightness`` is asked only of candidates that are at most ``behind`` behind the best without it: drawing costs time.
-    """
-
-    inliers: float = 20.0
-    similarity: float = 68.0
-    likelihood: float = 2.4
-    brightness: float = 80.0
-    behind: float = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +40,8 @@ class RefineSettings:
     starts: StartSettings = field(default_factory=StartSettings)
     points: PointSettings = field(default_factory=PointSettings)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
+    around: AroundSettings = field(default_factory=AroundSettings)
+    near: NearWeights = field(default_factory=NearWeights)
     rays: RaySettings = field(default_factory=RaySettings)
     photometry: PhotometrySettings = field(default_factory=PhotometrySettings)
 
@@ -70,27 +60,6 @@ def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> Re
 
 #: Standard deviation of a rig's disparity offset; SGBM's was 0.1 to 0.46 px on real frames (feasibility.md).
 OFFSET_PX = 0.6
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """A registered pose and what speaks for it.
-
-    Attributes:
-        T_map_camera: of the reference camera.
-        registered: as the solver left it; the best one adjusted along its rays, by centimetres, after all below was told.
-        similarity: to the places around the pose, mean over the frames.
-        place_m: how far those places are, mean over the frames.
-        agreement: with the map as drawn at the pose, mean over the frames.
-        support: logarithm, against the other candidates.
-    """
-
-    T_map_camera: Transform
-    registered: Registered
-    similarity: float
-    place_m: float
-    agreement: Agreement
-    support: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,13 +112,29 @@ def refine(
         likeness=None if len(frames) == 1 else _likeness(bundle, frames),
     )  # fmt: skip
     found = register(cloud, merged, starts, reference.views.height_m, settings.registration)
-    candidates = _candidates(bundle, cloud, frames, seen, found, prior, settings.support)
-    noise = float(np.median([frame.noise for frame in frames]))
-    candidates.sort(key=lambda candidate: -candidate.support)
     pictures = _pictures(frames, blocks, settings)
-    candidates = _with_brightness(cloud, candidates, frames, blocks, pictures, settings)
+    judge = Judge(
+        bundle,
+        cloud,
+        frames,
+        seen,
+        blocks,
+        pictures,
+        prior,
+        settings.support,
+        settings.near,
+        settings.rays,
+        settings.photometry,
+    )
+    candidates = judge.with_brightness(judge.candidates(found))
+    noise = float(np.median([frame.noise for frame in frames]))
+    if cloud.brightness is not None and noise >= settings.around.from_noise:
+        near = poses_around(
+            cloud, merged, candidates[0].registered, reference.views.height_m, settings.registration, settings.around
+        )
+        candidates[0] = judge.best_near(candidates[0], near)
     best = candidates[0].registered
-    adjusted = adjust(cloud, pictures, best, settings.rays)
+    adjusted = adjust(cloud, pictures, best, settings.rays, met=judge.met(best))
     if adjusted is None:
         scatter, model = scatter_of(cloud, merged, best, settings.registration), OF_POINTS
     else:
@@ -175,7 +160,8 @@ def _pictures(frames: tuple[Frame, ...], blocks: list[DepthBlocks], settings: Re
     for frame, own in zip(frames, blocks, strict=True):
         T = level_from(frame.T_reference_camera, frame.R_level_camera, frames[0].R_level_camera)
         T_level_camera = T @ transform_from(frame.R_level_camera, np.zeros(3))
-        pictures.append(picture_of(own, T_level_camera, noise=frame.noise, focal_baseline_px_m=rig))
+        movable = movable_of(own, frame.R_level_camera, frame.views.height_m, settings.points)
+        pictures.append(picture_of(own, T_level_camera, noise=frame.noise, focal_baseline_px_m=rig, movable=movable))
     return pictures
 
 
@@ -202,82 +188,3 @@ def _likeness(bundle: MapBundle, frames: tuple[Frame, ...]) -> Likeness:
         return mean
 
     return likeness
-
-
-def _candidates(
-    bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], seen: list[Seen], found: tuple[Registered, ...],
-    prior: Prior | None, weights: SupportWeights,
-) -> list[Candidate]:  # fmt: skip
-    similarities, places_m, agreements = [], [], list[list[Agreement]]()
-    for frame, points in zip(frames, seen, strict=True):
-        own = [pose if frame is frames[0] else _seen_from(frame, frames[0], pose) for pose in found]
-        similarity, place_m = similarities_at(
-            bundle, frame.descriptors, R_map_level=np.stack([pose.R_map_level for pose in own]),
-            camera_m=np.stack([pose.camera_m for pose in own]),
-        )  # fmt: skip
-        similarities.append(similarity)
-        places_m.append(place_m)
-        if len(points):
-            agreements.append([agreement(cloud, points, pose) for pose in own])
-    candidates = []
-    for k, (pose, similarity, place_m) in enumerate(
-        zip(found, np.mean(similarities, axis=0), np.mean(places_m, axis=0), strict=True)
-    ):
-        agreed = Agreement.mean([each[k] for each in agreements])
-        support = (
-            weights.inliers * pose.inliers + weights.similarity * similarity + weights.likelihood * agreed.likelihood
-        )
-        if prior is not None:
-            heading = np.arctan2(pose.R_map_level[1, 0], pose.R_map_level[0, 0])
-            support += float(prior.log_weight(pose.camera_m[None, :2], np.array([heading]))[0])
-        T_map_camera = transform_from(pose.R_map_level @ frames[0].R_level_camera, pose.camera_m)
-        candidates.append(Candidate(T_map_camera, pose, float(similarity), float(place_m), agreed, float(support)))
-    return candidates
-
-
-def _with_brightness(
-    cloud: SurfelMap, candidates: list[Candidate], frames: tuple[Frame, ...], blocks: list[DepthBlocks], pictures: list[RayPicture],
-    settings: RefineSettings,
-) -> list[Candidate]:  # fmt: skip
-    """The candidates, the best first, once those in front have been judged by brightness as well.
-
-    Those behind get as much for it as the worst judged: they stay behind, by as much as they were at least.
-    """
-    weights = settings.support
-    judged = [k for k in candidates if k.support >= candidates[0].support - weights.behind]
-    if cloud.brightness is None or len(judged) == 1:
-        return candidates
-    greys = [
-        grey_of(frame.query.rgb, own.camera, own.covered, settings.photometry)
-        for frame, own in zip(frames, blocks, strict=True)
-    ]
-    agreed = []
-    for candidate in judged:
-        T_map_level = transform_from(candidate.registered.R_map_level, candidate.registered.camera_m)
-        each = [
-            agreement_of_brightness(
-                cloud, T_map_level @ picture.T_level_camera, picture.camera, grey, settings.rays, settings.photometry
-            )
-            for picture, grey in zip(pictures, greys, strict=True)
-        ]
-        agreed.append(float(np.mean(each)))
-    agreed += [min(agreed)] * (len(candidates) - len(judged))
-    told = [
-        replace(k, support=k.support + weights.brightness * each) for k, each in zip(candidates, agreed, strict=True)
-    ]
-    return sorted(told, key=lambda candidate: -candidate.support)
-
-
-def _seen_from(frame: Frame, reference: Frame, pose: Registered) -> Registered:
-    """The pose of another frame's level frame that follows from the reference's."""
-    T = level_from(frame.T_reference_camera, frame.R_level_camera, reference.R_level_camera)
-    R = pose.R_map_level @ T[:3, :3]
-    return Registered(
-        R,
-        pose.camera_m + pose.R_map_level @ T[:3, 3],
-        pose.scale,
-        pose.offset,
-        pose.inliers,
-        pose.information,
-        pose.hypothesis,
-    )

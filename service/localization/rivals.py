@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.localization.refine import Candidate
+from service.localization.judge import Candidate
 
 #: A rival stands further away than this, or looks another way: the next frame of the same street is none.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))

@@ -163,6 +163,10 @@ class QueryPoints:
         """The same points, none of less weight."""
         return QueryPoints(self.xyz, self.ray, self.sigma, np.maximum(self.weight, np.float32(weight)), self.q)
 
+    def thinned(self, count: int) -> "QueryPoints":
+        """At most so many of the points, evenly spread over their order."""
+        return self.subset(np.linspace(0, len(self) - 1, min(count, len(self))).astype(np.intp))
+
     def subset(self, rows: NDArray[np.intp]) -> "QueryPoints":
         """Some of the points."""
         return QueryPoints(*(np.ascontiguousarray(getattr(self, name)[rows]) for name in self.__slots__))

@@ -15,9 +15,6 @@ from jaxtyping import Float32, Int32, UInt8
 from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
-from service.geometry.rigid import Transform
-from service.registration.rays import RaySettings, meet
-from service.registration.surfel_map import SurfelMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,25 +55,18 @@ def grey_of(
 
 
 def agreement_of_brightness(
-    cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera, grey: Float32[NDArray[np.float32], "H W"],
-    rays: RaySettings, settings: PhotometrySettings,
+    brightness: Float32[NDArray[np.float32], " n"], met: Int32[NDArray[np.int32], "H W"], grey: Float32[NDArray[np.float32], "H W"],
+    settings: PhotometrySettings,
 ) -> float:  # fmt: skip
     """Mean squared correlation of patches, from 0 (also where the map knows no brightness) to 1.
 
     Args:
-        cloud: the map's.
-        T_map_camera: the pose, map frame.
-        camera: of the small picture.
+        brightness: of the map's surfels.
+        met: the surfel that each pixel of the small picture shows, as ``meet`` gave it.
         grey: of the picture, as ``grey_of`` gave it.
-        rays: how rays meet surfels.
         settings: of the patches.
     """
-    if cloud.brightness is None:
-        return 0.0
-    T = T_map_camera.copy()
-    T[:3, 3] -= cloud.origin_m
-    drawn = _drawn(cloud.brightness, meet(cloud, T, camera, rays), settings)
-    return squared_correlation(drawn, grey, settings)
+    return squared_correlation(_drawn(brightness, met, settings), grey, settings)
 
 
 def _drawn(

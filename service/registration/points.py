@@ -163,13 +163,30 @@ def points_from(
     chosen = _chosen(xyz[:, 2] + height_m < settings.ground_m, settings)
     xyz, z, level, length = xyz[chosen], z[chosen], level[chosen], np.linalg.norm(rays[chosen], axis=1)
     sigma = np.hypot(z**2 * noise * np.sqrt(1 + settings.correlated) * length, settings.floor_m)
-    above_m = xyz[:, 2] + height_m
-    movable = (above_m > settings.ground_m) & (above_m < settings.movable_m)
+    movable = _may_move(xyz[:, 2] + height_m, settings)
     f = np.float32
     return QueryPoints(
         xyz=xyz.astype(f), ray=(level / length[:, None]).astype(f), sigma=sigma.astype(f),
         weight=np.where(movable, settings.movable_weight, 1.0).astype(f), q=(z / focal_baseline_px_m).astype(f),
     )  # fmt: skip
+
+
+def movable_of(
+    blocks: DepthBlocks, R_level_camera: Rotation, height_m: float, settings: PointSettings
+) -> Bool[NDArray[np.bool_], "H W"]:
+    """Which blocks show what may have come or gone since the survey (``movable_m``); arguments as in ``points_of``."""
+    own = blocks.camera
+    v, u = (np.arange(side)[of] for side, of in ((own.height, np.s_[:, None]), (own.width, np.s_[None])))
+    x, y, z = R_level_camera[2]
+    above_m = blocks.z_m * (x * (u - own.cx) / own.fx + y * (v - own.cy) / own.fy + z) + height_m
+    return _may_move(above_m, settings) & (blocks.z_m > 0)
+
+
+def _may_move(
+    above_m: Float64[NDArray[np.float64], "*shape"], settings: PointSettings
+) -> Bool[NDArray[np.bool_], "*shape"]:
+    may: Bool[NDArray[np.bool_], "*shape"] = (above_m > settings.ground_m) & (above_m < settings.movable_m)
+    return may
 
 
 def _chosen(ground: Bool[NDArray[np.bool_], " n"], settings: PointSettings) -> NDArray[np.intp]:

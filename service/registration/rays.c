@@ -31,15 +31,15 @@ typedef struct {
 } Disc;
 
 /* From the least whole number that is not below a number, and not below 0. */
-static inline int32_t from(double edge)
+static inline int32_t from(float edge)
 {
-    const int32_t whole = edge > 0 ? (int32_t)edge : 0;
-    return whole + ((double)whole < edge);
+    const int32_t whole = edge > 0 ? (edge < 1e9f ? (int32_t)edge : 1000000000) : 0;
+    return whole + ((float)whole < edge);
 }
 
-static inline int32_t up_to(double edge, int64_t size)
+static inline int32_t up_to(float edge, int64_t size)
 {
-    return (int32_t)(edge < (double)(size - 1) ? edge : (double)(size - 1));
+    return (int32_t)(edge < (float)(size - 1) ? edge : (float)(size - 1));
 }
 
 /* met (height, width): the surfel on each pixel's ray, -1 for none; of discs that overlap near the first one met, that whose middle is
@@ -54,50 +54,67 @@ WIDE void streetfix_meet(const Surfel *surfels, const int64_t *parts, int64_t pa
         met[i] = -1;
     }
     /* What is beside the picture is left out before anything is divided; a disc reaches its radius over its middle, across and ahead. */
-    const double *R = v->R;
-    const double left = -v->cx / v->fx, right = ((double)(v->width - 1) - v->cx) / v->fx;
-    const double top = -v->cy / v->fy, bottom = ((double)(v->height - 1) - v->cy) / v->fy;
-    const double beside = o->radius * (1.0 + fmax(-left, right)), above = o->radius * (1.0 + fmax(-top, bottom));
+    float r[9];
+    for (int i = 0; i < 9; i++) r[i] = (float)v->R[i];
+    const float tx = (float)v->t[0], ty = (float)v->t[1], tz = (float)v->t[2], fx = (float)v->fx, fy = (float)v->fy;
+    const float cx = (float)v->cx, cy = (float)v->cy, ifx = (float)(1.0 / v->fx), ify = (float)(1.0 / v->fy);
+    const float radius = (float)o->radius, nearest = (float)o->nearest, reach = (float)o->reach, grazing2 = (float)(o->grazing * o->grazing);
+    const float left = -cx * ifx, right = ((float)(v->width - 1) - cx) * ifx;
+    const float top = -cy * ify, bottom = ((float)(v->height - 1) - cy) * ify;
+    const float beside = radius * (1.0f + fmaxf(-left, right)), above = radius * (1.0f + fmaxf(-top, bottom));
     int64_t count = 0;
     for (int64_t p = 0; p < part_count; p++)
         for (int64_t k = parts[2 * p]; k < parts[2 * p] + parts[2 * p + 1]; k++) {
             const Surfel *m = surfels + k;
-            const double dx = m->x - v->t[0], dy = m->y - v->t[1], dz = m->z - v->t[2];
-            const double z = R[2] * dx + R[5] * dy + R[8] * dz, x = R[0] * dx + R[3] * dy + R[6] * dz, y = R[1] * dx + R[4] * dy + R[7] * dz;
-            if (!((z >= o->nearest) & (z <= o->reach) & (x >= left * z - beside) & (x <= right * z + beside) & (y >= top * z - above) &
+            const float dx = m->x - tx, dy = m->y - ty, dz = m->z - tz;
+            const float z = r[2] * dx + r[5] * dy + r[8] * dz, x = r[0] * dx + r[3] * dy + r[6] * dz, y = r[1] * dx + r[4] * dy + r[7] * dz;
+            if (!((z >= nearest) & (z <= reach) & (x >= left * z - beside) & (x <= right * z + beside) & (y >= top * z - above) &
                   (y <= bottom * z + above))) continue;
-            const double nx = R[0] * m->nx + R[3] * m->ny + R[6] * m->nz, ny = R[1] * m->nx + R[4] * m->ny + R[7] * m->nz;
-            const double nz = R[2] * m->nx + R[5] * m->ny + R[8] * m->nz, off = nx * x + ny * y + nz * z;
-            if (off * off < o->grazing * o->grazing * (x * x + y * y + z * z)) continue;
+            const float nx = r[0] * m->nx + r[3] * m->ny + r[6] * m->nz, ny = r[1] * m->nx + r[4] * m->ny + r[7] * m->nz;
+            const float nz = r[2] * m->nx + r[5] * m->ny + r[8] * m->nz, off = nx * x + ny * y + nz * z;
+            if (off * off < grazing2 * (x * x + y * y + z * z)) continue;
             /* How far the disc reaches along each axis; its picture lies between those of the corners of that box. */
-            const double wide = o->radius * sqrt(fmax(1.0 - nx * nx, 0)), tall = o->radius * sqrt(fmax(1.0 - ny * ny, 0));
-            const double deep = o->radius * sqrt(fmax(1.0 - nz * nz, 0)), close = 1.0 / fmax(z - deep, 0.5 * o->nearest), away = 1.0 / (z + deep);
-            const double u0 = (x - wide) * (x > wide ? away : close) * v->fx + v->cx, u1 = (x + wide) * (x > -wide ? close : away) * v->fx + v->cx;
-            const double v0 = (y - tall) * (y > tall ? away : close) * v->fy + v->cy, v1 = (y + tall) * (y > -tall ? close : away) * v->fy + v->cy;
-            if (!(u1 >= 0 && u0 <= (double)(v->width - 1) && v1 >= 0 && v0 <= (double)(v->height - 1))) continue;
-            seen[count++] = (Disc){(float)x, (float)y, (float)z, (float)nx, (float)ny, (float)nz, (int32_t)k, from(u0),
-                                   up_to(u1, v->width), from(v0), up_to(v1, v->height)};
+            const float wide = radius * sqrtf(fmaxf(1.0f - nx * nx, 0)), tall = radius * sqrtf(fmaxf(1.0f - ny * ny, 0));
+            const float deep = radius * sqrtf(fmaxf(1.0f - nz * nz, 0)), close = 1.0f / fmaxf(z - deep, 0.5f * nearest), away = 1.0f / (z + deep);
+            const float u0 = (x - wide) * (x > wide ? away : close) * fx + cx, u1 = (x + wide) * (x > -wide ? close : away) * fx + cx;
+            const float v0 = (y - tall) * (y > tall ? away : close) * fy + cy, v1 = (y + tall) * (y > -tall ? close : away) * fy + cy;
+            if (!(u1 >= 0 && u0 <= (float)(v->width - 1) && v1 >= 0 && v0 <= (float)(v->height - 1))) continue;
+            const Disc disc = {x, y, z, nx, ny, nz, (int32_t)k, from(u0), up_to(u1, v->width), from(v0), up_to(v1, v->height)};
+            seen[count] = disc;
+            count += (disc.left <= disc.right) & (disc.top <= disc.bottom); /* far ones may lie between the pixels' middles */
         }
-    const float radius2 = (float)(o->radius * o->radius), behind = (float)o->behind;
-    const float cx = (float)v->cx, cy = (float)v->cy, ifx = (float)(1.0 / v->fx), ify = (float)(1.0 / v->fy);
-    for (int pass = 0; pass < 2; pass++)
-        for (int64_t i = 0; i < count; i++) {
-            const Disc *s = seen + i;
-            const float off = s->nx * s->x + s->ny * s->y + s->nz * s->z;
-            for (int64_t b = s->top; b <= s->bottom; b++)
-                for (int64_t a = s->left; a <= s->right; a++) {
-                    const float rx = ((float)a - cx) * ifx, ry = ((float)b - cy) * ify, z = off / (s->nx * rx + s->ny * ry + s->nz);
-                    const float ex = rx * z - s->x, ey = ry * z - s->y, ez = z - s->z, apart = ex * ex + ey * ey + ez * ez;
-                    if (!(apart <= radius2)) continue; /* nor where the ray runs along the disc */
-                    const int64_t at = b * v->width + a;
-                    if (pass == 0) {
-                        if (z < first[at]) first[at] = z;
-                    } else if (z <= first[at] + behind && apart < middle[at]) {
-                        middle[at] = apart;
-                        met[at] = s->number;
-                    }
-                }
+    const float radius2 = radius * radius, behind = (float)o->behind;
+    /* Neither pass branches on what it finds: most discs cover a pixel or two, so a processor could only guess. A ray along a disc gives
+     * no number or an infinite one, which nothing is nearer than. */
+    for (int64_t i = 0; i < count; i++) {
+        const Disc *s = seen + i;
+        const float off = s->nx * s->x + s->ny * s->y + s->nz * s->z;
+        for (int64_t b = s->top; b <= s->bottom; b++) {
+            const float ry = ((float)b - cy) * ify, lean = s->ny * ry + s->nz;
+            float *row = first + b * v->width;
+            for (int64_t a = s->left; a <= s->right; a++) {
+                const float rx = ((float)a - cx) * ifx, z = off / (s->nx * rx + lean);
+                const float ex = rx * z - s->x, ey = ry * z - s->y, ez = z - s->z, apart = ex * ex + ey * ey + ez * ez;
+                const float near = apart <= radius2 ? z : INFINITY;
+                row[a] = near < row[a] ? near : row[a];
+            }
         }
+    }
+    for (int64_t i = 0; i < count; i++) {
+        const Disc *s = seen + i;
+        const float off = s->nx * s->x + s->ny * s->y + s->nz * s->z;
+        for (int64_t b = s->top; b <= s->bottom; b++) {
+            const float ry = ((float)b - cy) * ify, lean = s->ny * ry + s->nz;
+            for (int64_t a = s->left; a <= s->right; a++) {
+                const int64_t at = b * v->width + a;
+                const float rx = ((float)a - cx) * ifx, z = off / (s->nx * rx + lean);
+                const float ex = rx * z - s->x, ey = ry * z - s->y, ez = z - s->z, apart = ex * ex + ey * ey + ez * ez;
+                const int better = (apart <= radius2) & (z <= first[at] + behind) & (apart < middle[at]);
+                middle[at] = better ? apart : middle[at];
+                met[at] = better ? s->number : met[at];
+            }
+        }
+    }
 }
 
 typedef struct {
@@ -108,12 +125,14 @@ typedef struct {
     double surface;         /* m: how far the map's surfaces may be off along a ray */
     double robust;          /* standard deviations at which a residual weighs a quarter */
     double shared;          /* standard deviation of the error that a patch has in common, 1/m */
+    double moved;           /* m: standard deviation of how far what may move stands from where it was mapped */
     double nearest, reach;  /* m */
     double grazing;         /* cosine, as in Discs */
     int64_t patch;          /* pixels along its edge */
 } Asked;
 
-/* One pixel: what its residual does with the unknowns (0 .. 7), the residual (8), what its patch's own error does with it (9). */
+/* One pixel: what its residual does with the unknowns (0 .. 7), the residual (8), by how much its patch's own error, of
+ * deviation 1, is felt in it (9). */
 enum { RESIDUAL = UNKNOWNS, OWN, ROWS, LANES = 8, MOST = 256 };
 
 /* A patch's pixels side by side, as many as there are and zeros up to whole lanes. */
@@ -154,19 +173,22 @@ static inline double product(const double *one, const double *other, int count)
 /* H (8, 8) and b (8) of the normal equations of one picture, added to what is there, and the pull of each patch (patches, 8): sums of
  * gradients by residuals. Each patch's own common error is taken out, as one unknown a patch under a prior, by Schur's complement.
  * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST pixels. Returns how many pixels took part. */
-WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t *met, const float *inverse, const Asked *q, double *H, double *b,
-                            double *pulls)
+WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t *met, const float *inverse, const uint8_t *movable, const Asked *q,
+                            double *H, double *b, double *pulls)
 {
     Batch batch;
     int64_t pixels = 0;
     for (int64_t top = 0; top < v->height; top += q->patch)
         for (int64_t left = 0; left < v->width; left += q->patch, pulls += UNKNOWNS) {
             int count = 0;
+            double moved = 0;
             for (int64_t y = top; y < top + q->patch && y < v->height; y++)
                 for (int64_t x = left; x < left + q->patch && x < v->width; x++) {
                     const int64_t i = y * v->width + x;
-                    if (met[i] >= 0 && inverse[i] > 0)
-                        add_pixel(surfels + met[i], v, q, (double)x, (double)y, (double)inverse[i], &batch, &count);
+                    if (met[i] < 0 || !(inverse[i] > 0)) continue;
+                    const int before = count;
+                    add_pixel(surfels + met[i], v, q, (double)x, (double)y, (double)inverse[i], &batch, &count);
+                    if (count > before && movable[i]) moved += pow((double)inverse[i], 4);
                 }
             if (count == 0) continue;
             const int whole = (count + LANES - 1) / LANES * LANES;
@@ -174,7 +196,8 @@ WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t 
                 for (int k = count; k < whole; k++) batch.rows[a][k] = batch.weighted[a][k] = 0;
             double own[ROWS];
             for (int a = 0; a < ROWS; a++) own[a] = product(batch.weighted[OWN], batch.rows[a], whole);
-            const double share = q->shared > 0 ? 1.0 / (own[OWN] + 1.0 / (q->shared * q->shared)) : 0.0;
+            const double common = q->shared * q->shared + q->moved * q->moved * moved / count;
+            const double share = common > 0 ? 1.0 / (own[OWN] + 1.0 / common) : 0.0;
             for (int a = 0; a < UNKNOWNS; a++) {
                 for (int c = 0; c <= a; c++) {
                     const double told = product(batch.weighted[a], batch.rows[c], whole) - share * own[a] * own[c];

@@ -13,7 +13,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from service.compiled import load
@@ -46,6 +46,7 @@ class RaySettings:
         robust: standard deviations at which the robust kernel (Geman and McClure) takes three quarters off a pixel's weight.
         patch: pixels of the small picture along the edge of a patch.
         shared: standard deviation of what a patch's pixels err alike, in units of one pixel's noise.
+        moved_m: standard deviation of how far what may move stands from where it was mapped; a patch's pixels err alike in that.
         alike: so many pixels tell as much as one; against the priors.
         position_m: standard deviations of the priors about the pose that is adjusted,
         turn_rad: likewise;
@@ -67,6 +68,7 @@ class RaySettings:
     robust: float = 1.5
     patch: int = 6
     shared: float = 1.0
+    moved_m: float = 1.0
     alike: float = 8.0
     position_m: float = 1.0
     turn_rad: float = float(np.deg2rad(2.0))
@@ -90,6 +92,7 @@ class RayPicture:
         T_level_camera: of the camera against the reference's level frame.
         noise: standard deviation of an inverse depth, 1/m.
         focal_baseline_px_m: of a stereo rig; None where the depth has no disparity.
+        movable: where vehicles and people stand, which may have moved since the survey.
     """
 
     inverse: Float32[NDArray[np.float32], "H W"]
@@ -97,6 +100,7 @@ class RayPicture:
     T_level_camera: Transform
     noise: float
     focal_baseline_px_m: float | None
+    movable: Bool[NDArray[np.bool_], "H W"]
 
 
 #: Room for one surfel in the camera's axes: position, normal, number, the pixels that it may cover.
@@ -104,11 +108,16 @@ _DISC = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("number", "<i4
 
 
 def picture_of(
-    blocks: DepthBlocks, T_level_camera: Transform, *, noise: float, focal_baseline_px_m: float | None
+    blocks: DepthBlocks,
+    T_level_camera: Transform,
+    *,
+    noise: float,
+    focal_baseline_px_m: float | None,
+    movable: Bool[NDArray[np.bool_], "H W"],
 ) -> RayPicture:
     """What the rays of a thinned depth picture measured; arguments as in ``RayPicture``."""
     inverse = np.divide(1.0, blocks.z_m, out=np.zeros_like(blocks.z_m), where=blocks.z_m > 0)
-    return RayPicture(inverse, blocks.camera, T_level_camera, noise, focal_baseline_px_m)
+    return RayPicture(inverse, blocks.camera, T_level_camera, noise, focal_baseline_px_m, movable)
 
 
 class _View(Structure):
@@ -122,7 +131,8 @@ class _Discs(Structure):
 
 class _Asked(Structure):
     _fields_ = [("about", c_double * 3), *((name, c_double) for name in (
-        "scale", "offset", "unit", "noise", "surface", "robust", "shared", "nearest", "reach", "grazing")), ("patch", c_int64)]  # fmt: skip
+        "scale", "offset", "unit", "noise", "surface", "robust", "shared", "moved", "nearest",
+        "reach", "grazing")), ("patch", c_int64)]  # fmt: skip
 
 
 @cache
@@ -133,7 +143,7 @@ def _library() -> ctypes.CDLL:
     ]  # fmt: skip
     library.streetfix_meet.restype = None
     library.streetfix_pull.argtypes = [
-        c_void_p, POINTER(_View), c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p
+        c_void_p, POINTER(_View), c_void_p, c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p
     ]  # fmt: skip
     library.streetfix_pull.restype = c_int64
     return library
@@ -226,8 +236,25 @@ class _Pull:
     pixels: int
 
 
-def adjust(
+def met_by(
     cloud: SurfelMap, pictures: list[RayPicture], found: Registered, settings: RaySettings
+) -> list[Int32[NDArray[np.int32], "H W"]]:
+    """What the rays of all pictures meet (``meet``) from a registered pose; arguments as in ``adjust``."""
+    state = _state_of(cloud, found)
+    return [meet(cloud, state.camera_of(picture), picture.camera, settings) for picture in pictures]
+
+
+def _state_of(cloud: SurfelMap, found: Registered) -> _State:
+    return _State(found.R_map_level, found.camera_m - cloud.origin_m, float(np.log(found.scale)), found.offset)
+
+
+def adjust(
+    cloud: SurfelMap,
+    pictures: list[RayPicture],
+    found: Registered,
+    settings: RaySettings,
+    *,
+    met: list[Int32[NDArray[np.int32], "H W"]] | None = None,
 ) -> tuple[Registered, Float64[NDArray[np.float64], "8 8"]] | None:
     """Move a registered pose to where the rays of all pictures agree best with the map; None where too little is met.
 
@@ -236,20 +263,23 @@ def adjust(
         pictures: the reference's first.
         found: of the reference's level frame.
         settings: of the solver.
+        met: what the rays meet from there, where it is known already (``met_by``).
 
     Returns:
         The pose, its ``information`` that of the pixels alone, and the sum over patches of the outer products of their pulls
         (as in ``scatter_of``).
     """
-    state = _State(found.R_map_level, found.camera_m - cloud.origin_m, float(np.log(found.scale)), found.offset)
+    state = _state_of(cloud, found)
     free = np.ones(UNKNOWNS, bool)
     free[7] = pictures[0].focal_baseline_px_m is not None
     sigma = np.r_[np.full(3, settings.position_m), np.full(3, settings.turn_rad), settings.scale, settings.offset_px]
     prior, moved = np.diag(sigma**-2.0), np.zeros(UNKNOWNS)
     moved[6:] = state.log_scale, state.offset  # these priors are about none, the pose's about what was registered
-    for _ in range(settings.rounds):
+    met = met or met_by(cloud, pictures, found, settings)
+    for number in range(settings.rounds):
         before = moved
-        met = [meet(cloud, state.camera_of(picture), picture.camera, settings) for picture in pictures]
+        if number > 0:
+            met = [meet(cloud, state.camera_of(picture), picture.camera, settings) for picture in pictures]
         for _ in range(settings.steps):
             pull = _pull(cloud, pictures, met, state, settings)
             if pull.pixels < settings.fewest:
@@ -280,13 +310,13 @@ def _pull(
         pulls = np.zeros((down, across, UNKNOWNS))
         asked = _Asked(
             (c_double * 3)(*state.t), float(np.exp(state.log_scale)), state.offset, 0.0 if rig is None else 1.0 / rig,
-            picture.noise, settings.surface_m, settings.robust, settings.shared * picture.noise, settings.nearest_m,
+            picture.noise, settings.surface_m, settings.robust, settings.shared * picture.noise, settings.moved_m, settings.nearest_m,
             settings.reach_m, settings.grazing, settings.patch,
         )  # fmt: skip
         view = _view(state.camera_of(picture), camera)
         pixels += _library().streetfix_pull(
-            cloud.surfels.ctypes.data, byref(view), surfels.ctypes.data, picture.inverse.ctypes.data, byref(asked), H.ctypes.data,
-            b.ctypes.data, pulls.ctypes.data,
+            cloud.surfels.ctypes.data, byref(view), surfels.ctypes.data, picture.inverse.ctypes.data, picture.movable.ctypes.data,
+            byref(asked), H.ctypes.data, b.ctypes.data, pulls.ctypes.data,
         )  # fmt: skip
         if scattered:
             scatter += _scattered(pulls)

@@ -101,13 +101,13 @@ def register(
     states, owner = _states(cloud, starts, settings)
     ground = settings.ground_m - height_m
     align(
-        cloud.grid, cloud.surfels, _few(points, settings.coarse_points), states, settings.coarse, tolerance_m=0.3,
+        cloud.grid, cloud.surfels, points.thinned(settings.coarse_points), states, settings.coarse, tolerance_m=0.3,
         height_min_m=ground,
     )  # fmt: skip
     kept = _best_of_each(states, owner, settings)
     best, owner = states[kept].copy(), owner[kept]
     align(
-        cloud.grid, cloud.surfels, _few(points, settings.middle_points), best, settings.middle,
+        cloud.grid, cloud.surfels, points.thinned(settings.middle_points), best, settings.middle,
         tolerance_m=settings.tolerance_m, height_min_m=ground,
     )  # fmt: skip
     similar = {start.hypothesis: start.similarity for start in starts}
@@ -116,13 +116,24 @@ def register(
     kept = _distinct(best, promise, settings.refined, settings.apart_m)
     best, owner = best[kept].copy(), owner[kept]
     align(cloud.grid, cloud.surfels, points.weighing_at_least(settings.fine_weight), best, settings.fine)
-    score_only = replace(settings.fine, iterations=0)
-    align(cloud.grid, cloud.surfels, points, best, score_only, tolerance_m=settings.tolerance_m, height_min_m=ground)
+    score(cloud, points, best, height_m, settings)
     order = np.argsort(-best["inliers"], kind="stable")
-    return tuple(_registered(best[k], int(owner[k]), cloud.origin_m) for k in order)
+    return tuple(registered_of(best[k], int(owner[k]), cloud.origin_m) for k in order)
 
 
-def _registered(state: Any, hypothesis: int, origin_m: Float64[NDArray[np.float64], "3"]) -> Registered:
+def score(
+    cloud: SurfelMap, points: QueryPoints, states: NDArray[Any], height_m: float, settings: RegistrationSettings
+) -> None:
+    """Tell every state (``STATE``, in place) its share of inliers where it stands."""
+    score_only = replace(settings.fine, iterations=0)
+    align(
+        cloud.grid, cloud.surfels, points, states, score_only, tolerance_m=settings.tolerance_m,
+        height_min_m=settings.ground_m - height_m,
+    )  # fmt: skip
+
+
+def registered_of(state: Any, hypothesis: int, origin_m: Float64[NDArray[np.float64], "3"]) -> Registered:
+    """A state of the kernel (``STATE``) as a pose in the map frame."""
     return Registered(
         state["R"].copy(), state["t"] + origin_m, float(np.exp(state["log_scale"])), float(state["offset"]), float(state["inliers"]),
         state["information"].copy(), hypothesis,
@@ -144,10 +155,6 @@ def _states(
             row["R"] = start.R_map_level @ rotation_z(turn)
     owner = np.repeat([start.hypothesis for start in starts], len(turns) * len(offsets))
     return states.reshape(-1), owner
-
-
-def _few(points: QueryPoints, count: int) -> QueryPoints:
-    return points.subset(np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.intp))
 
 
 def _best_of_each(states: NDArray[Any], owner: NDArray[np.intp], settings: RegistrationSettings) -> list[int]:

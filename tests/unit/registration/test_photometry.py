@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, transform_from
 from service.registration.photometry import PhotometrySettings, agreement_of_brightness, grey_of, squared_correlation
-from service.registration.rays import RaySettings
+from service.registration.rays import RaySettings, meet
 
 SETTINGS = PhotometrySettings(patch=2, flat=0.0)
 CAMERA = PinholeCamera(96, 72, 60.0, 60.0, 47.5, 35.5)
 TRUE = transform_from(R_BODY_OPTICAL, np.array([0.0, 0.0, 1.5]))
-RAYS, PATCHES = RaySettings(), PhotometrySettings()
+PATCHES = PhotometrySettings()
 
 
 def picture(rows):
@@ -91,8 +91,10 @@ def seen(paint, T_map_camera):
 
 
 def told(cloud, rgb, T_map_camera):
+    T = T_map_camera.copy()
+    T[:3, 3] -= cloud.origin_m
     grey = grey_of(rgb, CAMERA, (1.0, 1.0), PATCHES)
-    return agreement_of_brightness(cloud, T_map_camera, CAMERA, grey, RAYS, PATCHES)
+    return agreement_of_brightness(cloud.brightness, meet(cloud, T, CAMERA, RaySettings()), grey, PATCHES)
 
 
 @pytest.mark.parametrize("aside_m", [-3.0, -1.0, -0.5, 0.5, 1.0, 3.0])
@@ -117,8 +119,8 @@ def test_the_sensors_unit_does_not_matter(painted):
     assert told(other, seen(paint, TRUE), TRUE) == pytest.approx(told(cloud, seen(paint, TRUE), TRUE), abs=1e-3)
 
 
-@pytest.mark.parametrize("brightness", [None, 0.0, np.nan])
+@pytest.mark.parametrize("brightness", [0.0, np.nan])
 def test_a_map_that_knows_no_brightness_says_nothing(painted, brightness):
     cloud, paint = painted
-    blank = None if brightness is None else np.full(len(cloud.surfels), brightness, np.float32)
+    blank = np.full(len(cloud.surfels), brightness, np.float32)
     assert told(replace(cloud, brightness=blank), seen(paint, TRUE), TRUE) == 0.0

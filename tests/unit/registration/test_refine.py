@@ -7,9 +7,11 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
 from service.localization import refine as refining
 from service.localization import similar
+from service.localization.judge import Judge, NearWeights, SupportWeights
 from service.localization.prior import Prior
-from service.localization.refine import RefineSettings, SupportWeights, refine, settings_for_rig
+from service.localization.refine import RefineSettings, refine, settings_for_rig
 from service.localization.starts import StartSettings
+from service.registration.around import Near
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
 from service.registration.points import inverse_depth_noise
 from service.registration.rays import RaySettings, adjust, meet
@@ -185,12 +187,12 @@ def judged(cloud, monkeypatch):
     """The cloud with some brightness, and what brightness is then said to say of each pose that is asked about: its y."""
     asked_y_m = []
 
-    def agreement(of_cloud, T_map_camera, *_):
-        assert of_cloud.brightness is not None
-        asked_y_m.append(T_map_camera[1, 3])
-        return float(T_map_camera[1, 3])
+    def brightness(judge, pose):
+        assert judge.cloud.brightness is not None
+        asked_y_m.append(pose.camera_m[1])
+        return float(pose.camera_m[1])
 
-    monkeypatch.setattr(refining, "agreement_of_brightness", agreement)
+    monkeypatch.setattr(Judge, "brightness", brightness)
     return replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32)), asked_y_m
 
 
@@ -236,6 +238,45 @@ def test_the_picture_tells_two_streets_apart_that_differ_in_paint_alone(bundle_l
     blind, found = (refined(bundle_like(0.9, 0.4), each, frame, brightness=30.0, **weights) for each in (cloud, lit))
     assert blind.best.T_map_camera[1, 3] == pytest.approx(40.5, abs=0.3)
     np.testing.assert_allclose(found.best.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
+
+
+def test_a_noisy_pictures_best_pose_is_looked_around_and_moves_to_what_shows_the_paint(
+    bundle_like, cloud, depth, here, seen_in, monkeypatch
+):
+    """Points say nothing between poses along a bare street; brightness is said to be best 1.4 m ahead of where registration ends."""
+    lit = replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32))
+    ahead = TRUE[:3, 3] + 1.4 * np.array([np.cos(np.deg2rad(HEADING_DEG)), np.sin(np.deg2rad(HEADING_DEG)), 0])
+    monkeypatch.setattr(Judge, "brightness", lambda _, pose: -float(np.linalg.norm(pose.camera_m - ahead)))
+    near = [Near(each, 0.5) for each in _shifted(refined(bundle_like(0.4, 0.9), lit, seen_in(depth, here)))]
+    monkeypatch.setattr(refining, "poses_around", lambda *_: near)
+    still = RaySettings(fewest=10**6)  # nothing is adjusted
+    noisy = replace(seen_in(depth, here), noise=5e-3)
+    found = {}
+    for name, frame, settings in (
+        ("noisy", noisy, RefineSettings(rays=still)),
+        ("exact", seen_in(depth, here), RefineSettings(rays=still)),
+        ("sure", noisy, RefineSettings(rays=still, near=NearWeights(stay=1e6))),
+    ):
+        near[0] = Near(_registered_by(bundle_like(0.4, 0.9), lit, frame), 0.5)
+        found[name] = refine(bundle_like(0.4, 0.9), lit, (frame,), None, settings)
+    moved, exact, sure = found["noisy"], found["exact"], found["sure"]
+    np.testing.assert_allclose(moved.best.T_map_camera[:3, 3], ahead, atol=0.05)
+    for stayed in (exact, sure):
+        np.testing.assert_allclose(stayed.best.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
+    assert moved.best.support >= sure.best.support
+
+
+def _registered_by(bundle, lit, frame):
+    """What registration alone makes of a frame."""
+    return refine(
+        bundle, replace(lit, brightness=None), (frame,), None, RefineSettings(rays=RaySettings(fewest=10**6))
+    ).best.registered
+
+
+def _shifted(found):
+    best = found.best.registered
+    ahead = best.R_map_level @ [1.4, 0.0, 0.0]
+    return [best, replace(best, camera_m=best.camera_m + ahead), replace(best, camera_m=best.camera_m - ahead)]
 
 
 # A frame 2 m further on that is turned by 20 degrees, leans otherwise, and was levelled otherwise too.
@@ -312,9 +353,9 @@ def asked(monkeypatch):
     def noted(name):
         kept = getattr(refining, name)
 
-        def call(*given):
+        def call(*given, **named):
             calls.append((name, given))
-            return kept(*given)
+            return kept(*given, **named)
 
         monkeypatch.setattr(refining, name, call)
 
