@@ -114,18 +114,8 @@ def refine(
     found = register(cloud, merged, starts, reference.views.height_m, settings.registration)
     pictures = _pictures(frames, blocks, settings)
     judge = Judge(
-        bundle,
-        cloud,
-        frames,
-        seen,
-        blocks,
-        pictures,
-        prior,
-        settings.support,
-        settings.near,
-        settings.rays,
-        settings.photometry,
-    )
+        bundle, cloud, frames, seen, blocks, pictures, prior, settings.support, settings.near, settings.rays, settings.photometry
+    )  # fmt: skip
     candidates = judge.with_brightness(judge.candidates(found))
     noise = float(np.median([frame.noise for frame in frames]))
     if cloud.brightness is not None and noise >= settings.around.from_noise:
