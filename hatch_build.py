@@ -20,8 +20,8 @@ SOURCES = tuple(
         "imaging/depth16.c",
     )
 )
-# Nobody looks at floating-point exceptions, and a compiler that minds them cannot choose without a branch.
-FLAGS = ["-O3", "-std=c11", "-fno-trapping-math", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
+# Nobody looks at floating-point exceptions nor at errno, and a compiler that minds them cannot choose without a branch.
+FLAGS = ["-O3", "-std=c11", "-fno-trapping-math", "-fno-math-errno", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror"]
 
 
 def compiler() -> list[str] | None:

@@ -15,10 +15,10 @@ from service.maps.reader import MapBundle
 from service.registration.around import Near
 from service.registration.photometry import PhotometrySettings, agreement_of_brightness, grey_of
 from service.registration.points import DepthBlocks
-from service.registration.rays import RayPicture, RaySettings, met_by
+from service.registration.rays import RayPicture, met_by
 from service.registration.register import Registered
 from service.registration.rendered import Agreement, Seen, agreement
-from service.registration.surfel_map import SurfelMap
+from service.registration.sight import Sights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +79,7 @@ class Judge:
 
     Attributes:
         bundle: the map.
-        cloud: its prepared cloud.
+        sights: what rays meet of its prepared cloud.
         frames: the reference first.
         seen: points of each frame, for drawing.
         blocks: of each frame's depth.
@@ -87,12 +87,11 @@ class Judge:
         prior: of the reference's pose, if anything is known.
         weights: of the evidence.
         near: of that among poses a metre apart.
-        rays: how rays meet surfels.
         photometry: how brightness is compared.
     """
 
     bundle: MapBundle
-    cloud: SurfelMap
+    sights: Sights
     frames: tuple[Frame, ...]
     seen: list[Seen]
     blocks: list[DepthBlocks]
@@ -100,7 +99,6 @@ class Judge:
     prior: Prior | None
     weights: SupportWeights
     near: NearWeights
-    rays: RaySettings
     photometry: PhotometrySettings
 
     def candidates(self, found: tuple[Registered, ...]) -> list[Candidate]:
@@ -127,28 +125,22 @@ class Judge:
     def agreement(self, pose: Registered) -> Agreement:
         """With the map's depth as drawn at a pose of the reference's level frame, mean over the frames that show anything."""
         return Agreement.mean([
-            agreement(self.cloud, points, self._of(frame, pose))
+            agreement(self.sights.cloud, points, self._of(frame, pose))
             for frame, points in zip(self.frames, self.seen, strict=True)
             if len(points)
         ])  # fmt: skip
 
-    def met(self, pose: Registered) -> list[NDArray[np.int32]]:
-        """What the rays of each picture meet from a pose of the reference's level frame; looked up once."""
-        if id(pose) not in self._met:
-            self._met[id(pose)] = pose, met_by(self.cloud, self.pictures, pose, self.rays)
-        return self._met[id(pose)][1]
-
     def brightness(self, pose: Registered) -> float:
         """Agreement with the map's brightness at a pose of the reference's level frame, mean over the frames; 0 where it has none."""
-        if self.cloud.brightness is None:
+        if self.sights.cloud.brightness is None:
             return 0.0
         if id(pose) not in self._agreed:
             each = [
-                agreement_of_brightness(self.cloud.brightness, met, grey, self.photometry)
-                for met, grey in zip(self.met(pose), self._greys, strict=True)
+                agreement_of_brightness(self.sights.cloud.brightness, met, grey, self.photometry)
+                for met, grey in zip(met_by(self.sights, self.pictures, pose), self._greys, strict=True)
             ]
-            self._agreed[id(pose)] = float(np.mean(each))
-        return self._agreed[id(pose)]
+            self._agreed[id(pose)] = pose, float(np.mean(each))
+        return self._agreed[id(pose)][1]
 
     def with_brightness(self, candidates: list[Candidate]) -> list[Candidate]:
         """The candidates, the best first, once those in front have been judged by brightness as well.
@@ -156,7 +148,7 @@ class Judge:
         Those behind get as much for it as the worst judged: they stay behind, by as much as they were at least.
         """
         judged = [k for k in candidates if k.support >= candidates[0].support - self.weights.behind]
-        if self.cloud.brightness is None or len(judged) == 1:
+        if self.sights.cloud.brightness is None or len(judged) == 1:
             return candidates
         agreed = [self.brightness(candidate.registered) for candidate in judged]
         agreed += [min(agreed)] * (len(candidates) - len(judged))
@@ -193,12 +185,8 @@ class Judge:
         return float(support)
 
     @cached_property
-    def _met(self) -> dict[int, tuple[Registered, list[NDArray[np.int32]]]]:
+    def _agreed(self) -> dict[int, tuple[Registered, float]]:
         """By identity of the pose, which is held so that no other takes its place."""
-        return {}
-
-    @cached_property
-    def _agreed(self) -> dict[int, float]:
         return {}
 
     @cached_property

@@ -22,6 +22,7 @@ from service.registration.rays import RayPicture, RaySettings, adjust, picture_o
 from service.registration.register import RegistrationSettings, register
 from service.registration.rendered import seen_by
 from service.registration.scatter import disagreement, scatter_of
+from service.registration.sight import Sights
 from service.registration.surfel_map import SurfelMap
 
 
@@ -113,9 +114,10 @@ def refine(
     )  # fmt: skip
     found = register(cloud, merged, starts, reference.views.height_m, settings.registration)
     pictures = _pictures(frames, blocks, settings)
+    sights = Sights(cloud, settings.rays)
     judge = Judge(
-        bundle, cloud, frames, seen, blocks, pictures, prior, settings.support, settings.near, settings.rays, settings.photometry
-    )  # fmt: skip
+        bundle, sights, frames, seen, blocks, pictures, prior, settings.support, settings.near, settings.photometry
+    )
     candidates = judge.with_brightness(judge.candidates(found))
     noise = float(np.median([frame.noise for frame in frames]))
     if cloud.brightness is not None and noise >= settings.around.from_noise:
@@ -124,7 +126,7 @@ def refine(
         )
         candidates[0] = judge.best_near(candidates[0], near)
     best = candidates[0].registered
-    adjusted = adjust(cloud, pictures, best, settings.rays, met=judge.met(best))
+    adjusted = adjust(sights, pictures, best, settings.rays)
     if adjusted is None:
         scatter, model = scatter_of(cloud, merged, best, settings.registration), OF_POINTS
     else:

@@ -37,15 +37,127 @@ static inline int32_t from(float edge)
     return whole + ((float)whole < edge);
 }
 
-static inline int32_t up_to(float edge, int64_t size)
+/* The largest whole number that is not above a number from 0 on, and not above the last one. */
+static inline int32_t up_to(float edge, float last)
 {
-    return (int32_t)(edge < (float)(size - 1) ? edge : (float)(size - 1));
+    return (int32_t)(edge < last ? (edge > 0 ? edge : 0) : last);
 }
 
-/* met (height, width): the surfel on each pixel's ray, -1 for none; of discs that overlap near the first one met, that whose middle is
- * nearest to the ray. ``parts`` (n, 2): first surfel and count of what may be in view; ``seen`` has room for all of them, ``first`` and
- * ``middle`` for a number a pixel. */
-WIDE void streetfix_meet(const Surfel *surfels, const int64_t *parts, int64_t part_count, const View *v, const Discs *o, Disc *seen,
+static inline float at_least(float number, float least)
+{
+    return number > least ? number : least;
+}
+
+/* The sides of a small picture as planes of the camera's axes: x between left and right of z, y between top and bottom, all in z. */
+typedef struct {
+    float r[9], t[3], fx, fy, cx, cy, ifx, ify, left, right, top, bottom;
+} Sides;
+
+static inline Sides sides_of(const View *v)
+{
+    Sides s;
+    for (int i = 0; i < 9; i++) s.r[i] = (float)v->R[i];
+    for (int i = 0; i < 3; i++) s.t[i] = (float)v->t[i];
+    s.fx = (float)v->fx, s.fy = (float)v->fy, s.cx = (float)v->cx, s.cy = (float)v->cy;
+    s.ifx = (float)(1.0 / v->fx), s.ify = (float)(1.0 / v->fy);
+    s.left = -s.cx * s.ifx, s.right = ((float)(v->width - 1) - s.cx) * s.ifx;
+    s.top = -s.cy * s.ify, s.bottom = ((float)(v->height - 1) - s.cy) * s.ify;
+    return s;
+}
+
+/* As many surfels are worked on at once as a register holds, in chunks that stay near the processor. */
+enum { CHUNK = 512 };
+
+/* Which of at most CHUNK surfels a disc's radius, and ``near_m`` and ``near_rad`` besides, bring into sight: their places among these, in
+ * order; returns how many. A camera that is moved and turned by these sees a point p moved by near_m + near_rad |p| at most, so each
+ * plane of the view's sides is moved out by as much. */
+static inline int in_sight(const Surfel *surfels, int count, const Sides *s, const Discs *o, float near_m, float near_rad, int32_t *places)
+{
+    const float *r = s->r, radius = (float)o->radius, nearest = (float)o->nearest, reach = (float)o->reach;
+    const float wide = 1.0f + at_least(-s->left, s->right), tall = 1.0f + at_least(-s->top, s->bottom);
+    int32_t seen[CHUNK];
+    for (int i = 0; i < count; i++) {
+        const Surfel *m = surfels + i;
+        const float dx = m->x - s->t[0], dy = m->y - s->t[1], dz = m->z - s->t[2];
+        const float z = r[2] * dx + r[5] * dy + r[8] * dz, x = r[0] * dx + r[3] * dy + r[6] * dz, y = r[1] * dx + r[4] * dy + r[7] * dz;
+        const float slack = near_m + near_rad * sqrtf(dx * dx + dy * dy + dz * dz);
+        const float beside = (radius + slack) * wide, above = (radius + slack) * tall;
+        seen[i] = (z >= nearest - slack) & (z <= reach + slack) & (x >= s->left * z - beside) & (x <= s->right * z + beside) &
+                  (y >= s->top * z - above) & (y <= s->bottom * z + above);
+    }
+    int found = 0;
+    for (int i = 0; i < count; i++) {
+        places[found] = i;
+        found += seen[i];
+    }
+    return found;
+}
+
+static inline int chunk_of(int64_t left)
+{
+    return left < CHUNK ? (int)left : CHUNK;
+}
+
+/* What any camera within ``near_m`` and ``near_rad`` of a view may meet, in the order in which it lies: copies to ``kept``, their numbers
+ * to ``numbers``, which have room for all of ``parts`` (n, 2), first surfel and count. Returns how many. */
+WIDE int64_t streetfix_gather(const Surfel *surfels, const int64_t *parts, int64_t part_count, const View *v, const Discs *o, double near_m,
+                              double near_rad, Surfel *kept, int32_t *numbers)
+{
+    const Sides s = sides_of(v);
+    int32_t places[CHUNK];
+    int64_t count = 0;
+    for (int64_t p = 0; p < part_count; p++)
+        for (int64_t k = parts[2 * p], end = k + parts[2 * p + 1]; k < end; k += CHUNK) {
+            const int found = in_sight(surfels + k, chunk_of(end - k), &s, o, (float)near_m, (float)near_rad, places);
+            for (int i = 0; i < found; i++, count++) {
+                kept[count] = surfels[k + places[i]];
+                numbers[count] = (int32_t)(k + places[i]);
+            }
+        }
+    return count;
+}
+
+/* Surfels in the camera's axes side by side; normals still the map's. */
+typedef struct {
+    int count;
+    float x[CHUNK], y[CHUNK], z[CHUNK], nx[CHUNK], ny[CHUNK], nz[CHUNK];
+    int32_t number[CHUNK];
+} Ahead;
+
+/* Adds those of them that cover a pixel's middle to ``seen``; returns how many these are. */
+static inline int64_t discs_of(const Ahead *m, const Sides *s, const View *v, const Discs *o, Disc *seen)
+{
+    float nx[CHUNK], ny[CHUNK], nz[CHUNK];
+    int32_t left[CHUNK], right[CHUNK], top[CHUNK], bottom[CHUNK], shown[CHUNK];
+    const float *r = s->r, radius = (float)o->radius, half = 0.5f * (float)o->nearest, grazing2 = (float)(o->grazing * o->grazing);
+    const float width = (float)(v->width - 1), height = (float)(v->height - 1);
+    for (int i = 0; i < m->count; i++) {
+        const float x = m->x[i], y = m->y[i], z = m->z[i];
+        nx[i] = r[0] * m->nx[i] + r[3] * m->ny[i] + r[6] * m->nz[i], ny[i] = r[1] * m->nx[i] + r[4] * m->ny[i] + r[7] * m->nz[i];
+        nz[i] = r[2] * m->nx[i] + r[5] * m->ny[i] + r[8] * m->nz[i];
+        const float off = nx[i] * x + ny[i] * y + nz[i] * z;
+        /* How far the disc reaches along each axis; its picture lies between those of the corners of that box. */
+        const float wide = radius * sqrtf(at_least(1.0f - nx[i] * nx[i], 0)), tall = radius * sqrtf(at_least(1.0f - ny[i] * ny[i], 0));
+        const float deep = radius * sqrtf(at_least(1.0f - nz[i] * nz[i], 0)), close = 1.0f / at_least(z - deep, half), away = 1.0f / (z + deep);
+        const float u0 = (x - wide) * (x > wide ? away : close) * s->fx + s->cx, u1 = (x + wide) * (x > -wide ? close : away) * s->fx + s->cx;
+        const float v0 = (y - tall) * (y > tall ? away : close) * s->fy + s->cy, v1 = (y + tall) * (y > -tall ? close : away) * s->fy + s->cy;
+        left[i] = from(u0), right[i] = up_to(u1, width), top[i] = from(v0), bottom[i] = up_to(v1, height);
+        /* Far ones may lie between the pixels' middles. */
+        shown[i] = (off * off >= grazing2 * (x * x + y * y + z * z)) & (u1 >= 0) & (v1 >= 0) & (left[i] <= right[i]) & (top[i] <= bottom[i]);
+    }
+    int64_t count = 0;
+    for (int i = 0; i < m->count; i++) {
+        const Disc disc = {m->x[i], m->y[i], m->z[i], nx[i], ny[i], nz[i], m->number[i], left[i], right[i], top[i], bottom[i]};
+        seen[count] = disc;
+        count += shown[i];
+    }
+    return count;
+}
+
+/* met (height, width): number of the surfel on each pixel's ray, -1 for none; of discs that overlap near the first one met, that whose
+ * middle is nearest to the ray. ``surfels`` and ``numbers`` (count) are of what may be in view (streetfix_gather); ``seen`` has room for all
+ * of them, ``first`` and ``middle`` for a number a pixel. */
+WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t surfel_count, const View *v, const Discs *o, Disc *seen,
                     float *first, float *middle, int32_t *met)
 {
     const int64_t pixels = v->width * v->height;
@@ -54,64 +166,52 @@ WIDE void streetfix_meet(const Surfel *surfels, const int64_t *parts, int64_t pa
         met[i] = -1;
     }
     /* What is beside the picture is left out before anything is divided; a disc reaches its radius over its middle, across and ahead. */
-    float r[9];
-    for (int i = 0; i < 9; i++) r[i] = (float)v->R[i];
-    const float tx = (float)v->t[0], ty = (float)v->t[1], tz = (float)v->t[2], fx = (float)v->fx, fy = (float)v->fy;
-    const float cx = (float)v->cx, cy = (float)v->cy, ifx = (float)(1.0 / v->fx), ify = (float)(1.0 / v->fy);
-    const float radius = (float)o->radius, nearest = (float)o->nearest, reach = (float)o->reach, grazing2 = (float)(o->grazing * o->grazing);
-    const float left = -cx * ifx, right = ((float)(v->width - 1) - cx) * ifx;
-    const float top = -cy * ify, bottom = ((float)(v->height - 1) - cy) * ify;
-    const float beside = radius * (1.0f + fmaxf(-left, right)), above = radius * (1.0f + fmaxf(-top, bottom));
+    const Sides s = sides_of(v);
+    const float *r = s.r, cx = s.cx, cy = s.cy, ifx = s.ifx, ify = s.ify, radius = (float)o->radius;
     int64_t count = 0;
-    for (int64_t p = 0; p < part_count; p++)
-        for (int64_t k = parts[2 * p]; k < parts[2 * p] + parts[2 * p + 1]; k++) {
-            const Surfel *m = surfels + k;
-            const float dx = m->x - tx, dy = m->y - ty, dz = m->z - tz;
-            const float z = r[2] * dx + r[5] * dy + r[8] * dz, x = r[0] * dx + r[3] * dy + r[6] * dz, y = r[1] * dx + r[4] * dy + r[7] * dz;
-            if (!((z >= nearest) & (z <= reach) & (x >= left * z - beside) & (x <= right * z + beside) & (y >= top * z - above) &
-                  (y <= bottom * z + above))) continue;
-            const float nx = r[0] * m->nx + r[3] * m->ny + r[6] * m->nz, ny = r[1] * m->nx + r[4] * m->ny + r[7] * m->nz;
-            const float nz = r[2] * m->nx + r[5] * m->ny + r[8] * m->nz, off = nx * x + ny * y + nz * z;
-            if (off * off < grazing2 * (x * x + y * y + z * z)) continue;
-            /* How far the disc reaches along each axis; its picture lies between those of the corners of that box. */
-            const float wide = radius * sqrtf(fmaxf(1.0f - nx * nx, 0)), tall = radius * sqrtf(fmaxf(1.0f - ny * ny, 0));
-            const float deep = radius * sqrtf(fmaxf(1.0f - nz * nz, 0)), close = 1.0f / fmaxf(z - deep, 0.5f * nearest), away = 1.0f / (z + deep);
-            const float u0 = (x - wide) * (x > wide ? away : close) * fx + cx, u1 = (x + wide) * (x > -wide ? close : away) * fx + cx;
-            const float v0 = (y - tall) * (y > tall ? away : close) * fy + cy, v1 = (y + tall) * (y > -tall ? close : away) * fy + cy;
-            if (!(u1 >= 0 && u0 <= (float)(v->width - 1) && v1 >= 0 && v0 <= (float)(v->height - 1))) continue;
-            const Disc disc = {x, y, z, nx, ny, nz, (int32_t)k, from(u0), up_to(u1, v->width), from(v0), up_to(v1, v->height)};
-            seen[count] = disc;
-            count += (disc.left <= disc.right) & (disc.top <= disc.bottom); /* far ones may lie between the pixels' middles */
+    int32_t places[CHUNK];
+    Ahead ahead;
+    for (int64_t k = 0; k < surfel_count; k += CHUNK) {
+        ahead.count = in_sight(surfels + k, chunk_of(surfel_count - k), &s, o, 0, 0, places);
+        for (int i = 0; i < ahead.count; i++) {
+            const Surfel *m = surfels + k + places[i];
+            const float dx = m->x - s.t[0], dy = m->y - s.t[1], dz = m->z - s.t[2];
+            ahead.x[i] = r[0] * dx + r[3] * dy + r[6] * dz, ahead.y[i] = r[1] * dx + r[4] * dy + r[7] * dz;
+            ahead.z[i] = r[2] * dx + r[5] * dy + r[8] * dz;
+            ahead.nx[i] = m->nx, ahead.ny[i] = m->ny, ahead.nz[i] = m->nz;
+            ahead.number[i] = numbers[k + places[i]];
         }
+        count += discs_of(&ahead, &s, v, o, seen + count);
+    }
     const float radius2 = radius * radius, behind = (float)o->behind;
     /* Neither pass branches on what it finds: most discs cover a pixel or two, so a processor could only guess. A ray along a disc gives
      * no number or an infinite one, which nothing is nearer than. */
     for (int64_t i = 0; i < count; i++) {
-        const Disc *s = seen + i;
-        const float off = s->nx * s->x + s->ny * s->y + s->nz * s->z;
-        for (int64_t b = s->top; b <= s->bottom; b++) {
-            const float ry = ((float)b - cy) * ify, lean = s->ny * ry + s->nz;
+        const Disc *d = seen + i;
+        const float off = d->nx * d->x + d->ny * d->y + d->nz * d->z;
+        for (int64_t b = d->top; b <= d->bottom; b++) {
+            const float ry = ((float)b - cy) * ify, lean = d->ny * ry + d->nz;
             float *row = first + b * v->width;
-            for (int64_t a = s->left; a <= s->right; a++) {
-                const float rx = ((float)a - cx) * ifx, z = off / (s->nx * rx + lean);
-                const float ex = rx * z - s->x, ey = ry * z - s->y, ez = z - s->z, apart = ex * ex + ey * ey + ez * ez;
+            for (int64_t a = d->left; a <= d->right; a++) {
+                const float rx = ((float)a - cx) * ifx, z = off / (d->nx * rx + lean);
+                const float ex = rx * z - d->x, ey = ry * z - d->y, ez = z - d->z, apart = ex * ex + ey * ey + ez * ez;
                 const float near = apart <= radius2 ? z : INFINITY;
                 row[a] = near < row[a] ? near : row[a];
             }
         }
     }
     for (int64_t i = 0; i < count; i++) {
-        const Disc *s = seen + i;
-        const float off = s->nx * s->x + s->ny * s->y + s->nz * s->z;
-        for (int64_t b = s->top; b <= s->bottom; b++) {
-            const float ry = ((float)b - cy) * ify, lean = s->ny * ry + s->nz;
-            for (int64_t a = s->left; a <= s->right; a++) {
+        const Disc *d = seen + i;
+        const float off = d->nx * d->x + d->ny * d->y + d->nz * d->z;
+        for (int64_t b = d->top; b <= d->bottom; b++) {
+            const float ry = ((float)b - cy) * ify, lean = d->ny * ry + d->nz;
+            for (int64_t a = d->left; a <= d->right; a++) {
                 const int64_t at = b * v->width + a;
-                const float rx = ((float)a - cx) * ifx, z = off / (s->nx * rx + lean);
-                const float ex = rx * z - s->x, ey = ry * z - s->y, ez = z - s->z, apart = ex * ex + ey * ey + ez * ez;
+                const float rx = ((float)a - cx) * ifx, z = off / (d->nx * rx + lean);
+                const float ex = rx * z - d->x, ey = ry * z - d->y, ez = z - d->z, apart = ex * ex + ey * ey + ez * ez;
                 const int better = (apart <= radius2) & (z <= first[at] + behind) & (apart < middle[at]);
                 middle[at] = better ? apart : middle[at];
-                met[at] = better ? s->number : met[at];
+                met[at] = better ? d->number : met[at];
             }
         }
     }

@@ -9,8 +9,6 @@ import ctypes
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
@@ -22,26 +20,21 @@ from service.geometry.rigid import Rotation, Transform, transform_from
 from service.registration.kernel import UNKNOWNS
 from service.registration.points import DepthBlocks
 from service.registration.register import Registered
-from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.sight import LIBRARY, DiscSettings, Sights, View
+from service.registration.surfel_map import SurfelMap
 
-LIBRARY = Path(__file__).with_name("_rays.so")
 MOST_PATCH = 16  # pixels along its edge; as in ``rays.c``
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RaySettings:
-    """Ours, November 2026; chosen on watch cities.
+class RaySettings(DiscSettings):
+    """Ours, November 2026; chosen on watch cities. The depths that count for discs count here.
 
     Attributes:
         rounds: of looking up what the rays meet, at most, and
         steps: of the solver in each.
         still_m: a round that moves the pose by less, and
         still_rad: turns it by less, is the last.
-        radius_m: of the disc that a surfel is taken for.
-        behind_m: discs so far behind the first one on a ray may be the same surface.
-        grazing: cosine; discs seen flatter are not met.
-        nearest_m: of depths that count, and
-        reach_m: the furthest.
         surface_m: how far the map's surfaces may be off along a ray.
         robust: standard deviations at which the robust kernel (Geman and McClure) takes three quarters off a pixel's weight.
         patch: pixels of the small picture along the edge of a patch.
@@ -59,11 +52,6 @@ class RaySettings:
     steps: int = 2
     still_m: float = 0.02
     still_rad: float = 1e-3
-    radius_m: float = 0.2
-    behind_m: float = 0.3
-    grazing: float = 0.05
-    nearest_m: float = 0.5
-    reach_m: float = 40.0
     surface_m: float = 0.05
     robust: float = 1.5
     patch: int = 6
@@ -103,10 +91,6 @@ class RayPicture:
     movable: Bool[NDArray[np.bool_], "H W"]
 
 
-#: Room for one surfel in the camera's axes: position, normal, number, the pixels that it may cover.
-_DISC = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("number", "<i4"), ("box", "<i4", (4,))])
-
-
 def picture_of(
     blocks: DepthBlocks,
     T_level_camera: Transform,
@@ -120,15 +104,6 @@ def picture_of(
     return RayPicture(inverse, blocks.camera, T_level_camera, noise, focal_baseline_px_m, movable)
 
 
-class _View(Structure):
-    _fields_ = [("R", c_double * 9), ("t", c_double * 3), *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
-                ("width", c_int64), ("height", c_int64)]  # fmt: skip
-
-
-class _Discs(Structure):
-    _fields_ = [(name, c_double) for name in ("radius", "nearest", "reach", "behind", "grazing")]
-
-
 class _Asked(Structure):
     _fields_ = [("about", c_double * 3), *((name, c_double) for name in (
         "scale", "offset", "unit", "noise", "surface", "robust", "shared", "moved", "nearest",
@@ -138,73 +113,11 @@ class _Asked(Structure):
 @cache
 def _library() -> ctypes.CDLL:
     library = load(LIBRARY)
-    library.streetfix_meet.argtypes = [
-        c_void_p, c_void_p, c_int64, POINTER(_View), POINTER(_Discs), c_void_p, c_void_p, c_void_p, c_void_p
-    ]  # fmt: skip
-    library.streetfix_meet.restype = None
     library.streetfix_pull.argtypes = [
-        c_void_p, POINTER(_View), c_void_p, c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p
+        c_void_p, POINTER(View), c_void_p, c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p
     ]  # fmt: skip
     library.streetfix_pull.restype = c_int64
     return library
-
-
-def meet(
-    cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera, settings: RaySettings
-) -> Int32[NDArray[np.int32], "H W"]:
-    """Number of the surfel that each pixel's ray meets, -1 for none.
-
-    Args:
-        cloud: the map's.
-        T_map_camera: in the surfels' frame.
-        camera: of a small picture.
-        settings: of the discs.
-    """
-    parts, room = _in_view(cloud, T_map_camera, camera, settings)
-    view = _view(T_map_camera, camera)
-    seen, met = np.empty(room, _DISC), np.empty((camera.height, camera.width), np.int32)
-    first, middle = np.empty((2, camera.height * camera.width), np.float32)
-    discs = _Discs(settings.radius_m, settings.nearest_m, settings.reach_m, settings.behind_m, settings.grazing)
-    _library().streetfix_meet(
-        cloud.surfels.ctypes.data, parts.ctypes.data, len(parts), byref(view), byref(discs), seen.ctypes.data, first.ctypes.data,
-        middle.ctypes.data, met.ctypes.data,
-    )  # fmt: skip
-    return met
-
-
-def _in_view(
-    cloud: SurfelMap, T_map_camera: Transform, camera: PinholeCamera, settings: RaySettings
-) -> tuple[NDArray[np.int64], int]:
-    """First surfel and count of the tiles that a camera may see, and how many surfels they hold.
-
-    Seen from above, its field of view lies in the hull of where it stands and of what is furthest in its corners.
-    """
-    u, v = (np.array([-0.5, side - 0.5]) for side in (camera.width, camera.height))
-    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-    corners = settings.reach_m * np.stack([x.ravel(), y.ravel(), np.ones(4)], axis=1) @ T_map_camera[:3, :3].T
-    hull = np.vstack([np.zeros(2), corners[:, :2]])
-    away = cloud.tiles[:, :2] - T_map_camera[:2, 3]
-    half = TILE_M / np.sqrt(2) + settings.radius_m
-    seen = np.ones(len(away), bool)
-    for one, other in combinations(range(len(hull)), 2):
-        along = hull[other] - hull[one]
-        length = np.hypot(*along)
-        if length < 1e-6:
-            continue
-        outward = np.array([along[1], -along[0]]) / length
-        sides = (hull - hull[one]) @ outward
-        for sign in (1.0, -1.0):
-            if (sign * sides <= 1e-6).all():  # all of it lies on the other side of this edge
-                seen &= sign * ((away - hull[one]) @ outward) <= half
-    parts = np.ascontiguousarray(cloud.tiles[seen, 2:4].astype(np.int64))
-    return parts, int(parts[:, 1].sum())
-
-
-def _view(T_map_camera: Transform, camera: PinholeCamera) -> _View:
-    return _View(
-        (c_double * 9)(*T_map_camera[:3, :3].ravel()), (c_double * 3)(*T_map_camera[:3, 3]), camera.fx, camera.fy, camera.cx,
-        camera.cy, camera.width, camera.height,
-    )  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -236,12 +149,10 @@ class _Pull:
     pixels: int
 
 
-def met_by(
-    cloud: SurfelMap, pictures: list[RayPicture], found: Registered, settings: RaySettings
-) -> list[Int32[NDArray[np.int32], "H W"]]:
-    """What the rays of all pictures meet (``meet``) from a registered pose; arguments as in ``adjust``."""
-    state = _state_of(cloud, found)
-    return [meet(cloud, state.camera_of(picture), picture.camera, settings) for picture in pictures]
+def met_by(sights: Sights, pictures: list[RayPicture], found: Registered) -> list[Int32[NDArray[np.int32], "H W"]]:
+    """What the rays of all pictures meet (``Sights.meet``) from a registered pose; arguments as in ``adjust``."""
+    state = _state_of(sights.cloud, found)
+    return [sights.meet(state.camera_of(picture), picture.camera) for picture in pictures]
 
 
 def _state_of(cloud: SurfelMap, found: Registered) -> _State:
@@ -249,37 +160,29 @@ def _state_of(cloud: SurfelMap, found: Registered) -> _State:
 
 
 def adjust(
-    cloud: SurfelMap,
-    pictures: list[RayPicture],
-    found: Registered,
-    settings: RaySettings,
-    *,
-    met: list[Int32[NDArray[np.int32], "H W"]] | None = None,
+    sights: Sights, pictures: list[RayPicture], found: Registered, settings: RaySettings
 ) -> tuple[Registered, Float64[NDArray[np.float64], "8 8"]] | None:
     """Move a registered pose to where the rays of all pictures agree best with the map; None where too little is met.
 
     Args:
-        cloud: the map's.
+        sights: what the rays meet of the map, by the same settings.
         pictures: the reference's first.
         found: of the reference's level frame.
         settings: of the solver.
-        met: what the rays meet from there, where it is known already (``met_by``).
 
     Returns:
         The pose, its ``information`` that of the pixels alone, and the sum over patches of the outer products of their pulls
         (as in ``scatter_of``).
     """
-    state = _state_of(cloud, found)
+    cloud, state = sights.cloud, _state_of(sights.cloud, found)
     free = np.ones(UNKNOWNS, bool)
     free[7] = pictures[0].focal_baseline_px_m is not None
     sigma = np.r_[np.full(3, settings.position_m), np.full(3, settings.turn_rad), settings.scale, settings.offset_px]
     prior, moved = np.diag(sigma**-2.0), np.zeros(UNKNOWNS)
     moved[6:] = state.log_scale, state.offset  # these priors are about none, the pose's about what was registered
-    met = met or met_by(cloud, pictures, found, settings)
-    for number in range(settings.rounds):
+    for _ in range(settings.rounds):
         before = moved
-        if number > 0:
-            met = [meet(cloud, state.camera_of(picture), picture.camera, settings) for picture in pictures]
+        met = [sights.meet(state.camera_of(picture), picture.camera) for picture in pictures]
         for _ in range(settings.steps):
             pull = _pull(cloud, pictures, met, state, settings)
             if pull.pixels < settings.fewest:
@@ -313,7 +216,7 @@ def _pull(
             picture.noise, settings.surface_m, settings.robust, settings.shared * picture.noise, settings.moved_m, settings.nearest_m,
             settings.reach_m, settings.grazing, settings.patch,
         )  # fmt: skip
-        view = _view(state.camera_of(picture), camera)
+        view = View.of(state.camera_of(picture), camera)
         pixels += _library().streetfix_pull(
             cloud.surfels.ctypes.data, byref(view), surfels.ctypes.data, picture.inverse.ctypes.data, picture.movable.ctypes.data,
             byref(asked), H.ctypes.data, b.ctypes.data, pulls.ctypes.data,

@@ -10,9 +10,10 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
 from service.registration import rays
 from service.registration.kernel import SURFEL
-from service.registration.rays import RayPicture, RaySettings, adjust, meet
+from service.registration.rays import RayPicture, RaySettings
 from service.registration.register import Registered
-from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.sight import Sights
+from service.registration.surfel_map import SurfelMap
 
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
 SETTINGS = RaySettings(radius_m=0.25, fewest=100)
@@ -21,106 +22,8 @@ NOISE = 1e-3
 ORIGIN = np.array([500.0, -300.0, 40.0])
 
 
-def wall(x, *, y=(-20, 20), z=(-20, 20), step=0.2, normal=(1, 0, 0)):
-    ys, zs = (np.arange(low + step / 2, high, step) for low, high in (y, z))
-    grid = np.stack(np.meshgrid([float(x)], ys, zs, indexing="ij"), axis=-1).reshape(-1, 3)
-    surfels = np.zeros(len(grid), SURFEL)
-    surfels["xyz"], surfels["normal"] = grid, normal
-    return surfels
-
-
-def cloud_of(*parts):
-    """By tiles, as a map is."""
-    surfels = np.concatenate(parts)
-    tile = np.floor(surfels["xyz"][:, :2].astype(float) / TILE_M).astype(int)
-    order = np.lexsort((tile[:, 1], tile[:, 0]))
-    corners, first, count = np.unique(tile[order], axis=0, return_index=True, return_counts=True)
-    return SurfelMap.prepare(ORIGIN, surfels[order], np.c_[(corners + 0.5) * TILE_M, first, count])
-
-
-def looking_ahead(x=0.0, y=0.0, z=0.0):
-    return transform_from(R_BODY_OPTICAL, np.array([x, y, z]))
-
-
-def test_every_ray_meets_the_surfel_nearest_to_where_it_passes():
-    cloud = cloud_of(wall(10))
-    met = meet(cloud, looking_ahead(), CAMERA, SETTINGS)
-    hits = 10 * CAMERA.rays_of_pixels()
-    where = np.stack([-hits[..., 0], -hits[..., 1]], axis=-1)  # y is to the left, z up
-    assert (met >= 0).all()
-    away = np.linalg.norm(cloud.surfels["xyz"][met][..., 1:] - where, axis=-1)
-    assert away.max() <= 0.1 * np.sqrt(2) + 1e-5
-
-
-def test_what_is_nearer_hides_what_is_behind_and_gaps_are_looked_through():
-    cloud = cloud_of(wall(10), wall(5, y=(-1, 1)))
-    x = cloud.surfels["xyz"][meet(cloud, looking_ahead(), CAMERA, SETTINGS)][..., 0]
-    # A metre at 5 m is 6.4 pixels, and a disc's radius 1.6.
-    np.testing.assert_array_equal(x[:, 26:38], 5)
-    np.testing.assert_array_equal(x[:, [*range(23), *range(41, 64)]], 10)
-
-
-def test_of_surfaces_close_behind_each_other_the_one_passed_nearest_is_met():
-    """Discs overlap; the one that happens to lie a little nearer must not win everywhere."""
-    one, other = wall(10, y=(-0.1, 0.1), z=(-0.1, 0.1)), wall(9.9, y=(0.1, 0.3), z=(-0.1, 0.1))
-    cloud = cloud_of(one, other)
-    camera = PinholeCamera(1, 1, 32.0, 32.0, 0.0, 0.0)
-    assert cloud.surfels["xyz"][meet(cloud, looking_ahead(), camera, SETTINGS)[0, 0], 0] == 10
-    alone = meet(cloud, looking_ahead(), camera, replace(SETTINGS, behind_m=0.05))
-    assert cloud.surfels["xyz"][alone[0, 0], 0] == pytest.approx(9.9)
-
-
-@pytest.mark.parametrize(("x", "is_met"), [(0.3, False), (0.7, True), (39.0, True), (41.0, False), (-5.0, False)])
-def test_what_is_too_near_too_far_or_behind_is_not_met(x, is_met):
-    met = meet(cloud_of(wall(x)), looking_ahead(), CAMERA, SETTINGS)
-    assert (met[20:28, 28:36] >= 0).all() == is_met
-
-
-def test_discs_seen_edge_on_are_not_met():
-    edge_on = wall(10, normal=(0, 1, 0), y=(-0.1, 0.1), z=(-5, 5))
-    assert (meet(cloud_of(edge_on), looking_ahead(y=0.2), CAMERA, SETTINGS) < 0).all()
-    assert (meet(cloud_of(edge_on), looking_ahead(y=3.0), CAMERA, SETTINGS) >= 0).any()
-
-
-@given(st.integers(0, 10**6), st.floats(-180, 180), st.floats(-80, 80), st.floats(-30, 30))
-@settings(max_examples=60)
-def test_tiles_out_of_sight_hold_nothing_that_would_have_been_met(seed, heading, pitch, roll):
-    rng = np.random.default_rng(seed)
-    low = rng.uniform(-60, 60, (40, 3)) * [1, 1, 0.3]
-    cloud = cloud_of(*(np.concatenate([wall(x, y=(y, y + 4), z=(z, z + 4))]) for x, y, z in low))
-    R = Rotation.from_euler("zyx", [heading, pitch, roll], degrees=True).as_matrix() @ R_BODY_OPTICAL
-    T = transform_from(R, rng.uniform(-5, 5, 3))
-    everything = SurfelMap(cloud.origin_m, cloud.surfels, np.array([[*T[:2, 3], 0.0, len(cloud.surfels)]]), cloud.grid)
-    np.testing.assert_array_equal(meet(cloud, T, CAMERA, SETTINGS), meet(everything, T, CAMERA, SETTINGS))
-
-
-@given(st.integers(0, 10**6), st.sampled_from([5.0, 20.0, 80.0]))
-@settings(max_examples=40)
-def test_the_kernel_meets_what_plain_numpy_meets(seed, focal_px):
-    """Discs anywhere and any way round, through lenses of 135 to 17 degrees; every disc asked of every ray."""
-    rng, s = np.random.default_rng(seed), replace(SETTINGS, radius_m=0.4)
-    camera = PinholeCamera(24, 18, focal_px, focal_px, 11.0, 9.5)
-    discs = np.zeros(400, SURFEL)
-    discs["xyz"] = rng.uniform([0, -8, -8], [16, 8, 8], (400, 3))
-    discs["normal"] = rng.normal(size=(400, 3))
-    discs["normal"] /= np.linalg.norm(discs["normal"], axis=1, keepdims=True)
-    cloud = cloud_of(discs)
-    ray = camera.rays_of_pixels().reshape(-1, 3)
-    x, n = (cloud.surfels[name].astype(float) @ R_BODY_OPTICAL for name in ("xyz", "normal"))
-    off = (n * x).sum(axis=1)
-    z = off / (ray @ n.T)
-    apart2 = ((ray[:, None] * z[..., None] - x) ** 2).sum(axis=2)
-    flat = np.abs(off) < s.grazing * np.linalg.norm(x, axis=1)
-    there = (apart2 <= s.radius_m**2) & ~flat & (x[:, 2] >= s.nearest_m) & (x[:, 2] <= s.reach_m)
-    first = np.where(there, z, np.inf).min(axis=1, keepdims=True)
-    among = np.where(there & (z <= first + s.behind_m), apart2, np.inf)
-    expected = np.where(np.isfinite(among.min(axis=1)), among.argmin(axis=1), -1)
-    met = meet(cloud, looking_ahead(), camera, s).ravel()
-    # Single precision may decide otherwise what lies on a rim, or as near as another.
-    assert (met == expected).mean() > 0.99
-    nearest = np.sort(apart2, axis=1)
-    clear = (np.abs(apart2 - s.radius_m**2) > 1e-4).all(axis=1) & (nearest[:, 1] - nearest[:, 0] > 1e-4)
-    np.testing.assert_array_equal(met[clear], expected[clear])
+def adjust(cloud, pictures, found, of):
+    return rays.adjust(Sights(cloud, of), pictures, found, of)
 
 
 @pytest.fixture(scope="module")
@@ -161,16 +64,13 @@ def test_a_faultless_picture_is_put_where_it_was_taken(city, street, pose, away,
     assert (got.hypothesis, got.inliers) == (3, 0.9)
 
 
-def test_what_is_met_already_is_not_looked_up_again(city, street, pose, monkeypatch):
+def test_what_a_judge_has_looked_up_already_is_not_looked_up_again(city, street, pose, monkeypatch):
     pictures, start = [picture_of(street, pose)], found_at(pose, away=(0.1, 0.05, 0))
-    met = rays.met_by(city, pictures, start, SETTINGS)
-    expected, _ = adjust(city, pictures, start, SETTINGS)
-    asked, kept = [], rays.meet
-    monkeypatch.setattr(rays, "meet", lambda *given: (asked.append(given), kept(*given))[1])
-    got, _ = adjust(city, pictures, start, replace(SETTINGS, rounds=1), met=met)
+    sights, asked, kept = Sights(city, SETTINGS), [], Sights._look_up
+    rays.met_by(sights, pictures, start)
+    monkeypatch.setattr(Sights, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
+    rays.adjust(sights, pictures, start, replace(SETTINGS, rounds=1))
     assert asked == []
-    got, _ = adjust(city, pictures, start, SETTINGS, met=met)
-    np.testing.assert_array_equal(got.camera_m, expected.camera_m)
 
 
 @pytest.mark.parametrize(
@@ -186,8 +86,8 @@ def test_what_is_met_already_is_not_looked_up_again(city, street, pose, monkeypa
 def test_rays_are_looked_up_until_the_pose_stands_still(
     city, street, pose, monkeypatch, away, still_m, rounds, looked_up
 ):
-    asked, kept = [], rays.meet
-    monkeypatch.setattr(rays, "meet", lambda *given: (asked.append(given), kept(*given))[1])
+    asked, kept = [], Sights._look_up
+    monkeypatch.setattr(Sights, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
     s = replace(SETTINGS, rounds=rounds, still_m=still_m, still_rad=1e9)
     adjust(city, [picture_of(street, pose)], found_at(pose, away=(away, 0, 0)), s)
     assert looked_up[0] <= len(asked) <= looked_up[1]
@@ -248,12 +148,16 @@ def test_cars_that_stand_elsewhere_now_pull_less_where_they_are_known_to_be_cars
     movable = np.zeros(inverse.shape, bool)
     movable[:, :30] = True  # patches of 6 pixels
     inverse[:, 30:32] = 0
-    pose = looking_ahead()[:3, :3] @ R_BODY_OPTICAL.T, np.zeros(3)
+    y, z = (side.ravel() for side in np.meshgrid(*[np.arange(-20, 20, 0.2)] * 2))
+    wall = np.zeros(len(y), SURFEL)
+    wall["xyz"], wall["normal"] = np.stack([np.full(len(y), 10.0), y, z], axis=1), (1, 0, 0)
+    mapped = SurfelMap.prepare(ORIGIN, wall, np.array([[0.0, 0.0, 0.0, len(wall)]]))
+    pose = np.eye(3), np.zeros(3)
     picture = RayPicture(inverse, CAMERA, transform_from(R_BODY_OPTICAL, np.zeros(3)), NOISE, None, movable)
     known = replace(SETTINGS, robust=50.0, rounds=4, scale=1e-4, turn_rad=1e-4)
     off = {}
     for name, where in (("unknown", np.zeros_like(movable)), ("known", movable)):
-        got, _ = adjust(cloud_of(wall(10)), [replace(picture, movable=where)], found_at(pose), known)
+        got, _ = adjust(mapped, [replace(picture, movable=where)], found_at(pose), known)
         off[name] = got.camera_m[0] - ORIGIN[0]
     assert off["unknown"] == pytest.approx(0.15, abs=0.03)
     assert off["known"] == pytest.approx(0.0, abs=0.03)
@@ -310,7 +214,7 @@ def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
     picture = replace(picture_of(street, pose, noise=2e-3, seed=seed), movable=movable)
     pictures = [picture] * (2 if again else 1)
     state = rays._State(R, t, float(np.log(scale)), float(offset))
-    met = [meet(city, state.camera_of(picture), CAMERA, s)] * len(pictures)
+    met = [Sights(city, s).meet(state.camera_of(picture), CAMERA)] * len(pictures)
     got = rays._pull(city, pictures, met, state, s, scattered=True)
     J, r, w, patches = plain(city, picture, met[0], R, t, scale=scale, offset=offset, s=s)
     H, b = J.T @ (J * w[:, None]), J.T @ (w * r)

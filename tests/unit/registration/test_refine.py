@@ -14,9 +14,10 @@ from service.localization.starts import StartSettings
 from service.registration.around import Near
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
 from service.registration.points import inverse_depth_noise
-from service.registration.rays import RaySettings, adjust, meet
+from service.registration.rays import RaySettings, adjust
 from service.registration.register import RegistrationSettings
 from service.registration.scatter import scatter_of
+from service.registration.sight import Sights
 
 CAMERA = PinholeCamera(80, 60, 50.0, 50.0, 39.5, 29.5)
 R_LEVEL_CAMERA = rotation_y(np.deg2rad(4.0)) @ R_BODY_OPTICAL
@@ -188,7 +189,7 @@ def judged(cloud, monkeypatch):
     asked_y_m = []
 
     def brightness(judge, pose):
-        assert judge.cloud.brightness is not None
+        assert judge.sights.cloud.brightness is not None
         asked_y_m.append(pose.camera_m[1])
         return float(pose.camera_m[1])
 
@@ -231,7 +232,7 @@ def test_the_picture_tells_two_streets_apart_that_differ_in_paint_alone(bundle_l
     camera = CAMERA.scaled_to(160, 120)
     T = TRUE.copy()
     T[:3, 3] -= lit.origin_m
-    met = meet(lit, T, camera, RaySettings())
+    met = Sights(lit, RaySettings()).meet(T, camera)
     grey = np.where(met >= 0, 255 - 200 * lit.brightness[np.maximum(met, 0)], 128).astype(np.uint8)
     frame = replace(frame, query=replace(frame.query, rgb=np.repeat(grey[..., None], 3, axis=2)))
     weights = {"inliers": 1.0, "similarity": 2.0, "likelihood": 0.0}
@@ -373,14 +374,12 @@ def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_
     found = refined(bundle, cloud, *frames, inliers=1.0, similarity=1.0, likelihood=0.0)
     best = found.best.registered
     assert best.inliers < max(each.registered.inliers for each in found.candidates)
-    (adjusting, (of_cloud, pictures, before, settings)), (covering, (information, scatter, noise, heading, model)) = (
-        asked
-    )
+    (adjusting, (sights, pictures, before, settings)), (covering, (information, scatter, noise, heading, model)) = asked
     assert (adjusting, covering) == ("adjust", "covariance_of")
-    assert of_cloud is cloud
+    assert sights.cloud is cloud
     assert settings == RefineSettings().rays
     assert [picture.noise for picture in pictures] == [3e-4, 1e-4, 2e-4]
-    adjusted, its_scatter = adjust(cloud, pictures, before, settings)
+    adjusted, its_scatter = adjust(sights, pictures, before, settings)
     np.testing.assert_array_equal(best.camera_m, adjusted.camera_m)
     np.testing.assert_array_equal(found.best.T_map_camera[:3, 3], adjusted.camera_m)
     np.testing.assert_allclose(found.best.T_map_camera[:3, :3], adjusted.R_map_level @ R_LEVEL_CAMERA, atol=1e-12)
