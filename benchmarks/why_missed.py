@@ -23,10 +23,6 @@ _PEERS = (
     "refusals are answered and a stuck request stops no other; whether that is the 9 % is a guess, not measured; the others are 2 to "
     "16 % dearer; of the 1.2 that a service adds to the bare retrieval nearly all would have to go"
 )
-_SLOWER = (
-    "measured on a slower machine than the rows before: the code of before takes 37.8 and 50.8 ms on it (22.3 and 30.3 elsewhere); "
-    "brightness as a judge takes 1.21 (precise) and 1.30 times the time without it, medians of 60 ratios within one run"
-)
 WHY_MISSED: dict[str, str] = {
     "paper.streetfix.minutes_for_paper_images": (
         "two threads beside other work, which spend processor time on waiting for each other; the others had one thread. Alike, one "
@@ -78,8 +74,6 @@ WHY_MISSED: dict[str, str] = {
         "with a precise camera: how far a map's own are off differs from city to city (0.015 to 0.022 m in the calibration cities), and "
         "one floor stands for all; next: a map's own errors told by its build"
     ),
-    "registration.cpu_ms_per_query.precise": _SLOWER,
-    "registration.cpu_ms_per_query.stereo": _SLOWER,
     "kitti_drive.odometry_vs_reference_m": (
         "0.36 m of it are the reference's first 0.4 s: GICP of those two scans gives 0.96 to 0.97 m for a step of 0.61 m there, from "
         "three starts, with the points of the sides, those behind, or all; what is left without the first frame is in the row beside; "
