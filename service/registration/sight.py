@@ -25,6 +25,8 @@ from service.registration.surfel_map import TILE_M, SurfelMap
 LIBRARY = Path(__file__).with_name("_rays.so")
 #: Poses that differ by no more than this see what has been gathered at one of them.
 NEAR_M, NEAR_RAD = 2.0, 0.1
+#: So many gatherings are kept, the last that were asked: a megabyte or two each, and a question has as many frames.
+KEPT = 16
 #: Gathered is this much more, so that rounding leaves nothing out.
 ROUNDING = 1e-3
 
@@ -132,7 +134,7 @@ class Sights:
         near = next((each for each in self._gathered if each.holds(T_map_camera, camera)), None)
         if near is None:
             near = self._gather(T_map_camera, camera)
-            self._gathered.append(near)
+        self._gathered = [each for each in self._gathered if each is not near][1 - KEPT :] + [near]
         seen, met = np.empty(len(near.surfels), _DISC), np.empty((camera.height, camera.width), np.int32)
         first, middle = np.empty((2, camera.height * camera.width), np.float32)
         _library().streetfix_meet(
@@ -149,7 +151,9 @@ class Sights:
             self.cloud.surfels.ctypes.data, parts.ctypes.data, len(parts), byref(View.of(T_map_camera, camera)),
             byref(self._discs), NEAR_M + ROUNDING, NEAR_RAD + ROUNDING, surfels.ctypes.data, numbers.ctypes.data,
         )  # fmt: skip
-        return _Gathered(T_map_camera, camera, surfels[:count], numbers[:count])
+        for each in (surfels, numbers):
+            each.resize(count, refcheck=False)  # gives back what was not needed
+        return _Gathered(T_map_camera, camera, surfels, numbers)
 
     def _tiles_in_view(self, T_map_camera: Transform, camera: PinholeCamera) -> NDArray[np.int64]:
         """First surfel and count of the tiles that a camera may see from near a pose.

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, transform_from
 from service.registration.kernel import SURFEL
-from service.registration.sight import NEAR_M, NEAR_RAD, DiscSettings, Sights
+from service.registration.sight import KEPT, NEAR_M, NEAR_RAD, DiscSettings, Sights
 from service.registration.surfel_map import TILE_M, SurfelMap
 
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
@@ -160,6 +160,20 @@ def test_from_further_off_and_for_another_camera_it_is_gathered_anew(away_m, tur
     turned = Rotation.from_rotvec([0, 0, turn_rad]).as_matrix() @ looking_ahead()[:3, :3]
     assert (sights.meet(transform_from(turned, np.array([0.0, away_m, 0.0])), camera) >= 0).any()
     assert len(sights._gathered) == gathered
+
+
+def test_of_many_places_the_last_ones_are_kept_and_others_gathered_again():
+    """As a long sequence asks of several candidates; what is met stays the same."""
+    cloud = cloud_of(wall(10, y=(-60, 60)))
+    sights, places = Sights(cloud, SETTINGS), [looking_ahead(y=3.0 * k) for k in range(-10, 10)]
+    for T in places:
+        sights.meet(T, CAMERA)
+        assert len(sights._gathered) <= KEPT
+        sights._look_up(places[-1], CAMERA)
+    assert [each.T_map_camera[1, 3] for each in sights._gathered[-2:]] == [places[-2][1, 3], places[-1][1, 3]]
+    sights._met.clear()
+    np.testing.assert_array_equal(sights.meet(places[0], CAMERA), meet(cloud, places[0], CAMERA))
+    assert len(sights._gathered) == KEPT
 
 
 def test_each_pose_is_looked_up_once(monkeypatch):
