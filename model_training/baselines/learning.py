@@ -7,7 +7,7 @@ method is given.
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -63,18 +63,31 @@ def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
         group["lr"] = rate * group.get("times", 1.0)
 
 
+def rests(scores: Sequence[float], patience: int) -> int:
+    """How often a score rested: ``patience`` values in a row without a new best, counted anew after each rest."""
+    best, since, count = -math.inf, 0, 0
+    for score in scores:
+        best, since = (score, 0) if score > best else (best, since + 1)
+        if since == patience:
+            since, count = 0, count + 1
+    return count
+
+
 class Training:
     """A run's folder: its settings, its curve and its last checkpoint.
 
     ``settings`` (plain JSON values) are kept beside the checkpoint; a folder of other settings is refused. ``budget_s`` is no
-    setting: a run that ended at a budget goes on when it is given more.
+    setting: a run that ended at a budget goes on when it is given more. A run that may ``drops`` times go on at a lower rate
+    (``rests_so_far``) ends at the rest after them; without drops at the first.
 
     Raises:
         DatasetError: the folder belongs to other settings.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], *, budget_s: float, patience: int = 6) -> None:
-        self.folder, self._budget_s, self._patience = folder, budget_s, patience
+    def __init__(
+        self, folder: Path, settings: Mapping[str, Any], *, budget_s: float, patience: int = 6, drops: int = 0
+    ) -> None:
+        self.folder, self._budget_s, self._patience, self._drops = folder, budget_s, patience, drops
         folder.mkdir(parents=True, exist_ok=True)
         kept, text = folder / "settings.json", json.dumps(dict(settings), indent=1, sort_keys=True) + "\n"
         if kept.exists() and kept.read_text() != text:
@@ -104,10 +117,12 @@ class Training:
         """Why there is nothing more to do: the budget is spent, or the score stopped gaining; None to go on."""
         if self.processor_s >= self._budget_s:
             return "budget"
-        scores = [point.score for point in self.curve]
-        if len(scores) > self._patience and max(scores[-self._patience :]) <= max(scores[: -self._patience]):
-            return "stopped gaining"
-        return None
+        return "stopped gaining" if self.rests_so_far > self._drops else None
+
+    @property
+    def rests_so_far(self) -> int:
+        """How often the score stopped gaining: what a learning rate may follow that falls then."""
+        return rests([point.score for point in self.curve], self._patience)
 
     def point(self, images: int, loss: float, score: float, state: Mapping[str, Any]) -> CurvePoint:
         """Note a point of the curve and save ``state`` (state_dicts and plain values), and apart the best one so far."""

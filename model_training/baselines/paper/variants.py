@@ -80,7 +80,11 @@ def run_variant(
     trainer = CnnTrainer(plan, frames, pairs if plan.pairs_too else None, work / name, budget_s=budget_s)
     net = trainer.run(f"CNN {name}", report)
     told = trainer.training
-    cost, images, why = told.processor_s, told.images, told.ended or f"{trainer.iterations} iterations"
+    cost, images, why = (
+        told.processor_s,
+        told.images,
+        f"{trainer.iterations} iterations" if plan.as_paper else told.ended or "",
+    )
     split, pictures = trainer.split, trainer.pictures
     gallery = _gallery(net, pictures, split, pairs if plan.pairs_too else None)
     centres = class_centres(frames.T_map_lidar[split.learnt, :2, 3], frames.street[split.learnt], CLASSES)

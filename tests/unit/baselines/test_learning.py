@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from model_training.baselines.learning import Training, cosine_share, set_rate
+from model_training.baselines.learning import Training, cosine_share, rests, set_rate
 from service.errors import DatasetError
 
 
@@ -66,6 +66,24 @@ def test_a_run_ends_when_its_score_stops_gaining(tmp_path: Path, scores: tuple[f
         training.point(number, 0.0, score, {})
 
     assert training.ended == ended
+
+
+def test_rests_are_counted_anew_after_each_and_a_new_best_ends_one() -> None:
+    assert rests([], 2) == 0
+    assert rests([0.1, 0.1, 0.1], 2) == 1
+    assert rests([0.1, 0.05, 0.2, 0.1], 2) == 0  # a new best in between
+    assert rests([0.1, 0.0, 0.0, 0.0, 0.0], 2) == 2
+    assert rests([0.1, 0.0, 0.0, 0.3, 0.2, 0.2], 2) == 2
+
+
+def test_a_run_with_drops_goes_on_after_the_first_rests(tmp_path: Path) -> None:
+    training = Training(tmp_path, {}, budget_s=100.0, patience=1, drops=1)
+    told = []
+    for number, score in enumerate((0.5, 0.4, 0.6, 0.6)):
+        training.point(number, 0.0, score, {})
+        told.append((training.rests_so_far, training.ended))
+
+    assert told == [(0, None), (1, None), (1, None), (2, "stopped gaining")]
 
 
 def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:

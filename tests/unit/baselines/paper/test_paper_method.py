@@ -158,7 +158,7 @@ def test_what_was_not_measured_is_black_in_both_kinds() -> None:
 
 def test_the_cnn_learns_what_tells_the_classes_apart_and_stops(tmp_path: Path) -> None:
     frames = frames_of(160)
-    trainer = CnnTrainer(CnnPlan("aligned", batch=16), frames, None, tmp_path, budget_s=60.0, patience=50)
+    trainer = CnnTrainer(CnnPlan("aligned", batch=16), frames, None, tmp_path, budget_s=60.0, patience=12)
 
     net = trainer.run("test")
 
