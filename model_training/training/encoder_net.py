@@ -21,6 +21,7 @@ from torch.nn import functional
 from service.imaging.view_grid import PLANES
 
 LAYERS = 12
+VIEWS_AT_ONCE = 16  # normalised together on a processor: their planes stay in its cache
 CHANNELS = 7  # log range, measured, height, observed, V1, V2, brightness
 
 
@@ -62,7 +63,7 @@ class EncoderNet(nn.Module):
 
     def of_both(self, planes: Tensor, queries: int) -> Tensor:
         """What ``forward`` gives for a batch whose first ``queries`` rows are queries; without the zeros of the side that is not asked."""
-        x = normalised(planes)
+        x = _normalised_in_parts(planes)
         convolution, norm, activation = self.conv1
         weight = cast("Tensor", convolution.weight)
         sides = [
@@ -98,6 +99,20 @@ def normalised(planes: Tensor) -> Tensor:
         ],
         dim=1,
     )
+
+
+def _normalised_in_parts(planes: Tensor) -> Tensor:
+    """``normalised`` for training: a few views at a time, into the layout and the precision that the first layer reads."""
+    size = VIEWS_AT_ONCE if planes.device.type == "cpu" else len(planes)
+    kind = (
+        torch.get_autocast_dtype(planes.device.type) if torch.is_autocast_enabled(planes.device.type) else planes.dtype
+    )
+    found = torch.empty(
+        len(planes), CHANNELS, *planes.shape[2:], dtype=kind, device=planes.device, memory_format=torch.channels_last
+    )
+    for first in range(0, len(planes), size):
+        found[first : first + size] = normalised(planes[first : first + size])
+    return found
 
 
 def _conv(inputs: int, outputs: int, stride: tuple[int, int] = (1, 1)) -> nn.Sequential:

@@ -24,6 +24,8 @@ from model_training.training.precision import Precision, forward_in
 from service.errors import DatasetError
 from service.imaging.view_grid import PLANES, ViewGrid
 
+PAIRS_AT_ONCE = 16  # augmented together on a processor
+
 _LOSSES = {"info_nce": paired_info_nce, "triplet": hardest_triplet}
 
 
@@ -192,17 +194,25 @@ def train(
 
 
 def views_of(batch: Batch, augment: Augmenter, place: torch.device, *, blind: tuple[str, ...] = ()) -> torch.Tensor:
-    """A batch as the network sees it: augmented planes, queries before survey views; queries without the planes in ``blind``."""
+    """A batch as the network sees it: augmented planes, queries before survey views; queries without the planes in ``blind``.
+
+    On a processor in parts of ``PAIRS_AT_ONCE`` pairs, whose planes stay in its cache: little more than half the time.
+    """
     count = len(batch.query_xy)
-    rows_seen = augment.cut_rows(batch.rows_seen.to(place), count)
-    surveys = augment.survey(
-        batch.survey_ranges.to(place), batch.survey_intensity.to(place), batch.survey_height_m.to(place), rows_seen
-    )
-    queries = augment.query(
-        batch.query_ranges.to(place), batch.query_rgb.to(place), batch.query_height_m.to(place), rows_seen
-    )
-    queries[:, [PLANES.index(name) for name in blind]] = 0.0
-    return torch.cat([queries, surveys]).contiguous(memory_format=torch.channels_last)
+    size = PAIRS_AT_ONCE if place.type == "cpu" else count
+    planes = torch.empty(2 * count, len(PLANES), *batch.query_ranges.shape[1:], device=place)
+    for first in range(0, count, size):
+        part = slice(first, min(first + size, count))
+        rows_seen = augment.cut_rows(batch.rows_seen.to(place), part.stop - first)
+        planes[count + first : count + part.stop] = augment.survey(
+            batch.survey_ranges[part].to(place), batch.survey_intensity[part].to(place),
+            batch.survey_height_m[part].to(place), rows_seen,
+        )  # fmt: skip
+        planes[part] = augment.query(
+            batch.query_ranges[part].to(place), batch.query_rgb[part].to(place), batch.query_height_m[part].to(place), rows_seen
+        )  # fmt: skip
+    planes[:count, [PLANES.index(name) for name in blind]] = 0.0
+    return planes
 
 
 def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:

@@ -3,7 +3,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training.augment import Augmentation, Augmenter, brightness  # noqa: E402  # after the skip
+from model_training.training.augment import Augmentation, Augmenter, brightness, least_of_nine  # noqa: E402  # after the skip
 from service.imaging.brightness import brightness as of_one_view  # noqa: E402
 from service.imaging.view_grid import PLANES, ViewGrid  # noqa: E402
 
@@ -173,3 +173,9 @@ def test_a_vehicle_in_the_way_covers_the_brightness_of_what_is_behind_it():
     inside = plane(planes, "brightness")[hidden]
     alike = torch.corrcoef(torch.stack([inside, free[hidden]]))[0, 1]
     assert abs(float(alike)) < 0.3  # depth bleeds over the edge, brightness does not
+
+
+def test_the_least_of_nine_is_what_a_pooling_gives():
+    values = torch.rand(3, 32, 128, generator=torch.Generator().manual_seed(4))
+    pooled = -torch.nn.functional.max_pool2d(-values[:, None], 3, 1, 1)[:, 0]
+    torch.testing.assert_close(least_of_nine(values), pooled, rtol=0, atol=0)
