@@ -13,10 +13,13 @@ from benchmarks.paper.data import PaperData, Size
 from benchmarks.paper.figures import draw_figures
 from benchmarks.paper.kept import MethodResult
 from benchmarks.paper.methods import RUNS, Bench
+from benchmarks.paper.pace import Pace, measure_pace
 from benchmarks.paper.rows import METHODS, all_rows
 from benchmarks.paper.tables import write_page
 from benchmarks.report import REPORTS, ROOT, Report
+from model_training.cli.progress import bars
 
+PACE = "pace"  # beside the methods: what each takes for the same number of images
 REDUCED, REDUCED_MINUTES = Size(frames=640, pairs=320, test_images=24), 0.1
 
 
@@ -45,12 +48,12 @@ def main() -> None:
         action="store_true",
         help="a little of everything, in minutes -> out/paper; shows that all runs, no more",
     )
-    parser.add_argument("--only", nargs="+", metavar="METHOD", help=f"of: {' '.join(RUNS)}")
+    parser.add_argument("--only", nargs="+", metavar="METHOD", help=f"of: {' '.join((*RUNS, PACE))}")
     parser.add_argument("--tables", action="store_true", help="run nothing, write the report from what is kept")
     parser.add_argument("--anew", action="store_true", help="run methods again whose answers are kept; trainings go on")
     arguments = parser.parse_args()
-    if unknown := set(arguments.only or ()) - set(RUNS):
-        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(RUNS)}")
+    if unknown := set(arguments.only or ()) - {*RUNS, PACE}:
+        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join((*RUNS, PACE))}")
     size = Size(arguments.frames, arguments.pairs, arguments.test_images)
     work, out, minutes = ROOT / "data" / "paper", REPORTS, arguments.budget_minutes
     if arguments.reduced:
@@ -58,29 +61,34 @@ def main() -> None:
         work, out = ROOT / "data" / "paper-reduced", ROOT / "out" / "paper"
     work, out = arguments.work or work, arguments.out or out
     bench = Bench(PaperData(work, size), 60 * minutes, out / "paper" / "answers")
+    pace_file = out / "paper" / "pace.json"
     done = work / "done"
     done.mkdir(parents=True, exist_ok=True)
     report = Report(
         "paper", "make paper" + (' ARGS="' + " ".join(sys.argv[1:]) + '"' if sys.argv[1:] else ""), folder=out
     )
-    wanted = [] if arguments.tables else arguments.only or list(RUNS)
+    wanted = [] if arguments.tables else arguments.only or [*RUNS, PACE]
     for name in wanted:
         if not arguments.anew and (done / name).exists():
             continue
         print(f"--- {name}", flush=True)
-        for result in RUNS[name](bench):
-            result.save(bench.kept)
+        if name == PACE:
+            with bars() as show:
+                measure_pace(bench.data, show).save(pace_file)
+        else:
+            for result in RUNS[name](bench):
+                result.save(bench.kept)
         (done / name).touch()
-    results = kept_results(bench)
+    results, pace = kept_results(bench), Pace.load(pace_file)
     missing = dict.fromkeys((*METHODS, "cnn_knn"), "not run yet")
-    figures = all_rows(report, results, bench.data.tests, missing)
+    figures = all_rows(report, results, bench.data.tests, missing, pace)
     report.notes["size"] = (
         f"{size.frames} LiDAR frames, {size.pairs} RGB-D pairs, {len(bench.data.tests['other_drive'])} test images a split; "
         f"learned methods have up to {minutes:g} minutes of processor time each."
     )
     print(f"written: {report.write()}")
     pictures = draw_figures(out / "paper", bench.data, results)
-    print(f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures, minutes)}")
+    print(f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures, minutes, pace)}")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import head_commit
+from benchmarks.report import head_commit, machine
 from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.learning import CurvePoint
 
@@ -30,6 +30,7 @@ class MethodResult:
         curve: of its training.
         extra: plain values that tables need.
         commit: that it was run at.
+        machine: that it ran on; empty where that was not kept.
     """
 
     method: str
@@ -41,6 +42,7 @@ class MethodResult:
     curve: list[CurvePoint] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
     commit: str = field(default_factory=head_commit)
+    machine: str = field(default_factory=machine)
 
     @property
     def aside(self) -> float:
@@ -52,7 +54,7 @@ class MethodResult:
         """Write ``METHOD.json``, whole or not at all."""
         folder.mkdir(parents=True, exist_ok=True)
         told = {
-            "method": self.method, "commit": self.commit, "training_s": self.training_s, "images": self.images,
+            "method": self.method, "commit": self.commit, "machine": self.machine, "training_s": self.training_s, "images": self.images,
             "training_set": self.training_set, "ended": self.ended, "extra": self.extra,
             "curve": [[p.images, p.processor_s, p.loss, p.score] for p in self.curve],
             "answers": {name: {"xy": _plain(each.xy), "street": each.street.tolist()} for name, each in self.answers.items()},
@@ -74,7 +76,7 @@ class MethodResult:
         }
         return MethodResult(
             told["method"], answers, told["training_s"], told["images"], told["training_set"], told["ended"],
-            [CurvePoint(int(a), b, c, d) for a, b, c, d in told["curve"]], told["extra"], told["commit"],
+            [CurvePoint(int(a), b, c, d) for a, b, c, d in told["curve"]], told["extra"], told["commit"], told.get("machine", ""),
         )  # fmt: skip
 
 

@@ -6,7 +6,6 @@ seen this city. Every map is built as any user builds one; every answer counts, 
 """
 
 import json
-import os
 import tempfile
 import time
 from pathlib import Path
@@ -22,16 +21,19 @@ from model_training.cli.progress import bars
 from model_training.evaluation.predict import predict
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.stock import ENCODER
+from model_training.training.encoder_net import EncoderShape
 from model_training.training.export import export
 from model_training.training.loop import Progress, TrainingConfig, load_run, train
 from model_training.training.packs import rows_seen_by
 from model_training.training.precision import native_precision
+from service.imaging.view_grid import ViewGrid
 from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 PAPER_IMAGES_SHARE = 4 * 0.7  # four epochs over 70 % of the frames
-
+#: Half the stock encoder's columns and narrower: one city asks less of it than any city, and it learns from more images a minute.
+SHAPE = EncoderShape(columns=64, widths=(16, 32, 96, 160))
 
 PILOT_STEPS, PILOT_LEFT_OUT = 24, 8  # the first steps read the pack from disk
 SPARED = 0.07  # of a budget: checkpoints, and a machine that is slower later than during the pilot
@@ -44,34 +46,39 @@ def config_as_paper(size: Size) -> TrainingConfig:
     """
     together = min(TrainingConfig().pairs, size.pairs // 4)
     steps = max(1, round(PAPER_IMAGES_SHARE * size.frames / (2 * together)))
-    return TrainingConfig(pairs=together, steps=steps, precision=native_precision(), memory_after=None)
+    return TrainingConfig(pairs=together, steps=steps, precision=native_precision(), memory_after=None, encoder=SHAPE)
 
 
 def config_within(budget_s: float, pack: Path, config: TrainingConfig, run: Path) -> TrainingConfig:
     """As many steps as a budget of processor time buys, told by a pilot; a run that has begun keeps its own number."""
     if (run / "config.json").exists():
         return TrainingConfig.model_validate_json((run / "config.json").read_bytes())
-    pilot, seen = config.model_copy(update={"steps": PILOT_STEPS}), []
+    return config.model_copy(update={"steps": max(1, int((1 - SPARED) * budget_s / seconds_a_step(pack, config)))})
+
+
+def seconds_a_step(pack: Path, config: TrainingConfig) -> float:
+    """Processor time of a step of training, by the first ones of a run that is thrown away."""
+    pilot, seen = config.model_copy(update={"steps": PILOT_STEPS}), list[float]()
     with tempfile.TemporaryDirectory() as folder, one_thread():
         train([pack], Path(folder), pilot, device="cpu", report=lambda _: seen.append(time.process_time()))
-    each = (seen[-1] - seen[PILOT_LEFT_OUT]) / (PILOT_STEPS - 1 - PILOT_LEFT_OUT)
-    return config.model_copy(update={"steps": max(1, int((1 - SPARED) * budget_s / each))})
+    return (seen[-1] - seen[PILOT_LEFT_OUT]) / (PILOT_STEPS - 1 - PILOT_LEFT_OUT)
 
 
 def pack_of(data: PaperData) -> Path:
-    """The comparison's frames and pairs as a training pack; the large arrays are linked, not copied."""
-    folder = data.work / f"pack2-paper-0-{data.size.frames}x{data.size.pairs}"
+    """The comparison's frames and pairs as a training pack with the columns of ``SHAPE``: every second one of the shared data's."""
+    folder = data.work / f"pack2-paper-0-{data.size.frames}x{data.size.pairs}-{SHAPE.columns}"
     if folder.exists():
         return folder
     part = folder.with_name(folder.name + ".part")
     frames, pairs = data.frames, data.pairs
+    every = ViewGrid().columns // SHAPE.columns
     part.mkdir(parents=True, exist_ok=True)
-    for name in ("panoramas", "intensities"):
-        (part / f"{name}.npy").unlink(missing_ok=True)
-        os.link(data.work / f"frames-{data.size.frames}" / f"{name}.npy", part / f"{name}.npy")
-    np.save(part / "places.npy", frames.places)
-    np.save(part / "rows_seen.npy", rows_seen_by(frames.panoramas))
-    for name, array in (("ranges", pairs.ranges), ("rgb", pairs.colours), ("queries", pairs.views)):
+    arrays = {
+        "panoramas": frames.panoramas[..., ::every], "intensities": frames.intensities[..., ::every], "places": frames.places,
+        "rows_seen": rows_seen_by(frames.panoramas), "ranges": pairs.ranges[..., ::every], "rgb": pairs.colours[:, :, ::every],
+        "queries": pairs.views,
+    }  # fmt: skip
+    for name, array in arrays.items():
         np.save(part / f"{name}.npy", array)
     part.rename(folder)
     return folder

@@ -7,6 +7,7 @@ import numpy as np
 
 from benchmarks.paper.data import PaperData
 from benchmarks.paper.kept import SPLITS, MethodResult
+from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import errors_of, minutes_for_paper_images
 from benchmarks.report import head_commit, machine
 from model_training.baselines.paper.cnn import layer_table
@@ -43,6 +44,7 @@ def write_page(
     figures: Figures,
     pictures: Mapping[str, str],
     budget_minutes: float,
+    pace: Pace | None = None,
 ) -> Path:
     """Write the page and say where it is."""
     parts = [
@@ -51,7 +53,7 @@ def write_page(
         _pictures(pictures),
         _network(),
         _table_two(data, results),
-        _table_three(results, figures),
+        _table_three(results, figures, pace),
         _claims(results, figures),
         _variants(results),
         _ks(results),
@@ -171,7 +173,7 @@ def _table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str
     ]  # fmt: skip
 
 
-def _table_three(results: Mapping[str, MethodResult], figures: Figures) -> list[str]:
+def _table_three(results: Mapping[str, MethodResult], figures: Figures, pace: Pace | None) -> list[str]:
     lines = [
         "## Table III: methods", "",
         ("Queries are RGB-D pairs. Training time is processor time of all cores; making the data is not in it (nor is it in the paper's). "
@@ -186,7 +188,7 @@ def _table_three(results: Mapping[str, MethodResult], figures: Figures) -> list[
         if method not in figures:
             continue
         other, own, result = figures[method]["other_drive"], figures[method]["same_drive"], results[method]
-        minutes = minutes_for_paper_images(result)
+        minutes = minutes_for_paper_images(method, result, pace)
         spent = "beforehand" if result.training_s is None else f"{result.training_s / 60:.1f}"
         lines.append(
             f"| {_title(method, results)} | {other['mean_distance_error_m']:.3f} | {other['median_distance_error_m']:.3f} "

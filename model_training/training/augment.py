@@ -167,9 +167,10 @@ class Augmenter:
         top = self._chance(count, s.narrow_rows) * self._uniform(count, 1, 1) * 10
         bottom = self._chance(count, s.narrow_rows) * self._uniform(count, 1, 1) * 10
         narrow = self._chance(count, s.narrow_columns)
-        both = narrow * self._uniform(count, 1, 1) * 14
-        left = both + narrow * self._uniform(count, 1, 1) * 12
-        right = both + narrow * self._uniform(count, 1, 1) * 12
+        one = self.grid.columns / 128
+        both = narrow * self._uniform(count, 1, 1) * 14 * one
+        left = both + narrow * self._uniform(count, 1, 1) * 12 * one
+        right = both + narrow * self._uniform(count, 1, 1) * 12 * one
         return (row >= top) & (row < self.grid.rows - bottom) & (column >= left) & (column < self.grid.columns - right)
 
     def _colour(self, rgb: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-METHODS = ("streetfix", "scan_context", "dual", "regression", "cnn_one_space_both")
+METHODS = ("streetfix", "scan_context", "dual", "regression", "cnn_one_space_both", "pace")
 
 
 def test_a_little_of_everything_runs_and_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -42,6 +42,9 @@ def test_a_little_of_everything_runs_and_goes_on_where_it_was(tmp_path: Path) ->
     assert (
         rows["paper.streetfix.same_drive.mean_distance_error_m"]["value"] < 500
     )  # so few images teach it nothing, but it answers in the city
+    pace = json.loads((tmp_path / "out" / "paper" / "pace.json").read_text())
+    assert {"streetfix", "googlenet", "dual_encoder", "fov_encoder", "cnn_as_printed"} < set(pace["seconds_an_image"])
+    assert "in one run" in rows["paper.streetfix.minutes_for_paper_images"]["why"]
     page = (tmp_path / "out" / "paper.md").read_text()
     for title in ("Table I", "Table II", "Table III", "Figure 9", "97.52 %"):
         assert title in page

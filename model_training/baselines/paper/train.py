@@ -120,7 +120,7 @@ class CnnTrainer:
         return trained
 
     def _train(self, name: str, report: Report) -> None:
-        batch = -(-len(self._learnt) // ITERATIONS_AN_EPOCH) if self.plan.as_paper else self.plan.batch
+        batch = self.batch
         most = self.iterations * batch if self.plan.as_paper else None
         every = batch * max(1, ITERATIONS_AN_EPOCH // 3) if self.plan.as_paper else max(batch, len(self._learnt) // 4)
         images, losses = self.training.images, list[float]()
@@ -133,7 +133,7 @@ class CnnTrainer:
         while not self._done(images, most):
             if not self.plan.as_paper:
                 set_rate(self._optimiser, self.plan.rate * DROP**self.training.rests_so_far)
-            losses.append(self._step(batch))
+            losses.append(self.step(batch))
             images += batch
             spent = images / most if most else self.training.share_spent
             report(name, round(1000 * spent), 1000)
@@ -141,6 +141,11 @@ class CnnTrainer:
                 point()
         if losses:  # since the last point, where the budget ended between two
             point()
+
+    @property
+    def batch(self) -> int:
+        """Pictures of a step."""
+        return -(-len(self._learnt) // ITERATIONS_AN_EPOCH) if self.plan.as_paper else self.plan.batch
 
     @property
     def iterations(self) -> int:
@@ -152,7 +157,8 @@ class CnnTrainer:
             return images >= most
         return images > 0 and self.training.ended is not None  # a short budget buys a step too
 
-    def _step(self, batch: int) -> float:
+    def step(self, batch: int) -> float:
+        """Learn from so many pictures drawn at random; the mean loss."""
         self.net.train()
         self._optimiser.zero_grad(set_to_none=True)
         total = 0.0

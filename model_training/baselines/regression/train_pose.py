@@ -64,7 +64,7 @@ def train_pose(
     watched = watched_rows(pairs)
     shown, kept_back = np.flatnonzero(~watched), np.flatnonzero(watched)
     with one_thread():
-        learner = _Learner(pairs, MapFrame.of(pairs.T_map_camera[shown, :3, 3]), settings)
+        learner = PoseLearner(pairs, MapFrame.of(pairs.T_map_camera[shown, :3, 3]), settings)
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
         while not training.curve or training.ended is None:  # a short budget buys a step too
@@ -107,8 +107,8 @@ class PoseRegressor:
         return np.concatenate([np.zeros((0, 4, 4)), *(transforms_of(pose, self.frame) for pose in found)])
 
 
-class _Learner:
-    """All that a checkpoint keeps."""
+class PoseLearner:
+    """A network in training: all that a checkpoint keeps."""
 
     def __init__(self, pairs: Pairs, frame: MapFrame, settings: PoseSettings) -> None:
         torch.manual_seed(settings.seed)
@@ -154,6 +154,7 @@ class _Learner:
         return apart
 
     def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
         return {
             "net": self._net.state_dict(), "loss": self._loss.state_dict(), "optimiser": self._optimiser.state_dict(),
             "torch": torch.get_rng_state(), "numpy": json.dumps(self._rng.bit_generator.state),
@@ -162,6 +163,7 @@ class _Learner:
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what ``state`` gave."""
         self._net.load_state_dict(state["net"])
         self._loss.load_state_dict(state["loss"])
         self._optimiser.load_state_dict(state["optimiser"])

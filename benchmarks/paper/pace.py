@@ -1,0 +1,134 @@
+"""How long each learned method trains for the same number of images: steps of all of them in turn, within one run.
+
+Methods are trained when there is time for each, on whatever machine that is, beside whatever else runs; what they took then
+cannot be compared. So the comparison of training times is a run of its own: some steps of every method, round after round.
+"""
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.paper.data import PaperData, Size
+from benchmarks.paper.ours import config_as_paper, pack_of, seconds_a_step
+from benchmarks.report import head_commit, machine
+from model_training.baselines.dual import learn
+from model_training.baselines.dual.pictures import Sweeps, pictures_of
+from model_training.baselines.gallery import thinned
+from model_training.baselines.learning import one_thread
+from model_training.baselines.paper.train import CnnTrainer
+from model_training.baselines.paper.variants import PLANS
+from model_training.baselines.regression.pictures import MapFrame
+from model_training.baselines.regression.train_pose import PoseLearner, PoseSettings
+from service.imaging.view_grid import ViewGrid
+
+ROUNDS, LEAST_S = 5, 3.0  # of processor time of each method in a round, at least
+Measure = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Processor seconds an image by method, a value a round; where and at which commit they were measured."""
+
+    seconds_an_image: Mapping[str, list[float]]
+    machine: str = field(default_factory=machine)
+    commit: str = field(default_factory=head_commit)
+
+    def minutes(self, method: str, images: int) -> float | None:
+        """Processor minutes for so many images, by the median round; None for a method that was not measured."""
+        rounds = self.seconds_an_image.get(method)
+        return None if rounds is None else float(np.median(rounds)) * images / 60
+
+    def save(self, path: Path) -> None:
+        """Write JSON, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        part.rename(path)
+
+    @staticmethod
+    def load(path: Path) -> "Pace | None":
+        """What was kept, or None."""
+        return Pace(**json.loads(path.read_text())) if path.exists() else None
+
+
+def measure_pace(data: PaperData, report: Callable[[str, int, int], None]) -> Pace:
+    """Measure all learned methods in turn, each with one thread.
+
+    Of the paper's baseline its first network counts alone: an image is a picture that GoogLeNet learns from, and what PointNetLK
+    takes besides is left out, in the baseline's favour. Of data that are not of the paper's size a single step is measured, to show
+    that all runs.
+    """
+    rounds, least_s = (ROUNDS, LEAST_S) if data.size == Size() else (1, 0.0)
+    with tempfile.TemporaryDirectory() as folder, one_thread():
+        methods = _methods(data, Path(folder), least_s)
+        found: dict[str, list[float]] = {name: [] for name in methods}
+        for turn in range(rounds):
+            for number, (name, measure) in enumerate(methods.items()):
+                found[name].append(measure())
+                report("pace", turn * len(methods) + number + 1, rounds * len(methods))
+    return Pace(found)
+
+
+def _methods(data: PaperData, folder: Path, least_s: float) -> dict[str, Measure]:
+    config = config_as_paper(data.size)
+    methods: dict[str, Measure] = {
+        "streetfix": lambda: seconds_a_step(pack_of(data), config) / (2 * config.pairs),
+        "googlenet": partial(_timed, _googlenet(data), least_s),
+        "dual_encoder": partial(_timed, _towers(data, "dual"), least_s),
+        "fov_encoder": partial(_timed, _towers(data, "fov"), least_s),
+    }
+    for name, plan in PLANS.items():
+        trainer = CnnTrainer(plan, data.frames, data.pairs if plan.pairs_too else None, folder / name, budget_s=60.0)
+        methods[f"cnn_{name}"] = partial(_timed, partial(_cnn_step, trainer), least_s)
+    return methods
+
+
+def _timed(step: Callable[[], int], least_s: float) -> float:
+    """Seconds an image of steps that give their number of images; the first one, which finds caches cold, does not count."""
+    step()
+    began, images = time.process_time(), 0
+    while images == 0 or time.process_time() - began < least_s:
+        images += step()
+    return (time.process_time() - began) / images
+
+
+def _cnn_step(trainer: CnnTrainer) -> int:
+    trainer.step(trainer.batch)
+    return trainer.batch
+
+
+def _googlenet(data: PaperData) -> Callable[[], int]:
+    learner = PoseLearner(data.pairs, MapFrame.of(data.pairs.T_map_camera[:, :3, 3]), PoseSettings())
+    rows = np.arange(len(data.pairs))
+
+    def step() -> int:
+        drawn = learner.draw(rows)
+        learner.step(drawn, 0.5)
+        return len(drawn)
+
+    return step
+
+
+def _towers(data: PaperData, kind: learn.Kind) -> Callable[[], int]:
+    settings = learn.BEST[kind]
+    pictures = pictures_of(data.pairs, learn.size_of(kind))
+    views = learn.views_of(kind, pictures.camera, ViewGrid())
+    sweeps = Sweeps.of(data.frames, thinned(data.frames.places[:, :2], settings.frames_spacing_m))
+    lesson = learn.Lesson.of(pictures, np.array(data.pairs.views), sweeps, views, settings)
+    towers = learn.towers_of(settings, views).to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
+    optimiser = torch.optim.AdamW(towers.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    batches = lesson.batches(settings, np.random.default_rng(0))
+
+    def step() -> int:
+        batch = next(batches)
+        learn.step(towers.train(), optimiser, batch, settings)
+        return 2 * len(batch[0])
+
+    return step
