@@ -17,8 +17,10 @@ from benchmarks.paper.data import PaperData, test_set
 from benchmarks.paper.kept import MethodResult
 from benchmarks.paper.rows import errors_of
 from benchmarks.paper.tables import DRIVES, TITLES
+from model_training.baselines.learning import CurvePoint
 from model_training.baselines.paper.knn import KS
 from model_training.baselines.paper.pictures import LidarPictures, fused_pictures
+from model_training.baselines.regression.locate import STAGES
 from model_training.datasets.dataset import Dataset, QueryFrame
 from service.imaging.fusion import fuse, picture_of
 from service.maps.streets import Streets
@@ -80,17 +82,12 @@ def _setup() -> Figure:
     axes.plot(1.0, 1.5, "s", color=THEIRS, ms=7)
     axes.plot(-0.4, 1.8, "o", color=OURS, ms=8)
     axes.axhline(0, color=INK, lw=1)
-    axes.annotate(
-        "LiDAR, 32 beams, +-15 degrees, 1.8 m", (-0.4, 1.8), (-7.5, 3.4), arrowprops={"arrowstyle": "-"}, color=OURS
-    )
-    axes.annotate(
-        "RGB and depth, 640 x 480, 90 degrees, 1.5 m",
-        (1.0, 1.5),
-        (0.2, 3.9),
-        arrowprops={"arrowstyle": "-"},
-        color=THEIRS,
-    )
-    axes.set(xlim=(-9, 9), ylim=(-0.2, 4.3), aspect="equal", xlabel="m", ylabel="m")
+    for text, at, where, side, colour in (
+        ("LiDAR, 32 beams, +-15 degrees, 1.8 m", (-0.4, 1.8), (-8.7, 4.1), "left", OURS),
+        ("RGB and depth, 640 x 480, 90 degrees, 1.5 m", (1.0, 1.5), (8.7, 4.1), "right", THEIRS),
+    ):
+        axes.annotate(text, at, where, arrowprops={"arrowstyle": "-", "color": INK}, color=colour, ha=side, fontsize=9)
+    axes.set(xlim=(-9, 9), ylim=(-0.2, 4.7), aspect="equal", xlabel="m", ylabel="m")
     return figure
 
 
@@ -198,24 +195,34 @@ def _city(dataset: Dataset) -> Figure:
     return figure
 
 
+#: What a curve shows, by how its name begins.
+WATCHED = (
+    ("cnn_", "street accuracy, LiDAR"), ("streetfix", "own view first of its batch"), ("googlenet", "median error (m)"),
+    ("PointNetLK", "median error (m)"), ("", "recall at 1 within 5 m"),
+)  # fmt: skip
+
+
 def _curves(results: Mapping[str, MethodResult]) -> Figure | None:
     shown = {
-        name: r
+        name: (r.curve, r.ended)
         for name, r in results.items()
-        if len(r.curve) > 1 and name not in ("cnn_knn", "cnn_softmax") and not name.startswith("cnn_softmax")
+        if len(r.curve) > 1 and name not in ("cnn_knn", *STAGES[1:]) and not name.startswith("cnn_softmax")
     }
+    if STAGES[-1] in results:
+        curve = [CurvePoint(**point) for point in results[STAGES[-1]].extra["pointnet_lk"]]
+        shown["PointNetLK"] = (curve, results[STAGES[-1]].ended)
     if not shown:
         return None
     columns = 3
     lines = -(-len(shown) // columns)
-    figure, grid = plt.subplots(lines, columns, figsize=(11, 2.6 * lines), squeeze=False)
-    for axes, (name, result) in zip(grid.ravel(), shown.items(), strict=False):
-        minutes = [point.processor_s / 60 for point in result.curve]
-        axes.plot(
-            minutes, [point.score for point in result.curve], color=OURS if name.startswith("streetfix") else THEIRS
-        )
-        axes.set_title(name, fontsize=9)
+    figure, grid = plt.subplots(lines, columns, figsize=(11, 2.7 * lines), squeeze=False)
+    for axes, (name, (curve, ended)) in zip(grid.ravel(), shown.items(), strict=False):
+        minutes, scores = [point.processor_s / 60 for point in curve], [abs(point.score) for point in curve]
+        axes.plot(minutes, scores, color=OURS if name.startswith("streetfix") else THEIRS)
+        axes.set_title(f"{name.removeprefix('cnn_knn_')} ({ended})", fontsize=9)
         axes.set_xlabel("processor minutes", fontsize=8)
+        axes.set_ylabel(next(what for begin, what in WATCHED if name.startswith(begin)), fontsize=8)
+        axes.set_ylim(bottom=0)
         _clean(axes)
     for axes in grid.ravel()[len(shown) :]:
         axes.axis("off")
@@ -241,7 +248,9 @@ def _errors(data: PaperData, results: Mapping[str, MethodResult]) -> Figure:
         each.set(xscale="log", xlabel="error (m)", title=DRIVES[split], ylim=(0, 1.01))
         _clean(each)
     axes[0].set_ylabel("share of queries within")
-    axes[0].legend(fontsize=7, loc="upper left")
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), fontsize=8, loc="lower center", ncols=5, bbox_to_anchor=(0.5, -0.1)
+    )
     return figure
 
 

@@ -36,6 +36,7 @@ PAPER_IMAGES_SHARE = 4 * 0.7  # four epochs over 70 % of the frames
 SHAPE = EncoderShape(columns=64, widths=(16, 32, 96, 160))
 
 PILOT_STEPS, PILOT_LEFT_OUT = 24, 8  # the first steps read the pack from disk
+MOST_STEPS = 4600  # after 4,521 the loss was 0.03 and 0.99 of the pairs were first in their batch (decision log): nothing is left to gain
 SPARED = 0.07  # of a budget: checkpoints, and a machine that is slower later than during the pilot
 
 
@@ -50,10 +51,11 @@ def config_as_paper(size: Size) -> TrainingConfig:
 
 
 def config_within(budget_s: float, pack: Path, config: TrainingConfig, run: Path) -> TrainingConfig:
-    """As many steps as a budget of processor time buys, told by a pilot; a run that has begun keeps its own number."""
+    """As many steps as a budget of processor time buys, told by a pilot, but no more than help; a run that began keeps its number."""
     if (run / "config.json").exists():
         return TrainingConfig.model_validate_json((run / "config.json").read_bytes())
-    return config.model_copy(update={"steps": max(1, int((1 - SPARED) * budget_s / seconds_a_step(pack, config)))})
+    bought = int((1 - SPARED) * budget_s / seconds_a_step(pack, config))
+    return config.model_copy(update={"steps": min(MOST_STEPS, max(1, bought))})
 
 
 def seconds_a_step(pack: Path, config: TrainingConfig) -> float:

@@ -196,6 +196,8 @@ def test_a_budget_buys_as_many_steps_as_a_pilot_says_and_a_run_that_began_keeps_
     config = config_within(100.0, tmp_path / "pack", TrainingConfig(), tmp_path / "run")
     assert config == TrainingConfig(steps=int((1 - ours.SPARED) * 200))
 
+    assert config_within(1e6, tmp_path / "pack", TrainingConfig(), tmp_path / "run").steps == ours.MOST_STEPS
+
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.json").write_text(config.model_dump_json())
     assert config_within(1e6, tmp_path / "pack", TrainingConfig(), tmp_path / "run") == config
