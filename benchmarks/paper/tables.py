@@ -86,7 +86,7 @@ def _head(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]:
         + (", ".join(f"`{c}`" for c in commits) or "-")
         + f", the page was written at `{head_commit()[:10]}`,",
         (
-            f"on {machine()}; {_machines(results)}the paper: Intel Core i5-8250U, 8 GB, MATLAB. CARLA is replaced by our simulator, so "
+            f"on {machine()}; {machines(results)}the paper: Intel Core i5-8250U, 8 GB, MATLAB. CARLA is replaced by our simulator, so "
             "figures compare methods on one city and not our city with theirs."
         ),
         (
@@ -96,7 +96,7 @@ def _head(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]:
     ]
 
 
-def _machines(results: Mapping[str, MethodResult]) -> str:
+def machines(results: Mapping[str, MethodResult]) -> str:
     """Where methods ran, where it was elsewhere; one of them a clause."""
     by_machine: dict[str, list[str]] = {}
     for result in results.values():
@@ -255,7 +255,7 @@ def _claims(results: Mapping[str, MethodResult], figures: Figures) -> list[str]:
     return lines
 
 
-_SETS = {
+SETS = {
     "lidar.same_drive": "LiDAR, same drive (30 %)", "lidar.other_drive": "LiDAR, other drive", "same_drive": "RGB-D, same drive",
     "other_drive": "RGB-D, other drive", "depth.other_drive": "depth alone, other drive",
 }  # fmt: skip
@@ -269,12 +269,12 @@ def _variants(results: Mapping[str, MethodResult]) -> list[str]:
         "## The paper's method, every way it can be meant", "",
         (f"Street accuracy by K-NN (k = 5) / by softmax, and K-NN's mean distance. "
         f"Answering the commonest class of the test images alone gives {max(TEST_IMAGES) / sum(TEST_IMAGES):.3f}."), "",
-        "| variant | " + " | ".join(_SETS.values()) + " | training (min) | images shown | ended |",
-        "|---|" + "---|" * (len(_SETS) + 3),
+        "| variant | " + " | ".join(SETS.values()) + " | training (min) | images shown | ended |",
+        "|---|" + "---|" * (len(SETS) + 3),
     ]  # fmt: skip
     for name, result in known.items():
         cells = []
-        for key in _SETS:
+        for key in SETS:
             each = result.extra["asked"][key]
             accuracy, mean = each["knn"][str(PAPER_K)]
             cells.append(f"{accuracy:.3f} / {each['softmax'][0]:.3f}, {mean:.1f} m")
@@ -283,13 +283,13 @@ def _variants(results: Mapping[str, MethodResult]) -> list[str]:
             + " | ".join(cells)
             + f" | {(result.training_s or 0) / 60:.1f} | {result.images:,} | {result.ended} |"
         )
-    return [*lines, "", *(f"- `{name}`: {WHAT[name]}." for name in known), "", *_verdicts(known)]
+    return [*lines, "", *(f"- `{name}`: {WHAT[name]}." for name in known), "", *verdicts(known)]
 
 
-def _verdicts(known: Mapping[str, MethodResult]) -> list[str]:
+def verdicts(known: Mapping[str, MethodResult]) -> list[str]:
     """What becomes of the paper's two claims: K-NN beats the network's own classifier, and PCA earns its place."""
     lines = []
-    for key, what in _SETS.items():
+    for key, what in SETS.items():
         asked = {name: result.extra["asked"][key] for name, result in known.items()}
         better = [name for name, each in asked.items() if each["knn"][str(PAPER_K)][0] > each["softmax"][0]]
         lines.append(
@@ -300,7 +300,7 @@ def _verdicts(known: Mapping[str, MethodResult]) -> list[str]:
         told = [
             f"{what} {known['converged'].extra['asked'][key]['knn'][str(PAPER_K)][0]:.3f} with, "
             f"{known['without_pca'].extra['asked'][key]['knn'][str(PAPER_K)][0]:.3f} without"
-            for key, what in _SETS.items()
+            for key, what in SETS.items()
         ]
         lines.append("- PCA, by K-NN: " + "; ".join(told) + ".")
     return lines
@@ -319,7 +319,7 @@ def _ks(results: Mapping[str, MethodResult]) -> list[str]:
         for key in ("lidar.same_drive", "lidar.other_drive", "other_drive"):
             each = result.extra["asked"][key]
             cells = [f"{each['softmax'][0]:.3f}", *(f"{each['knn'][str(k)][0]:.3f}" for k in KS)]
-            lines.append(f"| `{name}`, {_SETS[key]} | " + " | ".join(cells) + " |")
+            lines.append(f"| `{name}`, {SETS[key]} | " + " | ".join(cells) + " |")
     return lines
 
 

@@ -13,7 +13,7 @@ from benchmarks.paper.kept import MethodResult
 from benchmarks.paper.ours import config_as_paper, config_within
 from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import METHODS, PAPER_IMAGES, all_rows, errors_of, figures_of, minutes_for_paper_images
-from benchmarks.paper.tables import PAPER_MED_M, PAPER_MEDIAN, PAPER_MSE, TABLE_II
+from benchmarks.paper.tables import PAPER_MED_M, PAPER_MEDIAN, PAPER_MSE, SETS, TABLE_II, machines, verdicts
 from benchmarks.report import Report
 from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.learning import CurvePoint
@@ -212,3 +212,28 @@ def test_a_lidar_above_the_camera_looks_where_it_looks() -> None:
 
     assert heading_of_body(above) == pytest.approx(heading_of_camera(T_map_camera)) == pytest.approx(0.7)
     assert above[:3, 3] == pytest.approx([5.0, 6.0, 1.8])
+
+
+def asked_as(knn: float, softmax: float) -> dict[str, object]:
+    each = {"knn": {"5": [knn, 1.0]}, "softmax": [softmax, 1.0]}
+    return dict.fromkeys(SETS, each)
+
+
+def test_the_page_says_what_becomes_of_the_paper_s_two_claims() -> None:
+    with_pca = replace(result("cnn_knn_converged", 0, [0, 1, 2]), extra={"asked": asked_as(0.5, 0.4)})
+    without = replace(result("cnn_knn_without_pca", 0, [0, 1, 2]), extra={"asked": asked_as(0.3, 0.6)})
+
+    told = verdicts({"converged": with_pca, "without_pca": without})
+
+    assert told[0] == "- K-NN beats softmax, LiDAR, same drive (30 %): in 1 of 2 variants (`converged`)."
+    assert len(told) == len(SETS) + 1
+    assert "LiDAR, same drive (30 %) 0.500 with, 0.300 without" in told[-1]
+    assert not any("PCA" in line for line in verdicts({"converged": with_pca}))
+
+
+def test_the_page_says_which_methods_ran_elsewhere() -> None:
+    here, there = result("raw_range", 0, [0, 1, 2]), replace(result("fov_encoder", 0, [0, 1, 2]), machine="another")
+
+    assert machines({"raw_range": here}) == ""
+    assert machines({"raw_range": here, "fov_encoder": there}) == "`fov_encoder` on another; "
+    assert "not kept" in machines({"fov_encoder": replace(there, machine="")})
