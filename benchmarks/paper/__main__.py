@@ -87,7 +87,7 @@ def main() -> None:
         f"learned methods have up to {minutes:g} minutes of processor time each."
     )
     print(f"written: {report.write()}")
-    pictures = draw_figures(out / "paper", bench.data, results)
+    pictures = draw_figures(out / "paper", bench.data, results, figures, pace)
     print(f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures, minutes, pace)}")
 
 

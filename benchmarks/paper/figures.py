@@ -8,15 +8,16 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
 from benchmarks.paper.data import PaperData, test_set
 from benchmarks.paper.kept import MethodResult
+from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import errors_of
-from benchmarks.paper.tables import DRIVES, TITLES
+from benchmarks.paper.table_figures import INK, OURS, THEIRS, clean, table_one, table_three, table_two
+from benchmarks.paper.tables import DRIVES, TITLES, Figures
 from model_training.baselines.learning import CurvePoint
 from model_training.baselines.paper.knn import KS
 from model_training.baselines.paper.pictures import LidarPictures, fused_pictures
@@ -25,12 +26,13 @@ from model_training.datasets.dataset import Dataset, QueryFrame
 from service.imaging.fusion import fuse, picture_of
 from service.maps.streets import Streets
 
-INK, OURS, THEIRS = "#22303c", "#2a7f62", "#b5532a"
 COLOURS = ("#2a7f62", "#b5532a", "#3b6ea5", "#8a5aa8", "#c79a1b", "#5b6b7b", "#d1495b", "#4a8f9c")
 MAX_DEPTH_M = 40.0
 
 
-def draw_figures(folder: Path, data: PaperData, results: Mapping[str, MethodResult]) -> dict[str, str]:
+def draw_figures(
+    folder: Path, data: PaperData, results: Mapping[str, MethodResult], figures: Figures, pace: Pace | None = None
+) -> dict[str, str]:
     """Draw all that can be drawn; titles and paths relative to the page beside ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, str] = {}
@@ -50,15 +52,16 @@ def draw_figures(folder: Path, data: PaperData, results: Mapping[str, MethodResu
     keep("figure10", "Figure 10: training, what each method watches", _curves(results))
     keep("figure11", "Figure 11: RGB, depth, and both fused by IHS", _fused(data.dataset))
     keep("one_space", "One image space: the LiDAR's view (top) and the fused query on the view grid", _one_space(data))
+    keep("table1", "Table I as bars", table_one(data))
+    keep("table2", "Table II: every image of the five classes, medians as lines", table_two(data, results))
+    keep(
+        "table3",
+        "Table III as bars; the paper's as it prints them, on its own drive",
+        table_three(results, figures, pace),
+    )
     keep("errors", "Errors on another drive", _errors(data, results))
     keep("k", "K-NN by k, the softmax as dashes", _by_k(results))
     return drawn
-
-
-def _clean(axes: Axes) -> None:
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.grid(alpha=0.3)
 
 
 def _setup() -> Figure:
@@ -223,7 +226,7 @@ def _curves(results: Mapping[str, MethodResult]) -> Figure | None:
         axes.set_xlabel("processor minutes", fontsize=8)
         axes.set_ylabel(next(what for begin, what in WATCHED if name.startswith(begin)), fontsize=8)
         axes.set_ylim(bottom=0)
-        _clean(axes)
+        clean(axes)
     for axes in grid.ravel()[len(shown) :]:
         axes.axis("off")
     figure.tight_layout()
@@ -246,10 +249,10 @@ def _errors(data: PaperData, results: Mapping[str, MethodResult]) -> Figure:
                 lw=2.2 if name == "streetfix" else 1.3,
             )
         each.set(xscale="log", xlabel="error (m)", title=DRIVES[split], ylim=(0, 1.01))
-        _clean(each)
+        clean(each)
     axes[0].set_ylabel("share of queries within")
     figure.legend(
-        *axes[0].get_legend_handles_labels(), fontsize=8, loc="lower center", ncols=5, bbox_to_anchor=(0.5, -0.1)
+        *axes[0].get_legend_handles_labels(), fontsize=8, loc="lower center", ncols=5, bbox_to_anchor=(0.5, -0.16)
     )
     return figure
 
@@ -277,7 +280,7 @@ def _by_k(results: Mapping[str, MethodResult]) -> Figure | None:
             )
             each.axhline(told["softmax"][0], color=COLOURS[k], ls="--", lw=0.9)
         each.set(title=title, xlabel="k", ylim=(0, 1.02))
-        _clean(each)
+        clean(each)
     axes[0].set_ylabel("street accuracy")
     axes[-1].legend(fontsize=7)
     return figure

@@ -157,23 +157,26 @@ def _table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str
     street = np.asarray(test.street)
     errors = {name: errors_of(results[name].answers["other_drive"], test) for name in shown}
     rng = np.random.default_rng(0)
+    told: list[list[float]] = []  # a row a case
     for name, printed in TABLE_II:
         rows = np.flatnonzero(street == CLASS_NAMES.index(name))
-        cells = [name, f"{printed}"]
-        one = int(rng.choice(rows)) if len(rows) else None
+        if not len(rows):
+            lines.append(f"| {name} | {printed} |" + " - |" * (4 * len(shown)))
+            continue
+        one = int(rng.choice(rows))
+        of_case = [printed]
         for method in shown:
             e = errors[method][rows]
-            cells += (
-                ["-"] * 4
-                if one is None
-                else [
-                    f"{errors[method][one]:.3f}",
-                    f"{e.mean():.3f}",
-                    f"{np.median(e):.3f}",
-                    f"{np.square(e).mean():.3f}",
-                ]
-            )
-        lines.append("| " + " | ".join(cells) + " |")
+            of_case += [errors[method][one], e.mean(), float(np.median(e)), np.square(e).mean()]
+        told.append(of_case)
+        lines.append(f"| {name} | {printed} | " + " | ".join(f"{value:.3f}" for value in of_case[1:]) + " |")
+    for title, of in (("mean of the cases", np.mean), ("median of the cases", np.median)):
+        over = of(np.array(told), axis=0) if told else []
+        lines.append(
+            f"| {title} | "
+            + " | ".join(f"{value:.4g}" if k == 0 else f"{value:.3f}" for k, value in enumerate(over))
+            + " |"
+        )
     column = np.array([value for _, value in TABLE_II])
     least = PAPER_MED_M**2
     return [
