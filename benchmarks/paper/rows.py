@@ -10,6 +10,7 @@ from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.paper.pace import Pace
 from benchmarks.report import Report
 from model_training.baselines.answers import PlaceAnswers
+from model_training.baselines.paper.knn import PAPER_K
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.baselines.regression.locate import STAGES
 from model_training.evaluation.error_measures import (
@@ -94,7 +95,22 @@ def all_rows(
                 f"paper.{method}.minutes_for_paper_images", minutes, "min", bar=bar, better="lower", n=PAPER_IMAGES,
                 why=how + ("; the bar is the fastest learned method's" if bar else ""),
             )  # fmt: skip
+    for method, result in results.items():
+        if method.startswith("cnn_knn_"):
+            _rows_of_other_pictures(report, method.removeprefix("cnn_knn_"), result)
     return found
+
+
+def _rows_of_other_pictures(report: Report, variant: str, result: MethodResult) -> None:
+    """What a variant reaches where its queries are not RGB-D: LiDAR frames, the paper's split among them, and depth alone."""
+    for key in ("lidar.same_drive", "lidar.other_drive", "depth.same_drive", "depth.other_drive"):
+        asked = result.extra["asked"][key]
+        for method, (accuracy, mean_m) in (("cnn_knn", asked["knn"][str(PAPER_K)]), ("cnn_softmax", asked["softmax"])):
+            row, n = f"paper.{method}_{variant}.{key.replace('.', '_')}", asked["n"]
+            report.row(
+                f"{row}.street_accuracy", accuracy, "share", n=n, ci95=list(wilson_interval(round(accuracy * n), n))
+            )
+            report.row(f"{row}.mean_distance_error_m", mean_m, "m", n=n)
 
 
 def _rows_of(

@@ -219,6 +219,24 @@ def asked_as(knn: float, softmax: float) -> dict[str, object]:
     return dict.fromkeys(SETS, each)
 
 
+def test_lidar_queries_of_the_paper_s_network_have_rows_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = {key: {**each, "n": 3} for key, each in asked_as(0.5, 0.4).items()} | {
+        "depth.same_drive": {"knn": {"5": [0.2, 9.0]}, "softmax": [0.1, 8.0], "n": 3}
+    }
+    report = Report("paper", "make paper", folder=tmp_path)
+
+    all_rows(report, {"cnn_knn_converged": replace(result("cnn_knn_converged", 0, [0, 1, 2]), extra={"asked": asked})},
+             TESTS, dict.fromkeys(METHODS, "not run yet"))  # fmt: skip
+
+    rows = {row["id"]: row for row in report.rows}
+    assert rows["paper.cnn_knn_converged.lidar_same_drive.street_accuracy"]["value"] == 0.5
+    assert rows["paper.cnn_softmax_converged.lidar_other_drive.street_accuracy"]["value"] == 0.4
+    assert rows["paper.cnn_knn_converged.depth_same_drive.mean_distance_error_m"]["value"] == 9.0
+    capsys.readouterr()
+
+
 def test_the_page_says_what_becomes_of_the_paper_s_two_claims() -> None:
     with_pca = replace(result("cnn_knn_converged", 0, [0, 1, 2]), extra={"asked": asked_as(0.5, 0.4)})
     without = replace(result("cnn_knn_without_pca", 0, [0, 1, 2]), extra={"asked": asked_as(0.3, 0.6)})
