@@ -7,11 +7,13 @@ import numpy as np
 
 from benchmarks.paper.data import PaperData
 from benchmarks.paper.kept import SPLITS, MethodResult
+from benchmarks.paper.ours import MOST_STEPS, SHAPE
 from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import errors_of, minutes_for_paper_images
 from benchmarks.report import head_commit, machine
 from model_training.baselines.paper.cnn import layer_table
 from model_training.baselines.paper.knn import KS, PAPER_K
+from model_training.baselines.paper.train import PATIENCE, CnnPlan
 from model_training.baselines.paper.variants import WHAT
 from model_training.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PRINTED, PAPER_FRAMES, TEST_IMAGES
 
@@ -334,6 +336,10 @@ def _how(budget_minutes: float) -> list[str]:
         (f"- The others have up to {budget_minutes:g} minutes of processor time each, or end when what they watch (stretches of "
         "street, or pairs, of the "
         "training drives that they are not shown) stops gaining."),
+        (f"- The paper's network, where it is trained on: SGDM at {CnnPlan('aligned').rate:g} in batches of {CnnPlan('aligned').batch}, a fifth of "
+        f"the rate whenever {PATIENCE} quarters of an epoch bring no gain, ended by the third such rest; the best state answers."),
+        (f"- Ours: views of {SHAPE.rows} x {SHAPE.columns} cells and layers of {', '.join(map(str, SHAPE.widths))} channels, half the shipped "
+        f"encoder's columns and narrower, since it must know one city alone; it ends after {MOST_STEPS:,} steps of 256 images at the latest."),
         ("- Pairs: half ride on the survey's own drive, half on another with other vehicles, both directions, up to 2 m aside. Same-drive "
         "queries stand on the survey's track among its vehicles; other-drive ones come from a drive that nothing was learnt from."),
         "- `cnn_knn` and `cnn_softmax` are the variants that do best on training pairs kept aside; no test was looked at to choose.",
