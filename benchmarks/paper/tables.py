@@ -329,6 +329,7 @@ def _ks(results: Mapping[str, MethodResult]) -> list[str]:
 
 
 def _how(budget_minutes: float) -> list[str]:
+    plan = CnnPlan("aligned")
     return [
         "## How it was read", "",
         ("- 84 iterations in 4 epochs of 21 over 70 % of 46,741 frames make batches of 1,558 (summed over parts of 128). SGDM, rate 3e-4, "
@@ -336,10 +337,11 @@ def _how(budget_minutes: float) -> list[str]:
         (f"- The others have up to {budget_minutes:g} minutes of processor time each, or end when what they watch (stretches of "
         "street, or pairs, of the "
         "training drives that they are not shown) stops gaining."),
-        (f"- The paper's network, where it is trained on: SGDM at {CnnPlan('aligned').rate:g} in batches of {CnnPlan('aligned').batch}, a fifth of "
-        f"the rate whenever {PATIENCE} quarters of an epoch bring no gain, ended by the third such rest; the best state answers."),
-        (f"- Ours: views of {SHAPE.rows} x {SHAPE.columns} cells and layers of {', '.join(map(str, SHAPE.widths))} channels, half the shipped "
-        f"encoder's columns and narrower, since it must know one city alone; it ends after {MOST_STEPS:,} steps of 256 images at the latest."),
+        (f"- The paper's network, where it is trained on: SGDM at {plan.rate:g} in batches of {plan.batch}, a fifth of the rate whenever "
+        f"{PATIENCE} quarters of an epoch bring no gain, ended by the third such rest; the best state answers."),
+        (f"- Ours: views of {SHAPE.rows} x {SHAPE.columns} cells and layers of {', '.join(map(str, SHAPE.widths))} channels, half the "
+        "shipped encoder's columns and narrower, since it must know one city alone; it ends after "
+        f"{MOST_STEPS:,} steps of 256 images at the latest."),
         ("- Pairs: half ride on the survey's own drive, half on another with other vehicles, both directions, up to 2 m aside. Same-drive "
         "queries stand on the survey's track among its vehicles; other-drive ones come from a drive that nothing was learnt from."),
         "- `cnn_knn` and `cnn_softmax` are the variants that do best on training pairs kept aside; no test was looked at to choose.",
