@@ -58,6 +58,11 @@ class Split:
     watched: NDArray[np.int64]
     tested: NDArray[np.int64]
 
+    @property
+    def known(self) -> NDArray[np.int64]:
+        """The paper's 70 %: what K-NN may find."""
+        return np.sort(np.concatenate([self.learnt, self.watched]))
+
 
 def split_of(total: int) -> Split:
     """The paper's random 70/30 split; stretches of the drive that stopping is decided on are taken from the 70 %."""
@@ -73,7 +78,7 @@ def split_of(total: int) -> Split:
 
 
 def shown_pairs(total: int) -> NDArray[np.int64]:
-    """Rows of the training pairs that are learnt from; every twentieth is kept aside, to choose among variants."""
+    """Rows of the training pairs that are learnt from; every twentieth is kept aside, to end a training and to choose among variants."""
     rows = np.arange(total, dtype=np.int64)
     shown: NDArray[np.int64] = rows[rows % 20 != 0]
     return shown
@@ -93,8 +98,7 @@ class CnnTrainer:
         self.plan, self.frames, self.pairs = plan, frames, pairs
         self.split = split_of(len(frames))
         # As printed nothing is chosen by what is watched: all of the 70 % is learnt from, some of the 30 % is watched.
-        all_learnt = np.sort(np.concatenate([self.split.learnt, self.split.watched]))
-        self._learnt = all_learnt if plan.as_paper else self.split.learnt
+        self._learnt = self.split.known if plan.as_paper else self.split.learnt
         self._watched = self.split.tested[::WATCHED_EACH] if plan.as_paper else self.split.watched
         self.pictures = LidarPictures(frames, plan.space)
         self.training = Training(
@@ -185,6 +189,13 @@ class CnnTrainer:
         return pictures, street
 
     def _watched_accuracy(self) -> float:
+        """Of stretches of street that are not shown; of pairs that are not shown, where pairs are learnt from."""
+        if self.plan.pairs_too and self.pairs is not None:
+            pairs, aside = self.pairs, aside_pairs(len(self.pairs))
+            _, scores = outputs(
+                self.net, lambda chosen: fused_pictures(pairs, aside[chosen], self.plan.space), len(aside)
+            )
+            return float((scores.argmax(axis=1) == pairs.street[aside]).mean())
         rows = self._watched
         _, scores = outputs(self.net, lambda chosen: self.pictures.of(rows[chosen]), len(rows))
         return float((scores.argmax(axis=1) == self.frames.street[rows]).mean())

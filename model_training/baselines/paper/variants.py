@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.learning import CurvePoint, Report
 from model_training.baselines.paper.cnn import CLASSES, PaperCnn
-from model_training.baselines.paper.knn import KS, PAPER_K, Gallery, class_centres
+from model_training.baselines.paper.knn import KS, Gallery, class_centres
 from model_training.baselines.paper.pictures import LidarPictures, Pictures, fused_pictures
 from model_training.baselines.paper.train import CnnPlan, CnnTrainer, Split, aside_pairs, outputs, shown_pairs
 from model_training.baselines.paper_data.frames import Frames
@@ -87,7 +87,7 @@ def run_variant(
     )
     split, pictures = trainer.split, trainer.pictures
     gallery = _gallery(net, pictures, split, pairs if plan.pairs_too else None)
-    centres = class_centres(frames.T_map_lidar[split.learnt, :2, 3], frames.street[split.learnt], CLASSES)
+    centres = class_centres(frames.T_map_lidar[split.known, :2, 3], frames.street[split.known], CLASSES)
     asked: dict[str, Asked] = {}
 
     def ask(key: str, kind: str, drawn: Callable[[NDArray[np.int64]], Pictures], xy: NDArray[np.float64],
@@ -117,8 +117,8 @@ def run_variant(
 
 
 def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs | None) -> Gallery:
-    """Features of the frames learnt from; views look both ways along the street. Pairs learnt from are known places too."""
-    frames, rows = pictures.frames, split.learnt
+    """Features of the paper's 70 %; views look both ways along the street. Pairs learnt from are known places too."""
+    frames, rows = pictures.frames, split.known
     headings = (0.0, np.pi) if pictures.space == "view" else (0.0,)
     features, xy, street = [], [], []
     for heading in headings:
@@ -142,11 +142,3 @@ def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs 
 def street_accuracy(answers: PlaceAnswers, asked: Asked) -> float:
     """Share of queries whose class is right; an unanswered one is wrong."""
     return float((answers.street == asked.truth_street).mean())
-
-
-def best_variant(variants: Mapping[str, Variant]) -> str:
-    """The variant that answers the pairs kept aside best by K-NN (k = 5): chosen without a look at the tests."""
-    return max(
-        variants,
-        key=lambda name: street_accuracy(variants[name].asked["aside"].knn[PAPER_K], variants[name].asked["aside"]),
-    )
