@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -136,6 +137,12 @@ def machine() -> str:
 def head_commit() -> str:
     """The commit that is checked out."""
     return _git("rev-parse", "HEAD")
+
+
+@cache
+def loaded_commit() -> str:
+    """The commit that was checked out when this was first asked in this process: that of the code that runs, if asked early."""
+    return head_commit()
 
 
 def _git(*arguments: str) -> str:

@@ -24,11 +24,6 @@ _PEERS = (
     "16 % dearer; of the 1.2 that a service adds to the bare retrieval nearly all would have to go"
 )
 WHY_MISSED: dict[str, str] = {
-    "paper.streetfix.minutes_for_paper_images": (
-        "two threads beside other work, which spend processor time on waiting for each other; the others had one thread. Alike, one "
-        "thread each in half precision, it is 5.8 minutes against 3.7 of the encoder with a field of view, whose 4 x 4 patches are less"
-        " work a picture than our trunk"
-    ),
     "raw.unseen.precise.recall_at_1_5m": (
         "asked as our own method asks, levelled and at three turns; seen straight on, as the prototype asked (0.29), it finds as many as "
         "raw.unseen.precise.straight says; tried: cities of 600 x 400 m (raw.large: 0.46, ours 0.987; four hard conditions would miss "

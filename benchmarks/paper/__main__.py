@@ -14,9 +14,9 @@ from benchmarks.paper.figures import draw_figures
 from benchmarks.paper.kept import MethodResult
 from benchmarks.paper.methods import RUNS, Bench
 from benchmarks.paper.pace import Pace, measure_pace
+from benchmarks.paper.page import write_page
 from benchmarks.paper.rows import METHODS, all_rows
-from benchmarks.paper.tables import write_page
-from benchmarks.report import REPORTS, ROOT, Report
+from benchmarks.report import REPORTS, ROOT, Report, loaded_commit
 from model_training.cli.progress import bars
 
 PACE = "pace"  # beside the methods: what each takes for the same number of images
@@ -64,23 +64,24 @@ def main() -> None:
     pace_file = out / "paper" / "pace.json"
     done = work / "done"
     done.mkdir(parents=True, exist_ok=True)
+    loaded_commit()
     report = Report(
         "paper", "make paper" + (' ARGS="' + " ".join(sys.argv[1:]) + '"' if sys.argv[1:] else ""), folder=out
     )
     wanted = [] if arguments.tables else arguments.only or [*RUNS, PACE]
     for name in wanted:
-        if not arguments.anew and (done / name).exists():
+        if not arguments.anew and (pace_file if name == PACE else done / name).exists():
             continue
         print(f"--- {name}", flush=True)
         if name == PACE:
             with bars() as show:
                 measure_pace(bench.data, show).save(pace_file)
-        else:
-            for result in RUNS[name](bench):
-                result.save(bench.kept)
+            continue
+        for result in RUNS[name](bench):
+            result.save(bench.kept)
         (done / name).touch()
-    results, pace = kept_results(bench), Pace.load(pace_file)
-    missing = dict.fromkeys((*METHODS, "cnn_knn"), "not run yet")
+    results, pace = kept_results(bench), Pace.read(pace_file)
+    missing = dict.fromkeys(METHODS, "not run yet")
     figures = all_rows(report, results, bench.data.tests, missing, pace)
     report.notes["size"] = (
         f"{size.frames} LiDAR frames, {size.pairs} RGB-D pairs, {len(bench.data.tests['other_drive'])} test images a split; "
@@ -88,7 +89,9 @@ def main() -> None:
     )
     print(f"written: {report.write()}")
     pictures = draw_figures(out / "paper", bench.data, results, figures, pace)
-    print(f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures, minutes, pace)}")
+    print(
+        f"written: {write_page(out / 'paper.md', bench.data, results, figures, pictures, report.rows, minutes, pace)}"
+    )
 
 
 if __name__ == "__main__":

@@ -34,11 +34,23 @@ class Size:
     test_images: int | None = None
 
 
+def made_minutes(folder: Path) -> float:
+    """Minutes of wall time between the first and the last of a folder's files: what it took to make, pauses included."""
+    times = [path.stat().st_mtime for path in folder.rglob("*") if path.is_file()]
+    return (max(times) - min(times)) / 60 if times else 0.0
+
+
 class PaperData:
     """Frames, pairs and tests of one size, made when first asked for; what is finished is reused."""
 
     def __init__(self, work: Path, size: Size) -> None:
         self.work, self.size = work, size
+
+    def made_minutes(self) -> dict[str, float]:
+        """Minutes of wall time that making each part took."""
+        frames, dataset = self.work / f"frames-{self.size.frames}", self.dataset.folder
+        return {"LiDAR frames": made_minutes(frames), "RGB-D pairs, tests and survey": made_minutes(dataset),
+                "small pictures of the pairs": made_minutes(self.work / f"pairs-{self.size.pairs}")}  # fmt: skip
 
     @cached_property
     def frames(self) -> Frames:

@@ -26,7 +26,7 @@ from model_training.datasets.dataset import Dataset, QueryFrame
 from service.imaging.fusion import fuse, picture_of
 from service.maps.streets import Streets
 
-COLOURS = ("#2a7f62", "#b5532a", "#3b6ea5", "#8a5aa8", "#c79a1b", "#5b6b7b", "#d1495b", "#4a8f9c")
+COLOURS = ("#2a7f62", "#b5532a", "#3b6ea5", "#8a5aa8", "#c79a1b", "#5b6b7b", "#d1495b", "#4a8f9c", "#1b1b1b", "#e08fb0")
 MAX_DEPTH_M = 40.0
 
 
@@ -59,7 +59,7 @@ def draw_figures(
         "Table III as bars; the paper's as it prints them, on its own drive",
         table_three(results, figures, pace),
     )
-    keep("errors", "Errors on another drive", _errors(data, results))
+    keep("errors", "Errors on both drives", _errors(data, results))
     keep("k", "K-NN by k, the softmax as dashes", _by_k(results))
     return drawn
 
@@ -213,7 +213,7 @@ def _curves(results: Mapping[str, MethodResult]) -> Figure | None:
     }
     if STAGES[-1] in results:
         curve = [CurvePoint(**point) for point in results[STAGES[-1]].extra["pointnet_lk"]]
-        shown["PointNetLK"] = (curve, results[STAGES[-1]].ended)
+        shown["PointNetLK"] = (curve, results[STAGES[-1]].extra.get("pointnet_lk_ended", "budget"))
     if not shown:
         return None
     columns = 3

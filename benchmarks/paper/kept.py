@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import head_commit, machine
+from benchmarks.report import loaded_commit, machine
 from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.learning import CurvePoint
 
@@ -41,7 +41,7 @@ class MethodResult:
     ended: str = "nothing is learnt"
     curve: list[CurvePoint] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
-    commit: str = field(default_factory=head_commit)
+    commit: str = field(default_factory=loaded_commit)
     machine: str = field(default_factory=machine)
 
     @property

@@ -122,6 +122,7 @@ def regression(bench: Bench) -> list[MethodResult]:
             data.pairs, data.dataset.folder, data.tests, folder, budget_s=bench.budget_s, report=report
         )
     pose, lk = found.trainings["googlenet"], found.trainings["pointnet_lk"]
+    later = {"pointnet_lk": [asdict(p) for p in read_curve(lk.curve)], "pointnet_lk_ended": lk.ended}
     results = []
     for stage in STAGES:
         costs = [pose] if stage == "googlenet" else [pose, lk]
@@ -129,7 +130,7 @@ def regression(bench: Bench) -> list[MethodResult]:
         results.append(
             MethodResult(
                 stage, answers, sum(c.processor_s for c in costs), sum(c.images for c in costs), data.size.pairs,
-                pose.ended, read_curve(pose.curve), {"pointnet_lk": [asdict(p) for p in read_curve(lk.curve)]},
+                pose.ended, read_curve(pose.curve), later,
             )
         )  # fmt: skip
     return results

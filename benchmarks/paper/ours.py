@@ -5,7 +5,6 @@ images as the paper's 84 iterations show its CNN; both of the same frames and pa
 seen this city. Every map is built as any user builds one; every answer counts, accepted or not.
 """
 
-import json
 import tempfile
 import time
 from pathlib import Path
@@ -16,7 +15,7 @@ from benchmarks.paper.data import PaperData, Size, test_set
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.runs import MAPPING, code_hash
 from model_training.baselines.answers import PlaceAnswers
-from model_training.baselines.learning import CurvePoint, one_thread
+from model_training.baselines.learning import CURVE, CurvePoint, one_thread, read_curve, write_curve
 from model_training.cli.progress import bars
 from model_training.evaluation.predict import predict
 from model_training.mapping.build import BuildSettings, build_map
@@ -66,14 +65,18 @@ def seconds_a_step(pack: Path, config: TrainingConfig) -> float:
     return (seen[-1] - seen[PILOT_LEFT_OUT]) / (PILOT_STEPS - 1 - PILOT_LEFT_OUT)
 
 
-def pack_of(data: PaperData) -> Path:
-    """The comparison's frames and pairs as a training pack with the columns of ``SHAPE``: every second one of the shared data's."""
-    folder = data.work / f"pack2-paper-0-{data.size.frames}x{data.size.pairs}-{SHAPE.columns}"
+def pack_of(data: PaperData, shape: EncoderShape) -> Path:
+    """The comparison's frames and pairs as a training pack with the columns of an encoder: all of the shared data's, or every second one.
+
+    Every second column of a query lies a quarter of a column to the left of where a grid of half the columns has its own: less
+    than the turns that training draws.
+    """
+    folder = data.work / f"pack2-paper-0-{data.size.frames}x{data.size.pairs}-{shape.columns}"
     if folder.exists():
         return folder
     part = folder.with_name(folder.name + ".part")
     frames, pairs = data.frames, data.pairs
-    every = ViewGrid().columns // SHAPE.columns
+    every = ViewGrid().columns // shape.columns
     part.mkdir(parents=True, exist_ok=True)
     arrays = {
         "panoramas": frames.panoramas[..., ::every], "intensities": frames.intensities[..., ::every], "places": frames.places,
@@ -89,33 +92,38 @@ def pack_of(data: PaperData) -> Path:
 def streetfix(data: PaperData, budget_s: float | None) -> MethodResult:
     """Train on the comparison's data within a budget, None: on the paper's number of images; build the map, answer both tests."""
     method = "streetfix_as_paper" if budget_s is None else "streetfix"
-    run, curve, pack = data.work / "runs" / method, list[CurvePoint](), pack_of(data)
-    config = config_as_paper(data.size)
+    run, config = data.work / "runs" / method, config_as_paper(data.size)
+    pack = pack_of(data, config.encoder)
     if budget_s is not None:
         config = config_within(budget_s, pack, config, run)
-    spent = run / "processor_s.json"
-    before: float = json.loads(spent.read_text()) if spent.exists() else 0.0
-    began = time.process_time()
+    path = run / CURVE
+    curve = read_curve(path)
+    before, began = (curve[-1].processor_s if curve else 0.0), time.process_time()
 
     def note(progress: Progress) -> None:
+        """A point of the curve; what was noted after the checkpoint that a run goes on from is left out, its time is not."""
         if progress.step % 10 == 0 or progress.step == progress.steps:
-            images = progress.step * 2 * config.pairs
-            curve.append(CurvePoint(images, before + time.process_time() - began, progress.loss, progress.accuracy))
+            images, spent = progress.step * 2 * config.pairs, before + time.process_time() - began
+            curve[:] = [point for point in curve if point.images < images]
+            curve.append(CurvePoint(images, spent, progress.loss, progress.accuracy))
+            write_curve(path, curve)
         show("training", progress.step, progress.steps)
 
-    try:
-        with one_thread(), bars() as show:
-            train([pack], run, config, device="cpu", report=note)
-    finally:
-        if run.exists():
-            spent.write_text(json.dumps(before + time.process_time() - began) + "\n")
+    with one_thread(), bars() as show:
+        train([pack], run, config, device="cpu", report=note)
     encoder = run / "encoder.onnx"
     if not encoder.exists():
         export(load_run(run), encoder)
-    training_s: float = json.loads(spent.read_text())
+    shape = config.encoder
+    told = {
+        "cells": [shape.rows, shape.columns],
+        "widths": list(shape.widths),
+        "steps": config.steps,
+        "pairs": config.pairs,
+    }
     return MethodResult(
-        method, _answers(data, encoder), training_s, config.steps * 2 * config.pairs, data.size.frames + data.size.pairs,
-        f"{config.steps} steps", curve,
+        method, _answers(data, encoder), curve[-1].processor_s, config.steps * 2 * config.pairs,
+        data.size.frames + data.size.pairs, f"{config.steps} steps", curve, told,
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ cannot be compared. So the comparison of training times is a run of its own: som
 """
 
 import json
+import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -17,7 +18,7 @@ import torch
 
 from benchmarks.paper.data import PaperData, Size
 from benchmarks.paper.ours import config_as_paper, pack_of, seconds_a_step
-from benchmarks.report import head_commit, machine
+from benchmarks.report import loaded_commit, machine
 from model_training.baselines.dual import learn
 from model_training.baselines.dual.pictures import Sweeps, pictures_of
 from model_training.baselines.gallery import thinned
@@ -26,19 +27,25 @@ from model_training.baselines.paper.train import CnnTrainer
 from model_training.baselines.paper.variants import PLANS
 from model_training.baselines.regression.pictures import MapFrame
 from model_training.baselines.regression.train_pose import PoseLearner, PoseSettings
+from model_training.training.encoder_net import EncoderShape
 from service.imaging.view_grid import ViewGrid
 
 ROUNDS, LEAST_S = 5, 3.0  # of processor time of each method in a round, at least
+WARM_UP = 5  # steps that do not count: caches are cold, buffers are not there yet
 Measure = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Processor seconds an image by method, a value a round; where and at which commit they were measured."""
+    """Processor seconds an image by method, a value a round; where and at which commit they were measured.
+
+    ``load``: processes that wanted a core, on average over a minute, before and after (1 is this one alone).
+    """
 
     seconds_an_image: Mapping[str, list[float]]
+    load: tuple[float, float] = (0.0, 0.0)
     machine: str = field(default_factory=machine)
-    commit: str = field(default_factory=head_commit)
+    commit: str = field(default_factory=loaded_commit)
 
     def minutes(self, method: str, images: int) -> float | None:
         """Processor minutes for so many images, by the median round; None for a method that was not measured."""
@@ -53,9 +60,20 @@ class Pace:
         part.rename(path)
 
     @staticmethod
-    def load(path: Path) -> "Pace | None":
+    def read(path: Path) -> "Pace | None":
         """What was kept, or None."""
-        return Pace(**json.loads(path.read_text())) if path.exists() else None
+        if not path.exists():
+            return None
+        told = json.loads(path.read_text())
+        return Pace(**told | {"load": tuple(told["load"])})
+
+    def to_the_quickest(self) -> list[float]:
+        """Ours against the quickest of all other methods, round by round: under 1 it is the quicker."""
+        others = [times for name, times in self.seconds_an_image.items() if not name.startswith("streetfix")]
+        return [
+            ours / min(of)
+            for ours, of in zip(self.seconds_an_image["streetfix"], zip(*others, strict=True), strict=True)
+        ]
 
 
 def measure_pace(data: PaperData, report: Callable[[str, int, int], None]) -> Pace:
@@ -66,6 +84,7 @@ def measure_pace(data: PaperData, report: Callable[[str, int, int], None]) -> Pa
     that all runs.
     """
     rounds, least_s = (ROUNDS, LEAST_S) if data.size == Size() else (1, 0.0)
+    before = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder, one_thread():
         methods = _methods(data, Path(folder), least_s)
         found: dict[str, list[float]] = {name: [] for name in methods}
@@ -73,13 +92,15 @@ def measure_pace(data: PaperData, report: Callable[[str, int, int], None]) -> Pa
             for number, (name, measure) in enumerate(methods.items()):
                 found[name].append(measure())
                 report("pace", turn * len(methods) + number + 1, rounds * len(methods))
-    return Pace(found)
+    return Pace(found, (before, os.getloadavg()[0]))
 
 
 def _methods(data: PaperData, folder: Path, least_s: float) -> dict[str, Measure]:
     config = config_as_paper(data.size)
+    stock = config.model_copy(update={"encoder": EncoderShape()})
     methods: dict[str, Measure] = {
-        "streetfix": lambda: seconds_a_step(pack_of(data), config) / (2 * config.pairs),
+        "streetfix": lambda: seconds_a_step(pack_of(data, config.encoder), config) / (2 * config.pairs),
+        "streetfix_stock_shape": lambda: seconds_a_step(pack_of(data, stock.encoder), stock) / (2 * stock.pairs),
         "googlenet": partial(_timed, _googlenet(data), least_s),
         "dual_encoder": partial(_timed, _towers(data, "dual"), least_s),
         "fov_encoder": partial(_timed, _towers(data, "fov"), least_s),
@@ -91,8 +112,9 @@ def _methods(data: PaperData, folder: Path, least_s: float) -> dict[str, Measure
 
 
 def _timed(step: Callable[[], int], least_s: float) -> float:
-    """Seconds an image of steps that give their number of images; the first one, which finds caches cold, does not count."""
-    step()
+    """Seconds an image of steps that give their number of images."""
+    for _ in range(WARM_UP if least_s else 1):
+        step()
     began, images = time.process_time(), 0
     while images == 0 or time.process_time() - began < least_s:
         images += step()

@@ -1,19 +1,13 @@
-"""``reports/paper.md``: the paper's tables with its figures beside ours."""
+"""The paper's tables with its figures beside ours, as Markdown."""
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.paper.data import PaperData
 from benchmarks.paper.kept import SPLITS, MethodResult
-from benchmarks.paper.ours import MOST_STEPS, SHAPE
 from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import errors_of, minutes_for_paper_images
-from benchmarks.report import head_commit, machine
-from model_training.baselines.paper.cnn import layer_table
-from model_training.baselines.paper.knn import KS, PAPER_K
-from model_training.baselines.paper.train import PATIENCE, CnnPlan
 from model_training.baselines.paper.variants import WHAT
 from model_training.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PRINTED, PAPER_FRAMES, TEST_IMAGES
 
@@ -39,79 +33,21 @@ TITLES = {
 Figures = Mapping[str, Mapping[str, Mapping[str, float]]]
 
 
-def write_page(
-    path: Path,
-    data: PaperData,
-    results: Mapping[str, MethodResult],
-    figures: Figures,
-    pictures: Mapping[str, str],
-    budget_minutes: float,
-    pace: Pace | None = None,
-) -> Path:
-    """Write the page and say where it is."""
-    parts = [
-        _head(data, results),
-        _table_one(data),
-        _pictures(pictures),
-        _network(),
-        _table_two(data, results),
-        _table_three(results, figures, pace),
-        _claims(results, figures),
-        _variants(results),
-        _ks(results),
-        _how(budget_minutes),
-    ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(line for part in parts for line in [*part, ""]))
-    return path
-
-
-def _title(method: str, results: Mapping[str, MethodResult]) -> str:
+def title(method: str, results: Mapping[str, MethodResult]) -> str:
     """A method's title; of the paper's, which variant it is, of how many that have run."""
     title, variant = TITLES[method], results[method].method.removeprefix(f"{method}_")
     if variant == results[method].method:
         return title
     ran = sum(f"{method}_{name}" in results for name in WHAT)
     return (
-        f"{title} (`{variant}`, the best of {ran} variants that have run)"
+        f"{title} (`{variant}`, chosen of {ran} on pairs kept aside)"
         if ran > 1
         else f"{title} (`{variant}`, no other has run)"
     )
 
 
-def _head(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]:
-    commits = sorted({result.commit[:10] for result in results.values()})
-    return [
-        "# The paper, reproduced",
-        "",
-        "Made by `make paper`; none of it is typed by hand. Methods ran at commit "
-        + (", ".join(f"`{c}`" for c in commits) or "-")
-        + f", the page was written at `{head_commit()[:10]}`,",
-        (
-            f"on {machine()}; {machines(results)}the paper: Intel Core i5-8250U, 8 GB, MATLAB. CARLA is replaced by our simulator, so "
-            "figures compare methods on one city and not our city with theirs."
-        ),
-        (
-            f"Data: {data.size.frames:,} LiDAR frames, {data.size.pairs:,} RGB-D pairs to learn from, "
-            f"{len(data.tests['other_drive'])} test images a split."
-        ),
-    ]
-
-
-def machines(results: Mapping[str, MethodResult]) -> str:
-    """Where methods ran, where it was elsewhere; one of them a clause."""
-    by_machine: dict[str, list[str]] = {}
-    for result in results.values():
-        by_machine.setdefault(result.machine, []).append(result.method)
-    clauses = [
-        f"{', '.join(f'`{m}`' for m in dict.fromkeys(methods))} on {name or 'a machine that was not kept'}; "
-        for name, methods in sorted(by_machine.items())
-        if name != machine()
-    ]
-    return "".join(clauses)
-
-
-def _table_one(data: PaperData) -> list[str]:
+def table_one(data: PaperData) -> list[str]:
+    """Frames and test images of each class."""
     frames = np.bincount(np.asarray(data.frames.street), minlength=16)
     tests = {split: np.bincount(np.asarray(data.tests[split].street), minlength=16) for split in SPLITS}
     lines = [
@@ -130,23 +66,8 @@ def _table_one(data: PaperData) -> list[str]:
     return lines
 
 
-def _pictures(pictures: Mapping[str, str]) -> list[str]:
-    lines = ["## Figures 4 to 8, 10 and 11", ""]
-    for title, picture in pictures.items():
-        lines += [f"**{title}**", "", f"![{title}]({picture})", ""]
-    return lines[:-1]
-
-
-def _network() -> list[str]:
-    lines = [
-        "## Figure 9: the network", "",
-        "The figure's text names no layer. Counted are the types that the paper counts by: convolution, pooling, full connection.", "",
-        "| layer | does | output |", "|---|---|---|",
-    ]  # fmt: skip
-    return lines + [f"| {number} | {does} | {out} |" for number, does, out in layer_table()]
-
-
-def _table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]:
+def table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]:
+    """The five cases, one image and all images, and what is wrong with the printed column."""
     shown = [name for name in ("cnn_knn", "streetfix") if name in results]
     lines = [
         "## Table II: five cases", "",
@@ -191,16 +112,17 @@ def _table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str
     ]  # fmt: skip
 
 
-def _table_three(results: Mapping[str, MethodResult], figures: Figures, pace: Pace | None) -> list[str]:
+def table_three(results: Mapping[str, MethodResult], figures: Figures, pace: Pace | None) -> list[str]:
+    """Errors, streets and training of every method."""
     lines = [
         "## Table III: methods", "",
-        ("Queries are RGB-D pairs. Training time is processor time of all cores; making the data is not in it (nor is it in the paper's). "
+        ("Queries are RGB-D pairs. Training time is processor time of all cores; making the data is not in it, drawing batches is. "
         f"*At the paper's images*: for the 130,875 images that its 84 iterations show, {_paced(pace)}."), "",
         ("| method | mean error, other drive (m) | median (m) | street, other drive | mean error, same drive (m) "
         "| street, same drive | training (min) | at the paper's images (min) | training set |"),
         "|---|---|---|---|---|---|---|---|---|",
-        "| ICP + PointNetLK + GoogLeNet, as the paper prints | 30.3 | - | - | - | - | 4200 | - | 7600 |",
-        "| CNN + PCA + K-NN, as the paper prints | 0.804 | - | 0.9752 (its drive) | - | - | 138 | 138 | 46741 |",
+        "| ICP + PointNetLK + GoogLeNet, as the paper prints | - | - | - | 30.3 | - | 4200 | - | 7600 |",
+        "| CNN + PCA + K-NN, as the paper prints | - | - | - | 0.804 | 0.9752 | 138 | 138 | 46741 |",
     ]  # fmt: skip
     for method in TITLES:
         if method not in figures:
@@ -208,11 +130,12 @@ def _table_three(results: Mapping[str, MethodResult], figures: Figures, pace: Pa
         other, own, result = figures[method]["other_drive"], figures[method]["same_drive"], results[method]
         minutes = minutes_for_paper_images(method, result, pace)
         spent = "beforehand" if result.training_s is None else f"{result.training_s / 60:.1f}"
+        learnt_from = "26 other cities" if result.training_s is None else str(result.training_set)
         lines.append(
-            f"| {_title(method, results)} | {other['mean_distance_error_m']:.3f} | {other['median_distance_error_m']:.3f} "
+            f"| {title(method, results)} | {other['mean_distance_error_m']:.3f} | {other['median_distance_error_m']:.3f} "
             f"| {other['street_accuracy']:.4f} "
             f"| {own['mean_distance_error_m']:.3f} | {own['street_accuracy']:.4f} | {spent} "
-            f"| {'-' if minutes is None else f'{minutes:.1f}'} | {result.training_set} |"
+            f"| {'-' if minutes is None else f'{minutes:.1f}'} | {learnt_from} |"
         )
     return lines
 
@@ -225,126 +148,3 @@ def _paced(pace: Pace | None) -> str:
         f"by steps of all methods in turn within one run ({rounds} rounds, medians; {pace.machine}, one thread each, commit "
         f"`{pace.commit[:10]}`); of the paper's baseline its first network alone"
     )
-
-
-def _claims(results: Mapping[str, MethodResult], figures: Figures) -> list[str]:
-    lines = [
-        "## 97.52 % and 0.804 m",
-        "",
-        "| | paper | " + " | ".join(DRIVES[s] for s in SPLITS) + " |",
-        "|---|---|---|---|",
-    ]
-    for method in ("cnn_knn", "streetfix"):
-        if method in figures:
-            each = [figures[method][split] for split in SPLITS]
-            accuracy, mean = "97.52 %" if method == "cnn_knn" else "", "0.804 m" if method == "cnn_knn" else ""
-            lines.append(
-                f"| {_title(method, results)}: street | {accuracy} | "
-                + " | ".join(f"{100 * e['street_accuracy']:.2f} %" for e in each)
-                + " |"
-            )
-            lines.append(
-                f"| {_title(method, results)}: mean distance | {mean} | "
-                + " | ".join(f"{e['mean_distance_error_m']:.3f} m" for e in each)
-                + " |"
-            )
-    printed = results.get("cnn_knn_as_printed")
-    if printed is not None:
-        asked = printed.extra["asked"]["lidar.same_drive"]
-        accuracy, mean = asked["knn"][str(PAPER_K)]
-        lines += [
-            "", ("What the 97.52 % can have been: LiDAR frames of the same drive, a random 30 % of them, asked of the other 70 %, whose "
-            f"nearest stand centimetres away. That gives {100 * accuracy:.2f} % and {mean:.3f} m here (K-NN, {asked['n']} frames), by the "
-            f"softmax {100 * asked['softmax'][0]:.2f} %. It holds no RGB-D image and no other drive."),
-        ]  # fmt: skip
-    return lines
-
-
-SETS = {
-    "lidar.same_drive": "LiDAR, same drive (30 %)", "lidar.other_drive": "LiDAR, other drive", "same_drive": "RGB-D, same drive",
-    "other_drive": "RGB-D, other drive", "depth.other_drive": "depth alone, other drive",
-}  # fmt: skip
-
-
-def _variants(results: Mapping[str, MethodResult]) -> list[str]:
-    known = {name: results[f"cnn_knn_{name}"] for name in WHAT if f"cnn_knn_{name}" in results}
-    if not known:
-        return []
-    lines = [
-        "## The paper's method, every way it can be meant", "",
-        (f"Street accuracy by K-NN (k = 5) / by softmax, and K-NN's mean distance. "
-        f"Answering the commonest class of the test images alone gives {max(TEST_IMAGES) / sum(TEST_IMAGES):.3f}."), "",
-        "| variant | " + " | ".join(SETS.values()) + " | training (min) | images shown | ended |",
-        "|---|" + "---|" * (len(SETS) + 3),
-    ]  # fmt: skip
-    for name, result in known.items():
-        cells = []
-        for key in SETS:
-            each = result.extra["asked"][key]
-            accuracy, mean = each["knn"][str(PAPER_K)]
-            cells.append(f"{accuracy:.3f} / {each['softmax'][0]:.3f}, {mean:.1f} m")
-        lines.append(
-            f"| `{name}` | "
-            + " | ".join(cells)
-            + f" | {(result.training_s or 0) / 60:.1f} | {result.images:,} | {result.ended} |"
-        )
-    return [*lines, "", *(f"- `{name}`: {WHAT[name]}." for name in known), "", *verdicts(known)]
-
-
-def verdicts(known: Mapping[str, MethodResult]) -> list[str]:
-    """What becomes of the paper's two claims: K-NN beats the network's own classifier, and PCA earns its place."""
-    lines = []
-    for key, what in SETS.items():
-        asked = {name: result.extra["asked"][key] for name, result in known.items()}
-        better = [name for name, each in asked.items() if each["knn"][str(PAPER_K)][0] > each["softmax"][0]]
-        lines.append(
-            f"- K-NN beats softmax, {what}: in {len(better)} of {len(asked)} variants"
-            + (f" ({', '.join(f'`{n}`' for n in better)})." if 0 < len(better) < len(asked) else ".")
-        )
-    if {"converged", "without_pca"} <= set(known):
-        told = [
-            f"{what} {known['converged'].extra['asked'][key]['knn'][str(PAPER_K)][0]:.3f} with, "
-            f"{known['without_pca'].extra['asked'][key]['knn'][str(PAPER_K)][0]:.3f} without"
-            for key, what in SETS.items()
-        ]
-        lines.append("- PCA, by K-NN: " + "; ".join(told) + ".")
-    return lines
-
-
-def _ks(results: Mapping[str, MethodResult]) -> list[str]:
-    known = {name: results[f"cnn_knn_{name}"] for name in WHAT if f"cnn_knn_{name}" in results}
-    if not known:
-        return []
-    lines = ["## K-NN against softmax, k from 1 to 21", "", "Street accuracy; the paper takes k = 5.", ""]
-    lines += [
-        "| variant, queries | softmax | " + " | ".join(f"k={k}" for k in KS) + " |",
-        "|---|" + "---|" * (len(KS) + 1),
-    ]
-    for name, result in known.items():
-        for key in ("lidar.same_drive", "lidar.other_drive", "other_drive"):
-            each = result.extra["asked"][key]
-            cells = [f"{each['softmax'][0]:.3f}", *(f"{each['knn'][str(k)][0]:.3f}" for k in KS)]
-            lines.append(f"| `{name}`, {SETS[key]} | " + " | ".join(cells) + " |")
-    return lines
-
-
-def _how(budget_minutes: float) -> list[str]:
-    plan = CnnPlan("aligned")
-    return [
-        "## How it was read", "",
-        ("- 84 iterations in 4 epochs of 21 over 70 % of 46,741 frames make batches of 1,558 (summed over parts of 128). SGDM, rate 3e-4, "
-        "momentum 0.9."),
-        (f"- The others have up to {budget_minutes:g} minutes of processor time each, or end when what they watch (stretches of "
-        "street, or pairs, of the "
-        "training drives that they are not shown) stops gaining."),
-        (f"- The paper's network, where it is trained on: SGDM at {plan.rate:g} in batches of {plan.batch}, a fifth of the rate whenever "
-        f"{PATIENCE} quarters of an epoch bring no gain, ended by the third such rest; the best state answers."),
-        (f"- Ours: views of {SHAPE.rows} x {SHAPE.columns} cells and layers of {', '.join(map(str, SHAPE.widths))} channels, half the "
-        "shipped encoder's columns and narrower, since it must know one city alone; it ends after "
-        f"{MOST_STEPS:,} steps of 256 images at the latest."),
-        ("- Pairs: half ride on the survey's own drive, half on another with other vehicles, both directions, up to 2 m aside. Same-drive "
-        "queries stand on the survey's track among its vehicles; other-drive ones come from a drive that nothing was learnt from."),
-        "- `cnn_knn` and `cnn_softmax` are the variants that do best on training pairs kept aside; no test was looked at to choose.",
-        ("- K-NN's position is that of the nearest frame of the class that wins; the softmax is taken to answer the middle of its class. "
-        "A query without an answer counts with the middle of all places."),
-    ]  # fmt: skip

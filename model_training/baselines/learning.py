@@ -133,9 +133,7 @@ class Training:
             torch.save(dict(state), part)
             part.rename(self.folder / name)
         self.curve.append(point)
-        part = self.folder / "curve.part"
-        part.write_text("".join(json.dumps(asdict(each)) + "\n" for each in self.curve))
-        part.rename(self.folder / CURVE)
+        write_curve(self.folder / CURVE, self.curve)
         return point
 
     def checkpoint(self) -> dict[str, Any] | None:
@@ -166,6 +164,13 @@ def read_curve(path: Path) -> list[CurvePoint]:
     if not path.exists():
         return []
     return [CurvePoint(**json.loads(line)) for line in path.read_text().splitlines()]
+
+
+def write_curve(path: Path, curve: Sequence[CurvePoint]) -> None:
+    """Write the points of a run, whole or not at all."""
+    part = path.with_suffix(".part")
+    part.write_text("".join(json.dumps(asdict(each)) + "\n" for each in curve))
+    part.rename(path)
 
 
 Report = Callable[[str, int, int], None]  # stage, done, of; here: a method, and per mille of its budget

@@ -1,0 +1,126 @@
+"""``reports/paper.md``: all of the comparison on one page."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.paper.claims import by_k, claims, variants
+from benchmarks.paper.data import PaperData
+from benchmarks.paper.kept import MethodResult
+from benchmarks.paper.ours import MOST_STEPS, SHAPE
+from benchmarks.paper.pace import Pace
+from benchmarks.paper.tables import Figures, table_one, table_three, table_two
+from benchmarks.report import head_commit
+from model_training.baselines.paper.cnn import layer_table
+from model_training.baselines.paper.train import PATIENCE, CnnPlan
+from model_training.baselines.regression.train_pose import PoseSettings
+
+Rows = Sequence[Mapping[str, Any]]  # of the report
+
+
+def write_page(
+    path: Path,
+    data: PaperData,
+    results: Mapping[str, MethodResult],
+    figures: Figures,
+    pictures: Mapping[str, str],
+    rows: Rows,
+    budget_minutes: float,
+    pace: Pace | None = None,
+) -> Path:
+    """Write the page and say where it is."""
+    parts = [
+        _head(data),
+        _bars(rows),
+        table_one(data),
+        _pictures(pictures),
+        _network(),
+        table_two(data, results),
+        table_three(results, figures, pace),
+        claims(results, figures),
+        variants(results),
+        by_k(results),
+        _how(budget_minutes),
+        _runs(results, pace),
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(line for part in parts for line in [*part, ""]))
+    return path
+
+
+def _head(data: PaperData) -> list[str]:
+    made = "; ".join(f"{what} {minutes:.0f}" for what, minutes in data.made_minutes().items())
+    return [
+        "# The paper, reproduced",
+        "",
+        f"Made by `make paper` at commit `{head_commit()[:10]}`; none of it is typed by hand. The paper's machine: Intel Core",
+        "i5-8250U, 8 GB, MATLAB; ours are named under *Runs*. CARLA is replaced by our simulator, so figures compare methods on one",
+        "city and not our city with theirs.",
+        "",
+        f"Data: {data.size.frames:,} LiDAR frames, {data.size.pairs:,} RGB-D pairs to learn from, {len(data.tests['other_drive'])} test",
+        f"images a split. Making them is in no method's training time; minutes of wall time on two cores beside other work: {made}.",
+    ]
+
+
+def _bars(rows: Rows) -> list[str]:
+    """What ours must reach, as the report says it."""
+    lines = [
+        "## What ours must do", "",
+        "Lead every method on another drive, lie within the interval of the best on the survey's own, and train in fewer minutes for",
+        "the same images.", "",
+        "| row | ours | bar | holds |", "|---|---|---|---|",
+    ]  # fmt: skip
+    for row in rows:
+        if "bar" in row:
+            value = "-" if row["value"] is None else f"{row['value']:.4g}"
+            sign = "<=" if row["better"] == "lower" else ">="
+            lines.append(
+                f"| `{row['id']}` | {value} {row['unit']} | {sign} {row['bar']:.4g} | {'yes' if row['holds'] else '**no**'} |"
+            )
+    return lines
+
+
+def _pictures(pictures: Mapping[str, str]) -> list[str]:
+    lines = ["## Figures 4 to 8, 10 and 11, and the tables as plots", ""]
+    for title, picture in pictures.items():
+        lines += [f"**{title}**", "", f"![{title}]({picture})", ""]
+    return lines[:-1]
+
+
+def _network() -> list[str]:
+    lines = [
+        "## Figure 9: the network", "",
+        "The figure's text names no layer. Counted are the types that the paper counts by: convolution, pooling, full connection.", "",
+        "| layer | does | output |", "|---|---|---|",
+    ]  # fmt: skip
+    return lines + [f"| {number} | {does} | {out} |" for number, does, out in layer_table()]
+
+
+def _how(budget_minutes: float) -> list[str]:
+    plan = CnnPlan("aligned")
+    text = Path(__file__).with_name("how_read.md").read_text()
+    told = text.format(
+        budget=budget_minutes, rate=plan.rate, batch=plan.batch, patience=PATIENCE, rows=SHAPE.rows, columns=SHAPE.columns,
+        widths=", ".join(map(str, SHAPE.widths)), side=PoseSettings().side, steps=MOST_STEPS,
+    )  # fmt: skip
+    return told.rstrip().split("\n")
+
+
+def _runs(results: Mapping[str, MethodResult], pace: Pace | None) -> list[str]:
+    """Where each method's figures come from, and what the run in turn measured."""
+    lines = ["## Runs", "", "| method | commit | machine | training ended by |", "|---|---|---|---|"]
+    for name, result in results.items():
+        if name not in ("cnn_knn", "cnn_softmax"):  # stand for one of their variants
+            lines.append(f"| `{name}` | `{result.commit[:10]}` | {result.machine or 'not kept'} | {result.ended} |")
+    if pace is None:
+        return lines
+    ratios = pace.to_the_quickest()
+    lines += [
+        "", (f"Steps of all learned methods in turn: commit `{pace.commit[:10]}`, {pace.machine}, load {pace.load[0]:.1f} before and "
+        f"{pace.load[1]:.1f} after. Ours to the quickest other method, round by round: "
+        f"{', '.join(f'{ratio:.2f}' for ratio in ratios)}."), "",
+        "| method | milliseconds an image, each round |", "|---|---|",
+    ]  # fmt: skip
+    for name, times in pace.seconds_an_image.items():
+        lines.append(f"| `{name}` | {', '.join(f'{1000 * each:.2f}' for each in times)} |")
+    return lines
