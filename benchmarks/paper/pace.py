@@ -98,23 +98,27 @@ def measure_pace(data: PaperData, report: Callable[[str, int, int], None]) -> Pa
 def _methods(data: PaperData, folder: Path, least_s: float) -> dict[str, Measure]:
     config = config_as_paper(data.size)
     stock = config.model_copy(update={"encoder": EncoderShape()})
+
+    def warm(step: Callable[[], int]) -> Measure:
+        for _ in range(WARM_UP if least_s else 1):
+            step()
+        return partial(_timed, step, least_s)
+
     methods: dict[str, Measure] = {
         "streetfix": lambda: seconds_a_step(pack_of(data, config.encoder), config) / (2 * config.pairs),
         "streetfix_stock_shape": lambda: seconds_a_step(pack_of(data, stock.encoder), stock) / (2 * stock.pairs),
-        "googlenet": partial(_timed, _googlenet(data), least_s),
-        "dual_encoder": partial(_timed, _towers(data, "dual"), least_s),
-        "fov_encoder": partial(_timed, _towers(data, "fov"), least_s),
+        "googlenet": warm(_googlenet(data)),
+        "dual_encoder": warm(_towers(data, "dual")),
+        "fov_encoder": warm(_towers(data, "fov")),
     }
     for name, plan in PLANS.items():
         trainer = CnnTrainer(plan, data.frames, data.pairs if plan.pairs_too else None, folder / name, budget_s=60.0)
-        methods[f"cnn_{name}"] = partial(_timed, partial(_cnn_step, trainer), least_s)
+        methods[f"cnn_{name}"] = warm(partial(_cnn_step, trainer))
     return methods
 
 
 def _timed(step: Callable[[], int], least_s: float) -> float:
     """Seconds an image of steps that give their number of images."""
-    for _ in range(WARM_UP if least_s else 1):
-        step()
     began, images = time.process_time(), 0
     while images == 0 or time.process_time() - began < least_s:
         images += step()
