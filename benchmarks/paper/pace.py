@@ -30,8 +30,8 @@ from model_training.baselines.regression.train_pose import PoseLearner, PoseSett
 from model_training.training.encoder_net import EncoderShape
 from service.imaging.view_grid import ViewGrid
 
-ROUNDS, LEAST_S = 5, 3.0  # of processor time of each method in a round, at least
-WARM_UP = 5  # steps that do not count: caches are cold, buffers are not there yet
+ROUNDS, LEAST_S = 3, 3.0  # of processor time of each method in a round, at least
+WARM_UP = 3  # steps that do not count: caches are cold, buffers are not there yet
 Measure = Callable[[], float]
 
 
