@@ -200,7 +200,7 @@ def _city(dataset: Dataset) -> Figure:
 
 #: What a curve shows, by how its name begins.
 WATCHED = (
-    ("cnn_", "street accuracy, LiDAR"), ("streetfix", "own view first of its batch"), ("googlenet", "median error (m)"),
+    ("cnn_knn_one_space_both", "street accuracy, pairs"), ("cnn_", "street accuracy, LiDAR"), ("streetfix", "own view first of its batch"), ("googlenet", "median error (m)"),
     ("PointNetLK", "median error (m)"), ("", "recall at 1 within 5 m"),
 )  # fmt: skip
 
@@ -282,5 +282,5 @@ def _by_k(results: Mapping[str, MethodResult]) -> Figure | None:
         each.set(title=title, xlabel="k", ylim=(0, 1.02))
         clean(each)
     axes[0].set_ylabel("street accuracy")
-    axes[-1].legend(fontsize=7)
+    axes[-1].legend(fontsize=7, loc="center right", bbox_to_anchor=(1.0, 0.33))
     return figure
