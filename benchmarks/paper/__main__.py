@@ -87,6 +87,9 @@ def main() -> None:
         f"{size.frames} LiDAR frames, {size.pairs} RGB-D pairs, {len(bench.data.tests['other_drive'])} test images a split; "
         f"learned methods have up to {minutes:g} minutes of processor time each."
     )
+    report.notes["runs"] = "; ".join(
+        f"{name} at {result.commit[:10]}, {result.machine or 'machine not kept'}" for name, result in results.items()
+    )
     print(f"written: {report.write()}")
     pictures = draw_figures(out / "paper", bench.data, results, figures, pace)
     print(

@@ -200,8 +200,9 @@ def _city(dataset: Dataset) -> Figure:
 
 #: What a curve shows, by how its name begins.
 WATCHED = (
-    ("cnn_knn_one_space_both", "street accuracy, pairs"), ("cnn_", "street accuracy, LiDAR"), ("streetfix", "own view first of its batch"), ("googlenet", "median error (m)"),
-    ("PointNetLK", "median error (m)"), ("", "recall at 1 within 5 m"),
+    ("cnn_knn_one_space_both", "street accuracy, pairs"), ("cnn_", "street accuracy, LiDAR"),
+    ("streetfix", "own view first of its batch"), ("googlenet", "median error (m)"), ("PointNetLK", "median error (m)"),
+    ("", "recall at 1 within 5 m"),
 )  # fmt: skip
 
 
