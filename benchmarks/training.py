@@ -136,7 +136,9 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "bench")
     parser.add_argument("--steps", type=int, default=60)
     part = parser.add_mutually_exclusive_group()
-    part.add_argument("--no-walls", action="store_true", help="leave out the demo and the tests, the longest part; their rows stay")
+    part.add_argument(
+        "--no-walls", action="store_true", help="leave out the demo and the tests, the longest part; their rows stay"
+    )
     part.add_argument("--only", choices=WALLS, help="this alone, on a fresh clone; the other rows stay")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
