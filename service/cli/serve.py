@@ -59,7 +59,7 @@ def command(
     ] = False,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.03]"),
+        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
     ] = None,
 ) -> None:
     """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
