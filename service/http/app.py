@@ -11,7 +11,6 @@ from service.contract.oscp import GeoPoseRequest
 from service.http import problems
 from service.http.asking import Asking
 from service.http.auth import AuthMiddleware
-from service.http.direct import DirectMiddleware
 from service.http.request_id import RequestIdMiddleware
 from service.http.routes import answers, console, drawing, explain, health, localize, maps, oscp, samples
 from service.runtime.engine import Engine
@@ -37,8 +36,7 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
         title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False, docs_url=None, redoc_url=None
     )  # fmt: skip
     asking = Asking(engine)
-    localizing = localize.router_for(asking)
-    app.include_router(localizing)
+    app.include_router(localize.router_for(asking))
     app.include_router(oscp.router_for(asking))
     app.include_router(maps.router_for(engine))
     app.include_router(health.router_for(engine, version))
@@ -47,7 +45,6 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
             app.include_router(routes)
         for routes in (samples.router_for(engine.settings), answers.router_for(engine)):
             app.include_router(routes)
-    app.add_middleware(DirectMiddleware, router=localizing)
     if keys is not None:
         app.add_middleware(AuthMiddleware, keys=keys)
     app.add_middleware(
