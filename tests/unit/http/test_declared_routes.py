@@ -1,6 +1,7 @@
 """Every route is declared once: what is added to its declaration holds for what it answers."""
 
 from collections.abc import Callable
+from functools import partial
 
 import httpx
 import pytest
@@ -25,16 +26,9 @@ def refuse() -> None:
 def test_a_dependency_of_a_localizing_route_is_honoured(
     engine: Engine, app_client: AppClient, parts_of: Parts, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
-    declared = localize.router_for
-
-    def guarded(asking: Asking) -> APIRouter:
-        router = APIRouter()
-        router.include_router(declared(asking), dependencies=[Depends(refuse)])
-        return router
-
     files = {name: (name, data) for name, data in parts_of().items()}
     assert app_client(create_app(engine)).post(path, files=files).status_code != 403
-    monkeypatch.setattr(localize, "router_for", guarded)
+    monkeypatch.setattr(localize, "APIRouter", partial(APIRouter, dependencies=[Depends(refuse)]))
     refused = app_client(create_app(engine)).post(path, files=files)
     assert (refused.status_code, refused.json()["code"]) == (403, "forbidden")
 
