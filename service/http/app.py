@@ -11,9 +11,11 @@ from service.contract.oscp import GeoPoseRequest
 from service.http import problems
 from service.http.asking import Asking
 from service.http.auth import AuthMiddleware
+from service.http.host_check import HostMiddleware
 from service.http.request_id import RequestIdMiddleware
 from service.http.routes import answers, console, drawing, explain, health, localize, maps, oscp, samples
 from service.runtime.engine import Engine
+from service.runtime.hosts import AllowedHosts
 from service.runtime.keys import KeyRing
 
 _DESCRIPTION = """Street, position and heading of one RGB and one depth picture against a LiDAR map.
@@ -47,11 +49,24 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
             app.include_router(routes)
     if keys is not None:
         app.add_middleware(AuthMiddleware, keys=keys)
+    app.add_middleware(HostMiddleware, hosts=AllowedHosts.of(engine.settings))
     app.add_middleware(
         RequestIdMiddleware, requested=engine.metrics.requested, tracing=engine.tracing
     )  # outermost: the last one added
     problems.install(app)
     app.openapi = lambda: _openapi_of(app)  # type: ignore[method-assign]  # FastAPI's documented way
+    return app
+
+
+def create_health_app(engine: Engine) -> FastAPI:
+    """What the health port serves: ``/livez`` and ``/readyz``, and ``/metrics`` if the settings say so. Nobody needs a key there."""
+    wanted = {"/livez", "/readyz"} | ({"/metrics"} if engine.settings.health_metrics else set())
+    app = FastAPI(openapi_url=None, redirect_slashes=False)
+    router = health.router_for(engine, installed_version("streetfix"))
+    router.routes = [route for route in router.routes if getattr(route, "path", None) in wanted]
+    app.include_router(router)
+    app.add_middleware(RequestIdMiddleware, requested=engine.metrics.requested, tracing=engine.tracing)
+    problems.install(app)
     return app
 
 
