@@ -11,6 +11,7 @@ StreetfixError                     code            kind
 ├── UnknownMapError                unknown-map     not_found    no map of that name is mounted
 ├── UnknownSampleError              unknown-sample  not_found    no sample pair of that name lies beside the maps
 ├── NoPoseError                    no-pose         not_found    no sure pose, asked for in a format that has no word for doubt
+├── NotLocalizedError              not-localized   not_found    a pose is wanted of an answer that is not LOCALIZED
 ├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
 ├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
 ├── ForbiddenError                 forbidden       forbidden    the caller may ask, but not change what the service does
@@ -34,7 +35,7 @@ StreetfixError                     code            kind
 No number of HTTP or gRPC stands here: each face has one table over ``kind``.
 """
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 Kind = Literal[
     "invalid", "unsupported", "too_large", "not_found", "unauthorized", "forbidden", "busy", "deadline", "not_ready"
@@ -121,6 +122,22 @@ class NoPoseError(StreetfixError):
 
     code = "no-pose"
     kind = "not_found"
+
+
+class NotLocalizedError(StreetfixError):
+    """A pose is wanted of an answer that is not LOCALIZED, so that it has none.
+
+    Args:
+        message: for people.
+        answer: the whole answer, a ``service.contract.schema.LocalizeAnswer``; its hypotheses are not confirmed.
+    """
+
+    code = "not-localized"
+    kind = "not_found"
+
+    def __init__(self, message: str, *, answer: Any) -> None:
+        super().__init__(message)
+        self.answer = answer
 
 
 class NotGeoreferencedError(StreetfixError):
