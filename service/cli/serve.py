@@ -158,11 +158,14 @@ def _answer_by_workers(settings: "Settings") -> None:
             ):
                 _answer(shared, listener, health, choices=Choices(choices), ready=ready, says_where=number == 0)
 
-        def fell(pid: int) -> None:
+        def ended(pid: int) -> None:
             for path in counts.glob(f"gauge_live*_{pid}.db"):  # what it had in hand it has no more
                 path.unlink(missing_ok=True)
 
-        code = supervise(settings.workers, work, fell=fell)
+        # Requests and streams each end within the grace; what still runs long after it hangs.
+        code = supervise(
+            settings.workers, work, ended=ended, kill_after_s=settings.drain_s + 2 * settings.grace_s + 10.0
+        )
     if code:
         raise typer.Exit(code)
 
@@ -293,6 +296,9 @@ def _watching(engine: "Engine") -> Iterator[None]:
     watcher = MapWatcher(engine.registry, engine.settings.maps, warm=engine.warm, after=engine.follow_choices)
     watcher.start(engine.settings.watch_s or threading.TIMEOUT_MAX)
     before = signal.signal(signal.SIGHUP, lambda *_: watcher.look_now()) if hasattr(signal, "SIGHUP") else None
+    signal.pthread_sigmask(
+        signal.SIG_UNBLOCK, {signal.SIGHUP}
+    )  # one that came while the maps were opened is handled now
     try:
         yield
     finally:
