@@ -79,10 +79,6 @@ WHY_MISSED: dict[str, str] = {
         "run, whose largest was 0.047 m, the median was 0.9 mm, 5 differed by more than 1 cm, and the answers were no worse (0.019 and "
         "0.050 m off at the largest difference)"
     ),
-    "soak.slope_mib_per_hour": (
-        "measured while other work shared both cores, which is also why requests were refused; not told apart yet: memory that the "
-        "process keeps, and pages of the mapped files that it touches late; next: anonymous memory alone, on an idle machine"
-    ),
     "cpu_over_bare.full.rest": _OVER_BARE,
     "cpu_over_bare.full.grpc": _OVER_BARE,
     "cpu_over_bare.retrieval.rest": _OVER_BARE,
