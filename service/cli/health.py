@@ -7,20 +7,28 @@ import urllib.request
 
 import typer
 
+from service.cli.tls_options import Ca, Cert, Key
 from service.errors import UnreachableError
 
 _TIMEOUT_S = 2.0
 
 
-def command() -> None:
+def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
     """Ask the service that STREETFIX_* describes, on this machine, whether it is ready: leaves with 0 or 1.
+
+    Without --ca any certificate will do, since the service is on this machine. A service that asks for client certificates is only
+    asked if --cert and --key are given, else it has to listen.
 
     Example: STREETFIX_PORT=8000 streetfix health
     """
+    from service.client.tls import ClientTls
     from service.runtime.settings import load_settings
 
     settings = load_settings(insecure_public=True)  # what is asked here is not what is served
-    if settings.tls_client_ca is not None:  # it would ask for a certificate: that it listens must do
+    tls = ClientTls.of(ca, cert, key)
+    if (
+        settings.tls_client_ca is not None and tls.cert is None
+    ):  # it would ask for a certificate: that it listens must do
         try:
             socket.create_connection(("127.0.0.1", settings.port), timeout=_TIMEOUT_S).close()
         except OSError as error:
@@ -29,8 +37,10 @@ def command() -> None:
     scheme = "http" if settings.tls_certificate is None else "https"
     context = None
     if scheme == "https":  # its own certificate names the outside, not loopback
-        context = ssl.create_default_context()
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        context = tls.context()
+        context.check_hostname = False
+        if not tls.is_wanted or tls.ca is None:
+            context.verify_mode = ssl.CERT_NONE
     url = f"{scheme}://127.0.0.1:{settings.port}/readyz"
     try:
         urllib.request.urlopen(url, timeout=_TIMEOUT_S, context=context).close()  # noqa: S310  # of our own making
