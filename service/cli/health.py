@@ -28,7 +28,7 @@ def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
     tls = ClientTls.of(ca, cert, key)
     if (
         settings.tls_client_ca is not None and tls.cert is None
-    ):  # it would ask for a certificate: that it listens must do
+    ):  # without a certificate only that it listens can be seen
         try:
             socket.create_connection(("127.0.0.1", settings.port), timeout=_TIMEOUT_S).close()
         except OSError as error:

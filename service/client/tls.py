@@ -114,7 +114,8 @@ class ClientTls:
         else:
             context = httpx.create_ssl_context(trust_env=False)
         if self.cert is not None and self.key is not None:
-            self.cert.read(), self.key.read()  # OpenSSL does not say which of the two it cannot read
+            for file in (self.cert, self.key):  # OpenSSL does not say which of the two it cannot read
+                file.read()
             try:
                 context.load_cert_chain(self.cert.path, self.key.path, password=_no_password)
             except _EncryptedKeyError as error:
