@@ -25,12 +25,16 @@ def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
     from service.runtime.settings import load_settings
 
     settings = load_settings(insecure_public=True)  # what is asked here is not what is served
+    if settings.health_port is not None:
+        _ask(f"http://{_address(settings.health_host or settings.host)}:{settings.health_port}/readyz", None)
+        return
     tls = ClientTls.of(ca, cert, key)
+    address = _address(settings.host)
     if (
         settings.tls_client_ca is not None and tls.cert is None
     ):  # without a certificate only that it listens can be seen
         try:
-            socket.create_connection(("127.0.0.1", settings.port), timeout=_TIMEOUT_S).close()
+            socket.create_connection((address.strip("[]"), settings.port), timeout=_TIMEOUT_S).close()
         except OSError as error:
             raise UnreachableError(f"nothing listens on port {settings.port} ({error})") from error
         return
@@ -41,9 +45,18 @@ def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
         context.check_hostname = False
         if not tls.is_wanted or tls.ca is None:
             context.verify_mode = ssl.CERT_NONE
-    url = f"{scheme}://127.0.0.1:{settings.port}/readyz"
+    _ask(f"{scheme}://{address}:{settings.port}/readyz", context)
+
+
+def _ask(url: str, context: ssl.SSLContext | None) -> None:
     try:
         urllib.request.urlopen(url, timeout=_TIMEOUT_S, context=context).close()  # noqa: S310  # of our own making
     except (OSError, urllib.error.URLError) as error:
         raise UnreachableError(f"{url}: not ready ({error})") from error
     typer.echo("ready")
+
+
+def _address(host: str) -> str:
+    """Where a service that listens on a host is reached from this machine, as in a URL."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  # a question, nothing is bound
+    return f"[{host}]" if ":" in host else host
