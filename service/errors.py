@@ -25,7 +25,8 @@ StreetfixError                     code            kind
 ├── EncoderError                   encoder         not_ready    an encoder file is missing or is not an encoder of ours
 ├── UnreachableError               unreachable     not_ready    a service does not answer
 │   ├── NoAnswerInTimeError        no-answer       not_ready    a service was asked, and the caller's time ended
-│   └── ForeignServiceError        foreign         not_ready    what answers speaks another language
+│   ├── ForeignServiceError        foreign         not_ready    what answers speaks another language
+│   └── HandshakeError             handshake       not_ready    a service and its client do not agree on TLS
 ├── RefusedError                   refused         invalid      a service refused a request (seen by its client)
 │   └── UnavailableError           unavailable     not_ready    it refused for now, and still did when patience ended
 ├── AddressError                   address         not_ready    the service cannot listen where it was told to
@@ -232,6 +233,12 @@ class ForeignServiceError(UnreachableError):
     """What answers at an address is no Streetfix, or one of another contract."""
 
     code = "foreign"
+
+
+class HandshakeError(UnreachableError):
+    """A service and its client do not agree on TLS: an unknown authority, another name, a missing client certificate."""
+
+    code = "handshake"
 
 
 class RefusedError(StreetfixError):

@@ -245,12 +245,12 @@ def test_details_that_contradict_their_call_are_no_problem_of_ours() -> None:
             return (("grpc-status-details-bin", status.SerializeToString()),)
 
     Odd.__abstractmethods__ = frozenset()  # type: ignore[attr-defined]  # the rest of a call is not asked for
-    with pytest.raises(RefusedError, match="words"), errors_of_grpc("x:1", 1.0):
+    with pytest.raises(RefusedError, match="words"), errors_of_grpc("x:1", 1.0, None):
         raise Odd
 
 
 def test_an_error_that_is_no_call_is_one_of_ours() -> None:
-    with pytest.raises(UnreachableError), errors_of_grpc("x:1", 1.0):
+    with pytest.raises(UnreachableError), errors_of_grpc("x:1", 1.0, None):
         raise grpc.RpcError("gone")
 
 
