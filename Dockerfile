@@ -45,7 +45,7 @@ ENV PATH=/opt/streetfix/bin:$PATH \
 USER 10001:10001
 WORKDIR /tmp
 VOLUME ["/maps"]
-EXPOSE 8000 50051 8001
+EXPOSE 8000 50051
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=10s --timeout=3s --start-period=20s --retries=3 \
   CMD ["streetfix-ready"]

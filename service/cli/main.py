@@ -15,6 +15,8 @@ from service.cli import bridge, health, keys, localize, serve
 from service.errors import ExtraMissingError, StreetfixError
 
 GROUP = "streetfix.commands"
+#: The package of our other commands.
+_BESIDE_THE_SERVICE = "model_training"
 #: One line for ``--help``, which must not import what it lists, and the extra that brings a command's packages.
 _KNOWN = {
     "simulate": ("Make a city by seed and drive through it: survey and queries.", "mapping"),
@@ -131,8 +133,8 @@ def _not_called() -> None:
 
 
 def _is_installed(point: EntryPoint) -> bool:
-    """Whether the package of a command is there: an image of the service leaves out those that only build maps and encoders."""
-    return find_spec(point.module.partition(".")[0]) is not None
+    """Whether a command is there: the container image leaves out the package that builds maps and encoders."""
+    return point.module.partition(".")[0] != _BESIDE_THE_SERVICE or find_spec(_BESIDE_THE_SERVICE) is not None
 
 
 def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any] | typer.Typer:
