@@ -31,7 +31,8 @@ StreetfixError                     code            kind
 │   └── UnavailableError           unavailable     not_ready    it refused for now, and still did when patience ended
 ├── AddressError                   address         not_ready    the service cannot listen where it was told to
 ├── KeysError                      keys            not_ready    the file of API keys, or a certificate, cannot be used
-└── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
+├── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
+└── UnsupportedPlatformError       platform        unsupported  the service does not run on this operating system or processor
 
 No number of HTTP or gRPC stands here: each face has one table over ``kind``.
 """
@@ -296,4 +297,11 @@ class ExtraMissingError(StreetfixError):
     """A command needs packages of an extra that is not installed."""
 
     code = "extra-missing"
+    kind = "unsupported"
+
+
+class UnsupportedPlatformError(StreetfixError):
+    """The service does not run on this operating system or processor."""
+
+    code = "platform"
     kind = "unsupported"

@@ -31,7 +31,7 @@ class _Blocks(Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY)
+    library = load(LIBRARY, {"Blocks": _Blocks})
     library.streetfix_blocks.argtypes = [c_void_p, POINTER(_Blocks), c_void_p]
     library.streetfix_blocks.restype = None
     library.streetfix_second_differences.argtypes = [c_void_p, c_int64, c_int64, c_int64, c_int64, c_void_p]
