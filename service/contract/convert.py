@@ -278,7 +278,7 @@ def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
     ]  # fmt: skip
 
 
-def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
+def _direction(vector: schema.Direction, field: str) -> NDArray[np.float64]:
     direction = np.array([vector.x, vector.y, vector.z])
     length = math.hypot(*direction)
     if not 1e-6 < length < 1e9:
@@ -288,7 +288,7 @@ def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
     return direction / length
 
 
-def _down(gravity: schema.Vector) -> NDArray[np.float64]:
+def _down(gravity: schema.Direction) -> NDArray[np.float64]:
     """Gravity's direction; along the optical axis it leaves no heading to localize."""
     down = _direction(gravity, "gravity")
     if abs(down[2]) > np.cos(np.deg2rad(20.0)):

@@ -173,7 +173,7 @@ def test_an_unknown_map_is_refused_with_the_mounted_ones(client: httpx.Client, p
 
 
 def test_no_depth_is_a_problem_of_its_own(client: httpx.Client, parts_of: Parts) -> None:
-    require_problem(post(client, parts_of(depth={"scale_m": 0.001, "max_range_m": 0.001})), 422, "no-depth", "depth")
+    require_problem(post(client, parts_of(depth={"scale_m": 0.001, "max_range_m": 0.01})), 422, "no-depth", "depth")
 
 
 ORIGIN = {"x": 0, "y": 0, "z": 0}
