@@ -239,6 +239,17 @@ def _require_supported(camera: schema.Camera) -> None:
         )
 
 
+def require_camera(camera: PinholeCamera) -> None:
+    """Hold intrinsics that came by no request against the contract's bounds.
+
+    Raises:
+        RequestError: a number makes no sense.
+    """
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    with fields_under("camera"):
+        checked(numbers, schema.Camera)
+
+
 def _camera(camera: schema.Camera) -> PinholeCamera:
     return PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 

@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
-from service.localization.query import MOST_NEIGHBOURS
+from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS
 
 #: Of a focal length, in widths or heights of the picture: 175 and 0.6 degrees of view. What is less or more was given in another unit
 #: than pixels.
@@ -14,8 +14,6 @@ LEAST_FOCAL, MOST_FOCAL = 0.02, 100.0
 LEAST_SIDE, MOST_SIDE, MOST_ASPECT = 2, 32768, 16
 #: Components of a vector whose length does not matter: an accelerometer may count in m/s2, in thousandths of g or in its own steps.
 MOST_COMPONENT = 1e6
-#: Share of strangers that may be LOCALIZED; nobody could measure less.
-LEAST_RATE = 1e-6
 
 
 class _Strict(BaseModel):
@@ -164,7 +162,7 @@ class Options(_Strict):
         description="register the depth picture on the map's cloud; false: the pose of retrieval alone, covariance and confidence null",
     )
     false_accept_rate: float | None = Field(
-        None, ge=LEAST_RATE, lt=1,
+        None, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
         description="share of the queries taken outside the map that one can live with being LOCALIZED; less than the map's calibration "
         "measured is refused; default: the service's setting",
     )  # fmt: skip

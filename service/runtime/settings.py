@@ -18,7 +18,7 @@ from pydantic_settings import (
 from service.errors import RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.localization.encoder import Provider
-from service.localization.query import FALSE_ACCEPT_RATE
+from service.localization.query import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
 
 #: Names the settings file where no flag does.
 _CONFIG = "STREETFIX_CONFIG"
@@ -29,10 +29,10 @@ class Limits(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_request_bytes: int = Field(40 * 2**20, ge=1024, description="whole body of a request")
-    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, description="one picture, encoded")
-    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, description="one picture, decoded")
-    max_parts: int = Field(8, ge=3, description="parts of a multipart body")
+    # gRPC takes the length of a message in 32 bits.
+    max_request_bytes: int = Field(40 * 2**20, ge=1024, le=2**31 - 1, description="whole body of a request")
+    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, le=2**31 - 1, description="one picture, encoded")
+    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, le=2**30, description="one picture, decoded")
 
 
 class Settings(BaseSettings):
@@ -93,9 +93,9 @@ class Settings(BaseSettings):
         "cpu", description="what runs the encoder: ONNX Runtime's provider, where it is installed"
     )
     queue: int = Field(64, ge=0, le=100_000, description="requests that may wait in a process before 503")
-    request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
+    request_timeout_s: float = Field(30.0, gt=0, le=86400, description="from a request's first byte to its answer")
     false_accept_rate: float = Field(
-        FALSE_ACCEPT_RATE, gt=0, lt=1,
+        FALSE_ACCEPT_RATE, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
         description="share of the queries taken outside the map that one can live with being answered LOCALIZED",
     )  # fmt: skip
     console: bool = Field(True, description="serve the browser console at /console, and what it asks for")
