@@ -63,7 +63,9 @@ class RigidTransform(_Strict):
 class Camera(_Strict):
     """Intrinsics of the rectified colour picture, pixels; the centre of the first pixel is (0, 0)."""
 
-    model: Literal["PINHOLE"] = "PINHOLE"
+    model: Literal["PINHOLE"] = Field(
+        "PINHOLE", description="what the pictures are after rectification; any other model is refused, not misread"
+    )
     width: int = Field(ge=LEAST_SIDE, le=MOST_SIDE)
     height: int = Field(
         ge=LEAST_SIDE, le=MOST_SIDE, description=f"neither side is longer than {MOST_ASPECT} times the other"
@@ -79,8 +81,17 @@ class Camera(_Strict):
     cx: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
     cy: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
     distortion: list[Annotated[float, Field(ge=-1e3, le=1e3)]] = Field(
-        default_factory=list, max_length=14, description="must be empty or zero: send rectified pictures"
+        default_factory=list,
+        max_length=14,
+        description="of the pictures as sent: empty or zero; others are refused, not misread: rectify first",
     )
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _is_rectified(cls, model: object) -> object:
+        if model != "PINHOLE":
+            raise ValueError("only PINHOLE is read; rectify both pictures and send the rectified pictures' intrinsics")
+        return model
 
     @field_validator("fx", "fy")
     @classmethod

@@ -1,4 +1,8 @@
-"""Whatever fits the OpenAPI document, and what does not, is answered as the document says; nothing ends in a 5xx of ours."""
+"""Whatever fits the OpenAPI document, and what does not, is answered as the document says; nothing ends in a 5xx of ours.
+
+Schemathesis makes up the pictures, so its requests seldom reach the core. Requests with good pictures and every number at its bounds and
+beyond are those of ``tests/unit/http/test_extreme_values.py``, read off the same document.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -12,7 +12,7 @@ import pytest
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
-from service.runtime.settings import Settings
+from service.runtime.settings import Limits, Settings
 
 Parts = Callable[..., dict[str, bytes]]
 
@@ -170,6 +170,18 @@ def test_another_content_type_is_refused(client: httpx.Client) -> None:
 def test_an_unknown_map_is_refused_with_the_mounted_ones(client: httpx.Client, parts_of: Parts) -> None:
     problem = require_problem(post(client, parts_of(map="west")), 404, "unknown-map", "map")
     assert "mounted: tiny" in problem["detail"]
+
+
+@pytest.mark.parametrize("name", list(Limits.model_fields))
+def test_every_limit_of_the_settings_refuses_what_is_beyond_it(
+    bundle_path: Path, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, name: str
+) -> None:
+    """The same good request, whose body, pictures and pixels are beyond the least that each limit may be set to."""
+    least = {"max_request_bytes": 1024, "max_part_bytes": 1024, "max_pixels": 1}[name]
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1, limits=Limits(**{name: least})))
+    response = post(client_of(engine), parts_of())
+    engine.close()
+    assert (response.status_code, response.json()["code"]) == (413, "too-large")
 
 
 def test_no_depth_is_a_problem_of_its_own(client: httpx.Client, parts_of: Parts) -> None:

@@ -1,10 +1,12 @@
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from service.errors import RequestError
-from service.runtime.settings import Settings, load_settings
+from service.runtime.settings import Limits, Settings, load_settings
 
 
 def test_the_service_binds_to_loopback_unless_told_otherwise() -> None:
@@ -75,3 +77,17 @@ def test_a_file_that_makes_no_sense_is_refused_with_what_is_wrong(file: Path, te
         file.write_text(text)
     with pytest.raises(RequestError, match=says):
         load_settings(file)
+
+
+def test_every_number_has_a_least_and_a_most() -> None:
+    """An endless timeout, or a limit that gRPC's 32 bits do not hold, would fail at the first request."""
+
+    def bounds_of(model: type[BaseModel]) -> Iterator[tuple[str, set[str]]]:
+        for name, field in model.model_fields.items():
+            kinds = {field.annotation, *get_args(field.annotation)}
+            if bool not in kinds and kinds & {int, float}:
+                yield name, {key for each in field.metadata for key in ("ge", "gt", "le", "lt") if hasattr(each, key)}
+
+    found = dict([*bounds_of(Settings), *bounds_of(Limits)])
+    assert len(found) > 15
+    assert [name for name, bounds in found.items() if not (bounds & {"ge", "gt"} and bounds & {"le", "lt"})] == []
