@@ -110,7 +110,7 @@ class Camera(_Strict):
         width = info.data.get("width")  # None: refused itself
         if width is not None and max(width, height) > MOST_ASPECT * min(width, height):
             raise ValueError(
-                f"a picture of {width} x {height} px is a strip; no side may be {MOST_ASPECT} times the other"
+                f"a picture of {width} x {height} px is a strip; no side may be more than {MOST_ASPECT} times the other"
             )
         return height
 

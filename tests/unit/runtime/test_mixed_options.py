@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from service.contract.convert import answer_from
-from service.errors import NotFiniteError, StreetfixError
+from service.errors import NotFiniteError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import rotation_y, transform_from
 from service.grpc.messages import answer_message
@@ -193,11 +193,6 @@ def test_an_answer_that_is_not_finite_does_not_leave_the_core(
     monkeypatch.setattr(localizer_module, "evidence_of", lambda *_: np.full(len(FEATURES), np.nan))
     with pytest.raises(NotFiniteError, match=r"^confidence of the answer"):
         localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera))
-
-
-def test_such_an_answer_is_the_services_fault_in_both_faces() -> None:
-    """What is in the tree of errors is the request's; anything else ends in 500 or INTERNAL, with the request id and a line in the log."""
-    assert not issubclass(NotFiniteError, StreetfixError)
 
 
 def test_large_finite_numbers_are_no_defect(localizer: Localizer, pictures: Any) -> None:
