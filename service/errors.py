@@ -11,10 +11,13 @@ StreetfixError                     code            kind
 ├── UnknownMapError                unknown-map     not_found    no map of that name is mounted
 ├── UnknownSampleError              unknown-sample  not_found    no sample pair of that name lies beside the maps
 ├── NoPoseError                    no-pose         not_found    no sure pose, asked for in a format that has no word for doubt
+├── NotLocalizedError              not-localized   not_found    a pose is wanted of an answer that is not LOCALIZED
 ├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
 ├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
 ├── ForbiddenError                 forbidden       forbidden    the caller may ask, but not change what the service does
-├── BusyError                      busy            busy         the queue is full
+├── ForbiddenHostError             forbidden-host  forbidden    the request names a host that is not this service
+├── ForbiddenOriginError           forbidden-origin forbidden   a web page of another origin sent the request
+├── BusyError                      busy            busy         the queue, or the memory for requests, is full
 ├── NotReadyError                  not-ready       not_ready    no map is mounted, or the service is leaving
 ├── DeadlineError                  deadline        deadline     a request took longer than the service allows
 ├── BundleError                    bundle          not_ready    a map bundle is missing, damaged or of another version
@@ -35,7 +38,7 @@ No number of HTTP or gRPC stands here: each face has one table over ``kind``.
 and the request id, and log the story.
 """
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 Kind = Literal[
     "invalid", "unsupported", "too_large", "not_found", "unauthorized", "forbidden", "busy", "deadline", "not_ready"
@@ -124,6 +127,22 @@ class NoPoseError(StreetfixError):
     kind = "not_found"
 
 
+class NotLocalizedError(StreetfixError):
+    """A pose is wanted of an answer that is not LOCALIZED, so that it has none.
+
+    Args:
+        message: for people.
+        answer: the whole answer, a ``service.contract.schema.LocalizeAnswer``; its hypotheses are not confirmed.
+    """
+
+    code = "not-localized"
+    kind = "not_found"
+
+    def __init__(self, message: str, *, answer: Any) -> None:
+        super().__init__(message)
+        self.answer = answer
+
+
 class NotGeoreferencedError(StreetfixError):
     """A place on the Earth is asked of a map that has none."""
 
@@ -144,8 +163,22 @@ class ForbiddenError(StreetfixError):
     kind = "forbidden"
 
 
+class ForbiddenHostError(StreetfixError):
+    """The request's `Host` is not a name of this service, as when a web page's name was made to point here."""
+
+    code = "forbidden-host"
+    kind = "forbidden"
+
+
+class ForbiddenOriginError(StreetfixError):
+    """A web page of another origin sent a request that changes something or costs work."""
+
+    code = "forbidden-origin"
+    kind = "forbidden"
+
+
 class BusyError(StreetfixError):
-    """The queue is full; try again shortly."""
+    """The queue or the memory for requests is full; try again shortly."""
 
     code = "busy"
     kind = "busy"

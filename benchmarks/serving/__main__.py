@@ -13,12 +13,13 @@ from benchmarks.plans import paper_plan
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs
 from benchmarks.serving.decoding import decoding_rows
-from benchmarks.serving.fire import overload_rows, sigterm_rows, soak_rows, swap_rows
+from benchmarks.serving.fire import overload_rows, sigterm_rows, swap_rows
 from benchmarks.serving.hostile import hostile_rows
 from benchmarks.serving.machines import LOADING_CORE, SERVED_CORE, pin
 from benchmarks.serving.peers.measure import PEERS, peer_rows
 from benchmarks.serving.ratios import Site, ratio_rows, tail_rows
 from benchmarks.serving.sizes import size_rows
+from benchmarks.serving.soak import JUDGED_MINUTES, soak_rows
 from model_training.stock import ENCODER
 from service.maps.reader import MapBundle
 
@@ -43,7 +44,12 @@ def main() -> None:
     parser.add_argument("--queries", default=QUERIES)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each round")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--soak-minutes", type=float, default=30.0)
+    parser.add_argument("--soak-minutes", type=float, default=JUDGED_MINUTES)
+    parser.add_argument(
+        "--soak-rate",
+        type=float,
+        help="pairs of pictures a second in the soak, where other work shares the machine; default: 60 %% of what one core answers",
+    )
     parser.add_argument(
         "--only",
         nargs="+",
@@ -77,7 +83,7 @@ def main() -> None:
         "peers": lambda: peer_rows(
             report, site, seconds=seconds, rounds=arguments.rounds, core=core, names=arguments.peers
         ),
-        "soak": lambda: soak_rows(report, site, minutes=arguments.soak_minutes, core=core),
+        "soak": lambda: soak_rows(report, site, minutes=arguments.soak_minutes, rate=arguments.soak_rate, core=core),
     }
     if unknown := set(arguments.only or ()) - set(parts):
         parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(parts)}")

@@ -4,9 +4,11 @@ import json
 import os
 import re
 import signal
+import ssl
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
@@ -14,7 +16,7 @@ from typing import IO, Any, Self
 import httpx
 
 from benchmarks.report import ROOT
-from model_training.loadtest.processes import Usage, usage
+from model_training.loadtest.processes import Usage, descendants, usage
 
 SERVED_CORE, LOADING_CORE = 0, 1
 _CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
@@ -33,19 +35,23 @@ class Server:
     Args:
         maps: bundle, or folder of bundles.
         core: it is pinned to; None for all.
+        trusted: authorities of its certificate, where it speaks TLS.
         settings: as in the environment, lower case.
     """
 
-    def __init__(self, maps: Path, *, core: int | None = SERVED_CORE, **settings: object) -> None:
+    def __init__(
+        self, maps: Path, *, core: int | None = SERVED_CORE, trusted: ssl.SSLContext | None = None, **settings: object
+    ) -> None:
         environment = os.environ | {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
         began = time.perf_counter()
         self.process = subprocess.Popen(
-            [*_SERVE, str(maps), "--port", "0", "--grpc-port", "0"], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
+            [*_SERVE, str(maps), "--port", "0", "--grpc-port", "0"], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True,
+            process_group=0,  # Ctrl-C ends the measurement, which then ends the service
         )  # fmt: skip
         pin(self.process.pid, core)
         told = _until(self.process.stdout, r"serving gRPC at (\S+)", r"serving at (\S+)")
         self.grpc, self.url = told
-        while httpx.get(f"{self.url}/readyz", timeout=30).status_code != 200:
+        while httpx.get(f"{self.url}/readyz", timeout=30, verify=trusted or True).status_code != 200:
             time.sleep(0.005)
         self.ready_s = time.perf_counter() - began
 
@@ -122,3 +128,40 @@ def proportional_mib(pid: int) -> float:
     if found is None:
         raise RuntimeError(f"/proc/{pid}/smaps_rollup says no Pss")
     return int(found[1]) / 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What a process and its descendants hold at a moment.
+
+    Attributes:
+        anonymous_mib: pages of no file (``Pss_Anon``), shared ones counted in parts; pages of mapped maps come and go, these stay.
+        private_dirty_mib: pages that a process alone has written (``Private_Dirty``).
+        resident_mib: all pages in memory (``Rss``).
+        descriptors: open files and sockets.
+        threads: of all processes.
+    """
+
+    anonymous_mib: float
+    private_dirty_mib: float
+    resident_mib: float
+    descriptors: int
+    threads: int
+
+
+def held(pid: int) -> Held:
+    """What a process and its descendants hold now; one that ends meanwhile is left out."""
+    memory, descriptors, threads = {"Pss_Anon": 0.0, "Private_Dirty": 0.0, "Rss": 0.0}, 0, 0
+    for each in descendants(pid):
+        folder = Path("/proc") / str(each)
+        try:
+            fields = dict(re.findall(r"^(\w+):\s+(\d+) kB$", (folder / "smaps_rollup").read_text(), re.MULTILINE))
+            files = len(os.listdir(folder / "fd"))
+            told = re.search(r"^Threads:\s+(\d+)$", (folder / "status").read_text(), re.MULTILINE)
+        except OSError:
+            continue
+        for name in memory:
+            memory[name] += int(fields[name]) / 1024
+        descriptors += files
+        threads += 0 if told is None else int(told[1])
+    return Held(memory["Pss_Anon"], memory["Private_Dirty"], memory["Rss"], descriptors, threads)

@@ -24,12 +24,14 @@ class Reply:
     Attributes:
         code: ``ok``, or what went wrong: a status, ``timeout``, ``connection``.
         status: of the answer, where there is one.
-        position_m: of the answer.
+        position_m: of the answer; None unless it is LOCALIZED.
+        spread_mean_m: of an answer that is not LOCALIZED; only compared with other answers to the same request.
     """
 
     code: str
     status: str | None = None
     position_m: tuple[float, float, float] | None = None
+    spread_mean_m: tuple[float, float, float] | None = None
 
 
 class Target(Protocol):
@@ -91,8 +93,14 @@ class Rest:
         if response.status != 200:
             return Reply(str(response.status))
         answer = json.loads(content)
-        at = answer["pose"]["position"]
-        return Reply("ok", answer["status"], (at["x"], at["y"], at["z"]))
+        pose, spread = answer["pose"], answer["spread"]
+        return Reply(
+            "ok", answer["status"], None if pose is None else _xyz(pose["position"]), None if spread is None else _xyz(spread["mean"])
+        )  # fmt: skip
+
+
+def _xyz(vector: dict[str, float]) -> tuple[float, float, float]:
+    return vector["x"], vector["y"], vector["z"]
 
 
 class Grpc:
@@ -125,6 +133,9 @@ class Grpc:
             code = error.code()
             named = {grpc.StatusCode.DEADLINE_EXCEEDED: "timeout", grpc.StatusCode.UNAVAILABLE: "connection"}
             return Reply(named.get(code, code.name))
-        at = answer.pose.position
+        at, mean = answer.pose.position, answer.spread.mean
         status = pb.LocalizationStatus.Name(answer.status).removeprefix("LOCALIZATION_STATUS_")
-        return Reply("ok", status, (at.x, at.y, at.z))
+        return Reply(
+            "ok", status, (at.x, at.y, at.z) if answer.HasField("pose") else None,
+            (mean.x, mean.y, mean.z) if answer.HasField("spread") else None,
+        )  # fmt: skip

@@ -102,7 +102,12 @@ def build_map(
         if settings.passes_vote:
             gone = moved(cloud, dataset, poses, kept, settings, work, report=report)
             cloud.keep(~np.isin(cloud.sums()[0], gone))
-        return write_bundle(out, with_cloud(content, cloud), overwrite=overwrite)
+        report("writing", 0, 2)
+        content = with_cloud(content, cloud)
+        report("writing", 1, 2)
+        manifest = write_bundle(out, content, overwrite=overwrite)
+        report("writing", 2, 2)
+        return manifest
 
 
 def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:

@@ -96,7 +96,12 @@ def update_map(
             gone = moved(cloud, dataset, poses, kept, settings, work, earlier=earlier, report=report)
             cloud.keep(~np.isin(cloud.sums()[0], gone))
         whole = joined(content, _content(drive, places, content), newer_streets=area is not None)
-        return write_bundle(out, with_cloud(replace(whole, tool_versions=tool_versions()), cloud), overwrite=overwrite)
+        report("writing", 0, 2)
+        whole = with_cloud(replace(whole, tool_versions=tool_versions()), cloud)
+        report("writing", 1, 2)
+        manifest = write_bundle(out, whole, overwrite=overwrite)
+        report("writing", 2, 2)
+        return manifest
 
 
 def _told(replace_covered: bool, replace_area: Path | None) -> str:

@@ -66,10 +66,9 @@ def ros2(
         bool, typer.Option("--rectified", help="The pictures are rectified, whatever lens the info tells of.")
     ] = False,
     rate: Annotated[float, typer.Option(help="Questions a second at most; 0: one for every pair.")] = 1.0,
-    min_confidence: Annotated[float, typer.Option(help="Of a pose that is published; 0 lets all pass.")] = 0.9,
-    publish_doubtful: Annotated[
-        bool, typer.Option("--publish-doubtful", help="Publish what is not LOCALIZED, too; for measuring.")
-    ] = False,
+    min_confidence: Annotated[
+        float, typer.Option(help="Of a pose that is published; 0 lets every LOCALIZED answer pass.")
+    ] = 0.9,
     tolerance: Annotated[float, typer.Option(help="Seconds that stamps of colour and depth may differ.")] = 0.02,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="Of the robot.")] = 0,
     reliable: Annotated[
@@ -91,7 +90,7 @@ def ros2(
     from service.bridge.pose import CAMERA_AS_BODY, mount_from
 
     topics = Topics(color_topic, depth_topic, info_topic, pose_topic, diagnostics_topic)
-    gate, pairs = Gate(rate, min_confidence, publish_doubtful), Pairs(tolerance_s=tolerance)
+    gate, pairs = Gate(rate, min_confidence), Pairs(tolerance_s=tolerance)
     T_vehicle_camera = CAMERA_AS_BODY if mount is None else mount_from(mount)
     run = _node_of(node, domain=domain, reliable=reliable, depth=queue)
     with _asking(url, map_bundle, map_name=map_name, key=key) as localize, _until_told() as over:

@@ -9,6 +9,8 @@ import typer
 from service.errors import RequestError
 
 _TIMEOUT_S = 60.0
+#: Exit code for an answer that is not LOCALIZED, so that a script does not take it for a pose. 1 and 2 are errors.
+NOT_LOCALIZED = 3
 
 
 def command(
@@ -36,6 +38,9 @@ def command(
 ) -> None:
     """Ask where two pictures were taken.
 
+    Exit code: 0 if the answer is LOCALIZED; 3 if it is AMBIGUOUS or OUT_OF_MAP, then there is no pose; 1 for an error, 2 for wrong
+    options.
+
     Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json --near 12,-40
     """
     prior = _prior(near, heading)
@@ -46,6 +51,8 @@ def command(
         from service.cli.answer_text import print_answer
 
         print_answer(answer)
+    if answer["status"] != "LOCALIZED":
+        raise typer.Exit(NOT_LOCALIZED)
 
 
 def _prior(near: str | None, heading_deg: float | None) -> dict[str, Any] | None:
@@ -108,7 +115,11 @@ def _answer(body: bytes) -> dict[str, Any]:
         ValueError: it is no answer.
     """
     answer = json.loads(body)
-    if not isinstance(answer, dict) or "pose" not in answer:
+    if (
+        not isinstance(answer, dict)
+        or "status" not in answer
+        or (answer["status"] == "LOCALIZED") != bool(answer.get("pose"))
+    ):
         raise ValueError("no answer")
     return answer
 

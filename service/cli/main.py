@@ -55,7 +55,7 @@ _EXTRA_OF_PACKAGE = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage."""
+    """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage; a command may have more."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         _run(given)

@@ -17,6 +17,7 @@ from service.contract.schema import (
 from service.errors import (
     ForeignServiceError,
     NoAnswerInTimeError,
+    NotLocalizedError,
     RefusedError,
     RequestError,
     StreetfixError,
@@ -36,6 +37,7 @@ __all__ = [
     "LocalizeAnswer",
     "MapEntry",
     "NoAnswerInTimeError",
+    "NotLocalizedError",
     "Options",
     "PinholeCamera",
     "Pose",

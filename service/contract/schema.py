@@ -1,10 +1,11 @@
 """The contract as REST says it in JSON and gRPC in messages: requests and answers. Degrees here, radians inside."""
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from service.errors import NotLocalizedError, RequestError
 from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS
 
 #: Of a focal length, in widths or heights of the picture: 175 and 0.6 degrees of view. What is less or more was given in another unit
@@ -307,12 +308,33 @@ class Neighbour(BaseModel):
 class HypothesisOfPose(BaseModel):
     """A place where the pictures may have been taken."""
 
-    pose: Pose = Field(description="T_map_camera")
+    confirmed: bool = Field(
+        description="true for the first hypothesis of a LOCALIZED answer alone: it is the answer's pose. false: do not use it as a pose"
+    )
+    pose: Pose = Field(
+        description="T_map_camera; its covariance holds only if this hypothesis is right, and is null for the others of a LOCALIZED answer"
+    )
     share: float = Field(
         description="of the support of all hypotheses, 0 to 1; LOCALIZED needs more than a half for the first"
     )
     inliers: float = Field(description="share of the depth's weight that lies on the map, 0 to 1")
     similarity: float = Field(description="of the pictures to the places around, cosine")
+
+
+class Spread(BaseModel):
+    """Where the camera may be, over all hypotheses and the rest of the map. It is not a pose: its mean is usually between the hypotheses.
+
+    Each hypothesis counts with the probability that it is right, the whole map with the rest. The covariance is that of the mixture
+    (law of total covariance): hypotheses that are metres apart give metres, and a single hypothesis that is probably wrong gives the
+    size of the map. Of an OUT_OF_MAP answer the camera may be outside the map as well, which no covariance can say.
+    """
+
+    mean: Vector = Field(description="metres, map frame; not a position of the camera")
+    covariance: list[float] = Field(description="3x3, row by row, of the position, map axes, m^2")
+    heading_std_deg: float = Field(
+        description="circular standard deviation of the heading; 103.9 where nothing is known of it"
+    )
+    hypotheses_weight: float = Field(description="probability that one of the hypotheses is right, 0 to 1")
 
 
 class MapVersion(BaseModel):
@@ -334,27 +356,81 @@ class TimingsMs(BaseModel):
 
 
 class LocalizeAnswer(BaseModel):
-    """An answer that is not LOCALIZED is still an answer."""
+    """Where the pictures were taken. Only a LOCALIZED answer has a pose, a vehicle's pose, a geopose and a street.
+
+    An answer that is not LOCALIZED says in `hypotheses` and `spread` where the camera may be. None of that is confirmed.
+    """
 
     status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"] = Field(
         description="LOCALIZED: act on it; AMBIGUOUS: in the map, but not sure where; OUT_OF_MAP: the map does not show what "
         "the pictures do. Always LOCALIZED where confidence is null"
     )
     confidence: float | None = Field(
-        description="probability that the position is within 1 m; null: not calibrated, or nothing was to be registered"
+        description="probability that the position of the first hypothesis is within 1 m; null: not calibrated, or nothing was to be "
+        "registered"
     )
-    street: Street | None = Field(description="null where the map has no streets, or the neighbours lie in none")
-    pose: Pose = Field(description="T_map_camera")
-    vehicle_pose: Pose | None = Field(description="T_map_vehicle, where T_vehicle_camera was sent")
+    street: Street | None = Field(
+        description="null unless LOCALIZED, and where the map has no streets or the position lies in none"
+    )
+    pose: Pose | None = Field(description="T_map_camera; null unless LOCALIZED")
+    vehicle_pose: Pose | None = Field(
+        description="T_map_vehicle, where T_vehicle_camera was sent; null unless LOCALIZED"
+    )
     geopose: GeoPose | None = Field(
-        description="the vehicle's where T_vehicle_camera was sent, else the camera's; null where the map is not georeferenced"
+        description="the vehicle's where T_vehicle_camera was sent, else the camera's; null unless LOCALIZED, and where the map is not "
+        "georeferenced"
     )
     hypotheses: list[HypothesisOfPose] = Field(
-        description="distinct poses that were registered, the best supported first; empty without registration"
+        description="distinct poses that were registered, the best supported first; unconfirmed unless LOCALIZED; empty without "
+        "registration"
     )
+    spread: Spread | None = Field(description="where the camera may be; null for a LOCALIZED answer")
     neighbours: list[Neighbour]
     map: MapVersion
     timings_ms: TimingsMs
+
+    @model_validator(mode="after")
+    def _no_pose_unless_localized(self) -> Self:
+        """No answer of another kind can be made or read, whatever made it."""
+        localized = self.status == "LOCALIZED"
+        if localized != (self.pose is not None) or localized != (self.spread is None):
+            raise ValueError("a LOCALIZED answer has a pose and no spread, every other one a spread and no pose")
+        if not localized and (self.vehicle_pose, self.geopose, self.street) != (None, None, None):
+            raise ValueError("an answer that is not LOCALIZED has no vehicle_pose, geopose or street")
+        if any(each.confirmed != (localized and number == 0) for number, each in enumerate(self.hypotheses)):
+            raise ValueError("only the first hypothesis of a LOCALIZED answer is confirmed")
+        return self
+
+    def require_pose(self) -> Pose:
+        """The camera's pose.
+
+        Raises:
+            NotLocalizedError: the answer is not LOCALIZED; the error carries the answer.
+        """
+        if self.pose is None:
+            raise self._not_localized()
+        return self.pose
+
+    def require_vehicle_pose(self) -> Pose:
+        """The vehicle's pose.
+
+        Raises:
+            NotLocalizedError: the answer is not LOCALIZED; the error carries the answer.
+            RequestError: T_vehicle_camera was not sent.
+        """
+        if self.status != "LOCALIZED":
+            raise self._not_localized()
+        if self.vehicle_pose is None:
+            raise RequestError(
+                "vehicle_pose: the request did not say where the camera sits; send T_vehicle_camera", field="T_vehicle_camera"
+            )  # fmt: skip
+        return self.vehicle_pose
+
+    def _not_localized(self) -> NotLocalizedError:
+        return NotLocalizedError(
+            f"the answer is {self.status} (confidence {self.confidence or 0:.3f}), so it has no pose; look at its hypotheses, which "
+            "are not confirmed, send a prior or more frames, or look another way", answer=self,
+        )  # fmt: skip
 
 
 class MapEntry(BaseModel):
@@ -433,7 +509,7 @@ Base64 = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
 
 
 class QueryPointCloud(BaseModel):
-    """The query's points where the answer puts them."""
+    """The query's points where the best guess puts them: the answer's pose if it is LOCALIZED, else it is not confirmed."""
 
     origin: Vector = Field(description="map frame; the points count from it")
     count: int
@@ -454,7 +530,7 @@ class Explanation(BaseModel):
         description="the map from the most similar place, on the view grid; null without a cloud"
     )
     map_depth: Base64 | None = Field(
-        description="the map as this camera would see it from the answered pose, coloured as `depth`; null without a cloud"
+        description="the map as this camera would see it from the best guess, coloured as `depth`; null without a cloud"
     )
     points: QueryPointCloud
 
@@ -467,9 +543,9 @@ class LastAnswer(BaseModel):
     map: MapVersion
     status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
     confidence: float | None
-    street: str | None = Field(description="name of the street")
-    position: Vector
-    heading_deg: HeadingDeg
+    street: str | None = Field(description="name of the street; null unless LOCALIZED")
+    position: Vector | None = Field(description="null unless LOCALIZED")
+    heading_deg: HeadingDeg | None = Field(description="null unless LOCALIZED")
     frames: int = Field(description="picture pairs that it rests on")
     total_ms: float
 

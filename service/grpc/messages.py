@@ -134,7 +134,7 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
         status=_STATUS[answer.status],
         confidence=answer.confidence,
         street=None if answer.street is None else _street(answer.street),
-        pose=_pose(answer.pose),
+        pose=None if answer.pose is None else _pose(answer.pose),
         vehicle_pose=None if answer.vehicle_pose is None else _pose(answer.vehicle_pose),
         geopose=None if answer.geopose is None else _geopose(answer.geopose),
         neighbours=[
@@ -150,9 +150,12 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
             register_ms=times.register_, total_ms=times.total,
         ),
         hypotheses=[
-            pb.Hypothesis(pose=_pose(each.pose), share=each.share, inliers=each.inliers, similarity=each.similarity)
+            pb.Hypothesis(
+                pose=_pose(each.pose), share=each.share, inliers=each.inliers, similarity=each.similarity, confirmed=each.confirmed
+            )
             for each in answer.hypotheses
         ],
+        spread=None if answer.spread is None else _spread(answer.spread),
     )  # fmt: skip
     return message
 
@@ -181,6 +184,13 @@ def _pose(pose: schema.Pose) -> pb.Pose:
     return pb.Pose(
         position=_vector3(pose.position), orientation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w), heading_deg=pose.heading_deg,
         covariance=pose.covariance or (),
+    )  # fmt: skip
+
+
+def _spread(spread: schema.Spread) -> pb.Spread:
+    return pb.Spread(
+        mean=_vector3(spread.mean), covariance=spread.covariance, heading_std_deg=spread.heading_std_deg,
+        hypotheses_weight=spread.hypotheses_weight,
     )  # fmt: skip
 
 

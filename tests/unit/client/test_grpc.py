@@ -119,17 +119,23 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
     "changed",
     [
         {},
-        {"confidence": None, "street": None, "status": "OUT_OF_MAP"},
+        {"status": "OUT_OF_MAP"},
+        {"status": "AMBIGUOUS", "hypotheses": []},
         {"street": {"id": "s", "name": "N", "street": "1", "section": None, "class_index": 0, "vote": 1.0}},
         {"geopose": {"position": {"lat": 52.5, "lon": 13.4, "h": 70.0}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1}}},
         {"vehicle_pose": POSE},
-        {"hypotheses": [{"pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
+        {"hypotheses": [{"confirmed": True, "pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
         {"neighbours": [{"place": 3, "distance": 0.5, "similarity": 0.5, "street": None, "position": ORIGIN, "heading_deg": 0.0}]},
     ],
 )  # fmt: skip
-def test_an_answer_comes_through_the_messages_as_it_was(answer_json: Json, changed: dict[str, Any]) -> None:
-    answer = schema.LocalizeAnswer.model_validate(answer_json(**changed))
-    assert answer_of(answer_message(answer)) == answer
+def test_an_answer_comes_through_the_messages_as_it_was(
+    answer_json: Json, refused_of: Json, changed: dict[str, Any]
+) -> None:
+    content = refused_of(answer_json(), **changed) if "status" in changed else answer_json(**changed)
+    answer = schema.LocalizeAnswer.model_validate(content)
+    message = answer_message(answer)
+    assert answer_of(message) == answer
+    assert message.HasField("pose") == (answer.status == "LOCALIZED")
 
 
 def test_a_sequence_and_a_batch(client: GrpcClient, told: Told, answer_json: Json) -> None:

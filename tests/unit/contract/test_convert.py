@@ -175,6 +175,7 @@ def test_a_hypothesis_is_told_as_it_was_registered(localized):
     assert (found.share, found.inliers, found.similarity) == (1.0, 0.7, 0.8)
     assert found.pose.heading_deg == pytest.approx(-90)
     assert found.pose.covariance is None
+    assert found.confirmed
 
 
 def test_candidates_of_one_place_are_one_hypothesis_the_best_supported_of_it(localized):
@@ -193,7 +194,9 @@ def test_without_registration_there_are_no_hypotheses(localized):
 
 def test_of_an_answer_the_first_hypothesis_is_its_pose_and_the_shares_are_one(localized):
     answer = answer_from(localized)
-    assert answer.hypotheses[0].pose == answer.pose.model_copy(update={"covariance": None})
+    assert answer.hypotheses[0].pose == answer.pose
+    assert answer.pose.covariance is not None
+    assert [each.confirmed for each in answer.hypotheses] == [True] + [False] * (len(answer.hypotheses) - 1)
     shares = [each.share for each in answer.hypotheses]
     assert sum(shares) == pytest.approx(1)
     assert shares == sorted(shares, reverse=True)

@@ -37,7 +37,8 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     answer = response.json()
     assert response.status_code == 200
     assert list(answer) == [
-        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "neighbours", "map", "timings_ms",
+        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "spread", "neighbours", "map",
+        "timings_ms",
     ]  # fmt: skip
     assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
     assert answer["street"] | {"vote": 1} == {
@@ -51,8 +52,9 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     assert answer["neighbours"][0]["street"] == "s2"
     assert len(answer["neighbours"]) == 5
     best = answer["hypotheses"][0]
-    assert list(best) == ["pose", "share", "inliers", "similarity"]
-    assert best["pose"] == answer["pose"] | {"covariance": None}
+    assert list(best) == ["confirmed", "pose", "share", "inliers", "similarity"]
+    assert best["confirmed"]
+    assert best["pose"] == answer["pose"]
     assert best["inliers"] > 0.8
 
 

@@ -106,9 +106,11 @@ def require_consistent(answer: Answer, query: Any, bundle: MapBundle) -> None:
     if answer.covariance is not None:
         np.testing.assert_allclose(answer.covariance, answer.covariance.T)
         assert np.linalg.eigvalsh(answer.covariance).min() > 0
-    rotation = answer.T_map_camera[:3, :3]
+    rotation = answer.T_map_camera_guess[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    assert (answer.spread is None) == (answer.status == "LOCALIZED")
     located = answer_from(Located(answer, bundle))
+    assert (located.pose is None) == (answer.status != "LOCALIZED")
     json.loads(located.model_dump_json(by_alias=True), parse_constant=lambda name: pytest.fail(name))
     assert "nan" not in str(answer_message(located)).lower()
 
