@@ -35,6 +35,9 @@ StreetfixError                     code            kind
 └── UnsupportedPlatformError       platform        unsupported  the service does not run on this operating system or processor
 
 No number of HTTP or gRPC stands here: each face has one table over ``kind``.
+
+``NotFiniteError`` stands outside the tree: the service is at fault, not the request. Both faces answer such errors with 500 or INTERNAL
+and the request id, and log the story.
 """
 
 from typing import Any, ClassVar, Literal
@@ -291,6 +294,18 @@ class KeysError(StreetfixError):
 
     code = "keys"
     kind = "not_ready"
+
+
+class NotFiniteError(ArithmeticError):
+    """A number of an answer is not finite; no such number may leave the core.
+
+    Args:
+        path: of the number in the answer.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__(f"{path} of the answer is not finite")
+        self.path = path
 
 
 class ExtraMissingError(StreetfixError):
