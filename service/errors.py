@@ -14,7 +14,9 @@ StreetfixError                     code            kind
 ├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
 ├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
 ├── ForbiddenError                 forbidden       forbidden    the caller may ask, but not change what the service does
-├── BusyError                      busy            busy         the queue is full
+├── ForbiddenHostError             forbidden-host  forbidden    the request names a host that is not this service
+├── ForbiddenOriginError           forbidden-origin forbidden   a web page of another origin sent the request
+├── BusyError                      busy            busy         the queue, or the memory for requests, is full
 ├── NotReadyError                  not-ready       not_ready    no map is mounted, or the service is leaving
 ├── DeadlineError                  deadline        deadline     a request took longer than the service allows
 ├── BundleError                    bundle          not_ready    a map bundle is missing, damaged or of another version
@@ -141,8 +143,22 @@ class ForbiddenError(StreetfixError):
     kind = "forbidden"
 
 
+class ForbiddenHostError(StreetfixError):
+    """The request's `Host` is not a name of this service, as when a web page's name was made to point here."""
+
+    code = "forbidden-host"
+    kind = "forbidden"
+
+
+class ForbiddenOriginError(StreetfixError):
+    """A web page of another origin sent a request that changes something or costs work."""
+
+    code = "forbidden-origin"
+    kind = "forbidden"
+
+
 class BusyError(StreetfixError):
-    """The queue is full; try again shortly."""
+    """The queue or the memory for requests is full; try again shortly."""
 
     code = "busy"
     kind = "busy"

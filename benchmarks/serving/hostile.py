@@ -128,7 +128,7 @@ def _first_line(connection: socket.socket) -> str:
 def _announce(url: str, length: int, *, wait_s: float = 0.0) -> str:
     with _connected(url) as connection:
         connection.sendall(
-            b"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+            b"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
             + f"Content-Length: {length}\r\n\r\n".encode()
         )
         if wait_s:
@@ -141,7 +141,8 @@ def _slow(url: str) -> str:
     """A byte a second until the service has had enough."""
     with _connected(url) as connection:
         connection.sendall(
-            b"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=b\r\nContent-Length: 1000\r\n\r\n"
+            b"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+            b"Content-Length: 1000\r\n\r\n"
         )
         connection.settimeout(1.0)
         for _ in range(15):
@@ -162,7 +163,7 @@ def _slow(url: str) -> str:
 def _endless_headers(url: str) -> str:
     with _connected(url) as connection:
         try:
-            connection.sendall(b"GET /livez HTTP/1.1\r\nHost: x\r\n")
+            connection.sendall(b"GET /livez HTTP/1.1\r\nHost: localhost\r\n")
             for _ in range(64):
                 connection.sendall(b"X-A: " + b"a" * 65_536 + b"\r\n")
         except OSError:

@@ -1,9 +1,9 @@
 """For those who load with Locust; ``streetfix loadtest`` does more (gRPC, processor time, right answers).
 
     pip install locust
-    STREETFIX_DATASET=data/small locust -f model_training/loadtest/locustfile.py --host http://127.0.0.1:8000
+    STREETFIX_CLIENT_DATASET=data/small locust -f model_training/loadtest/locustfile.py --host http://127.0.0.1:8000
 
-``STREETFIX_QUERIES`` names a query set, ``STREETFIX_MAP`` a map, ``STREETFIX_API_KEY`` a key; ``STREETFIX_REFINE=0`` asks retrieval alone.
+``STREETFIX_CLIENT_QUERIES`` names a query set, ``STREETFIX_CLIENT_MAP`` a map, ``STREETFIX_API_KEY`` a key; ``STREETFIX_CLIENT_REFINE=0`` asks retrieval alone.
 """
 
 import itertools
@@ -16,8 +16,8 @@ from model_training.datasets.dataset import Dataset
 from model_training.loadtest.payloads import payloads
 
 PAYLOADS = payloads(
-    Dataset(Path(os.environ["STREETFIX_DATASET"])), os.environ.get("STREETFIX_QUERIES"), map_name=os.environ.get("STREETFIX_MAP"),
-    refine=os.environ.get("STREETFIX_REFINE", "1") != "0", most=50,
+    Dataset(Path(os.environ["STREETFIX_CLIENT_DATASET"])), os.environ.get("STREETFIX_CLIENT_QUERIES"), map_name=os.environ.get("STREETFIX_CLIENT_MAP"),
+    refine=os.environ.get("STREETFIX_CLIENT_REFINE", "1") != "0", most=50,
 )  # fmt: skip
 KEY = os.environ.get("STREETFIX_API_KEY")
 

@@ -1,9 +1,10 @@
 """A server that says it is leaving before it leaves, so that balancers send their requests elsewhere."""
 
+import asyncio
 import signal
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -17,15 +18,38 @@ class DrainingServer(uvicorn.Server):
     """On SIGTERM: not ready at once, then a while of answering everybody, then no new connections, then the end of running requests.
 
     Ctrl-C, and a second SIGTERM, skip the while.
+
+    Args:
+        config: of the service.
+        engine: that is told first.
+        delay_s: the while, seconds.
+        leaving: called when it is over.
+        beside: further listeners of the same loop, each with its configuration, as the health port's: a loop that hangs must not
+            look alive.
     """
 
     def __init__(
-        self, config: uvicorn.Config, engine: "Engine", *, delay_s: float, leaving: Callable[[], object] = lambda: None
-    ) -> None:
+        self, config: uvicorn.Config, engine: "Engine", *, delay_s: float, leaving: Callable[[], object] = lambda: None,
+        beside: Sequence[tuple[socket.socket, uvicorn.Config]] = (),
+    ) -> None:  # fmt: skip
         super().__init__(config)
         self._engine = engine
         self._delay_s = delay_s
         self._leaving = leaving
+        self._beside = beside
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen, beside too."""
+        await super().startup(sockets)
+        for listener, config in self._beside:
+            config.load()
+
+            def protocol(config: uvicorn.Config = config) -> asyncio.Protocol:
+                made: asyncio.Protocol = config.http_protocol_class(config, self.server_state, {})  # type: ignore[call-arg]
+                return made
+
+            server = await asyncio.get_running_loop().create_server(protocol, sock=listener, backlog=config.backlog)
+            self.servers.append(server)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """No new connections, then the end of running requests; other faces begin to leave at the same moment."""

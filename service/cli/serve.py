@@ -17,6 +17,9 @@ import typer
 from service.errors import AddressError, BundleError
 
 if TYPE_CHECKING:
+    import uvicorn
+    from fastapi import FastAPI
+
     from service.cli.certificates import Certificates
     from service.runtime.choices import Choices
     from service.runtime.engine import Engine
@@ -120,8 +123,8 @@ def serve(settings: "Settings") -> None:
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
     if settings.workers == 1:
-        with _listen(settings.host, settings.port) as listener:
-            _answer(settings, listener)
+        with _listen(settings.host, settings.port) as listener, _listen_for_health(settings) as health:
+            _answer(settings, listener, health)
     else:
         _answer_by_workers(settings)
     typer.echo("stopped")
@@ -140,16 +143,20 @@ def _answer_by_workers(settings: "Settings") -> None:
         tempfile.TemporaryDirectory(prefix="streetfix-") as folder,
         _held_port(settings.host, settings.port) as port,
         _held_port(settings.host, settings.grpc_port) as grpc_port,
+        _held_port(settings.health_host or settings.host, settings.health_port) as health_port,
     ):
         counts = Path(folder) / "metrics"
         counts.mkdir()
         os.environ[METRICS_FOLDER] = str(counts)  # Prometheus' client looks here when it is imported, which workers do
-        shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port})
+        shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port, "health_port": health_port})
         choices = Path(folder) / "choices.json"
 
         def work(number: int, ready: Callable[[], None]) -> None:
-            with _listen(shared.host, shared.port, shared=True) as listener:
-                _answer(shared, listener, choices=Choices(choices), ready=ready, says_where=number == 0)
+            with (
+                _listen(shared.host, shared.port, shared=True) as listener,
+                _listen_for_health(shared, shared=True) as health,
+            ):
+                _answer(shared, listener, health, choices=Choices(choices), ready=ready, says_where=number == 0)
 
         def fell(pid: int) -> None:
             for path in counts.glob(f"gauge_live*_{pid}.db"):  # what it had in hand it has no more
@@ -184,6 +191,7 @@ def _held_port(host: str, port: int | None) -> Iterator[int | None]:
 def _answer(
     settings: "Settings",
     listener: socket.socket,
+    health: socket.socket | None,
     *,
     choices: "Choices | None" = None,
     ready: Callable[[], None] = lambda: None,
@@ -194,7 +202,8 @@ def _answer(
 
     from service.cli.certificates import Certificates
     from service.cli.draining import DrainingServer
-    from service.http.app import create_app
+    from service.cli.reloading import reloading
+    from service.http.app import create_app, create_health_app
     from service.http.protocol import BoundedHttp
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
@@ -212,17 +221,33 @@ def _answer(
                 create_app(engine, keys), http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False,
                 lifespan="off", timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
             )  # fmt: skip
-            with _grpc(engine, keys, tls) as (grpc_port, leave), _watching(engine):
-                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave)
+            beside = [] if health is None else [(health, _plain(create_health_app(engine)))]
+            with (
+                _grpc(engine, keys, tls) as (grpc_port, leave),
+                _watching(engine),
+                reloading(keys, tls, every_s=settings.watch_s),
+            ):
+                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave, beside=beside)
                 # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
                 for number in (signal.SIGINT, signal.SIGTERM):
                     signal.signal(number, server.handle_exit)
                 ready()
                 if says_where:
-                    _say_where(engine, listener, grpc_port, "http" if tls is None else "https")
+                    _say_where(engine, listener, grpc_port, "http" if tls is None else "https", health)
                 server.run(sockets=[listener])
         finally:
             engine.close()
+
+
+def _plain(app: "FastAPI") -> "uvicorn.Config":
+    """Configuration of a listener without TLS."""
+    import uvicorn
+
+    from service.http.protocol import BoundedHttp
+
+    return uvicorn.Config(
+        app, http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False, lifespan="off"
+    )
 
 
 @contextmanager
@@ -276,6 +301,20 @@ def _watching(engine: "Engine") -> Iterator[None]:
         watcher.stop()
 
 
+@contextmanager
+def _listen_for_health(settings: "Settings", *, shared: bool = False) -> Iterator[socket.socket | None]:
+    """The health port's listener, where the settings want one.
+
+    Raises:
+        AddressError: the address is taken or not ours.
+    """
+    if settings.health_port is None:
+        yield None
+        return
+    with _listen(settings.health_host or settings.host, settings.health_port, shared=shared) as listener:
+        yield listener
+
+
 def _listen(host: str, port: int, *, shared: bool = False) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
@@ -288,7 +327,9 @@ def _cannot_listen(host: str, port: int, error: OSError) -> AddressError:
     return AddressError(f"cannot listen on {host}:{port} ({error.strerror}); choose another --host or --port")
 
 
-def _say_where(engine: "Engine", listener: socket.socket, grpc_port: int | None, scheme: str) -> None:
+def _say_where(
+    engine: "Engine", listener: socket.socket, grpc_port: int | None, scheme: str, health: socket.socket | None
+) -> None:
     host, port = listener.getsockname()[:2]
     for localizer in engine.registry:
         manifest = localizer.bundle.manifest
@@ -298,6 +339,9 @@ def _say_where(engine: "Engine", listener: socket.socket, grpc_port: int | None,
     shown = f"[{host}]" if ":" in host else host
     if grpc_port is not None:
         typer.echo(f"serving gRPC at {shown}:{grpc_port} (what it can do: proto/, or by reflection)")
+    if health is not None:
+        address, health_port = health.getsockname()[:2]
+        typer.echo(f"health at http://{f'[{address}]' if ':' in address else address}:{health_port}/readyz")
     if engine.settings.console:
         typer.echo(f"console at {scheme}://{shown}:{port}/console/")
     typer.echo(f"serving at {scheme}://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")

@@ -32,12 +32,12 @@ class AppTransport(httpx.BaseTransport):
 @pytest.fixture(scope="session")
 def app_client() -> Callable[[FastAPI], httpx.Client]:
     """A client of an application."""
-    return lambda app: httpx.Client(transport=AppTransport(app), base_url="http://app")
+    return lambda app: httpx.Client(transport=AppTransport(app), base_url="http://127.0.0.1")
 
 
 @pytest.fixture(scope="session")
 def client_of() -> Callable[[Engine], httpx.Client]:
-    return lambda engine: httpx.Client(transport=AppTransport(create_app(engine)), base_url="http://app")
+    return lambda engine: httpx.Client(transport=AppTransport(create_app(engine)), base_url="http://127.0.0.1")
 
 
 @pytest.fixture(scope="module")

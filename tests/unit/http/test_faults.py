@@ -86,7 +86,7 @@ def test_work_whose_caller_has_gone_is_dropped(engine: Engine, parts_of: Parts) 
         assert began.wait(30)
     files = {name: (name, data) for name, data in parts_of().items()}
     asked = httpx.Request("POST", "http://127.0.0.1/v1/localize", files=files)
-    head = f"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: {asked.headers['content-type']}\r\n"
+    head = f"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: {asked.headers['content-type']}\r\n"
     head += f"Content-Length: {asked.headers['content-length']}\r\n\r\n"
     with socket.create_server(("127.0.0.1", 0)) as listener:
         config = uvicorn.Config(create_app(engine), http=BoundedHttp, lifespan="off", log_config=None)

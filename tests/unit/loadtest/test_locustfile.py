@@ -13,7 +13,7 @@ def robot(small_dataset, monkeypatch):
     locust = ModuleType("locust")
     locust.HttpUser, locust.constant, locust.task = object, lambda seconds: seconds, lambda function: function
     monkeypatch.setitem(sys.modules, "locust", locust)
-    monkeypatch.setenv("STREETFIX_DATASET", str(small_dataset.folder))
+    monkeypatch.setenv("STREETFIX_CLIENT_DATASET", str(small_dataset.folder))
     monkeypatch.setenv("STREETFIX_API_KEY", "secret")
     monkeypatch.delitem(sys.modules, "model_training.loadtest.locustfile", raising=False)
     module = importlib.import_module("model_training.loadtest.locustfile")
