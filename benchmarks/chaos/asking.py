@@ -152,7 +152,7 @@ class Caller:
     def _grpc(self, what: What, key: str) -> tuple[Kind, dict[str, Any]]:
         metadata = (("authorization", f"Bearer {key}"),)
         with grpc.insecure_channel(f"127.0.0.1:{self.grpc_port}", options=_OPTIONS) as channel:
-            stub = LocalizationServiceStub(channel)
+            stub = LocalizationServiceStub(channel)  # type: ignore[no-untyped-call]  # generated code
             try:
                 if what == "maps":
                     found = stub.ListMaps(pb.ListMapsRequest(), timeout=TIMEOUT_S, metadata=metadata).maps

@@ -52,11 +52,13 @@ class Oracle:
         on_disk: complete and good bundles by folder.
         open: versions that the service has open, the newest first.
         serving: one of them.
+        is_unsure: a worker was killed while a version was open whose folder is gone; whoever knows that it has started again resets it.
     """
 
     on_disk: dict[str, Version]
     open: list[Version] = field(default_factory=list)
     serving: Version = field(init=False)
+    is_unsure: bool = field(init=False)
     _seen: dict[str, Version] = field(init=False)
     _unseen_by_some: set[str] = field(init=False)  # a worker started when they were away
 
@@ -65,7 +67,7 @@ class Oracle:
 
     def start(self) -> Expected:
         """The service starts: the newest bundle serves."""
-        self._seen, self._unseen_by_some = dict(self.on_disk), set()
+        self._seen, self._unseen_by_some, self.is_unsure = dict(self.on_disk), set(), False
         self.open = sorted(set(self.on_disk.values()), reverse=True)[:MOST_OPEN]
         self.serving = self.open[0]
         return Expected((self.serving.id,))
@@ -99,6 +101,10 @@ class Oracle:
             self.serving = max(there)
             if self.serving not in self.open:
                 self._mount(self.serving)
+        elif max(there) > max(
+            self.open
+        ):  # there is room again for one that was left out, and it is newer than all that are open
+            instead.add(max(there).id)
         return Expected(_path(before, self.serving), frozenset(instead - {before.id}))
 
     def choose(self, version: Version) -> Expected:
@@ -107,11 +113,16 @@ class Oracle:
         return Expected(_path(before, version))
 
     def worker_started_again(self) -> Expected:
-        """A worker cannot open again what lies in no folder; all may then agree on something else."""
+        """A worker cannot open again what lies in no folder; all may then agree to drop that, now or when it has started."""
         self._unseen_by_some |= set(self._seen) - set(self.on_disk)
-        if self.serving in self.on_disk.values():
-            return self.unchanged()
-        return Expected((self.serving.id,), frozenset({max(self.on_disk.values()).id}))
+        self.is_unsure = self.is_unsure or any(map(self.is_gone, self.open))
+        return self.unchanged()
+
+    def unsure(self, expected: Expected) -> Expected:
+        """What else may serve as long as it is not known what workers have dropped: the newest bundle on the disk."""
+        if not self.is_unsure:
+            return expected
+        return Expected(expected.path, expected.instead | {max(self.on_disk.values()).id})
 
     def unchanged(self) -> Expected:
         """Whatever happened, the same version serves."""
