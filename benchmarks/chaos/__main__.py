@@ -31,6 +31,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=3)
     parser.add_argument("--stop", action="store_true", help="at the first wrong, lost or differing answer")
     parser.add_argument("--no-report", action="store_true", help="leave reports/serving.json as it is")
+    parser.add_argument(
+        "--log", type=Path, default=ROOT / "out" / "chaos.log", help="what is done and what the service logs"
+    )
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate")
     parser.add_argument("--map", type=Path, help="another bundle than the paper's city, with --dataset")
     parser.add_argument("--dataset", type=Path)
@@ -44,10 +47,11 @@ def main() -> None:
     report.keep_others()
     began = time.monotonic()
     size = sum(path.stat().st_size for path in site.bundle.rglob("*") if path.is_file())
-    with small_disk(int(8 * size / 2**20) + 64) as disk:
+    arguments.log.parent.mkdir(parents=True, exist_ok=True)
+    with small_disk(int(8 * size / 2**20) + 64) as disk, arguments.log.open("w", buffering=1) as log:
         chaos = Chaos(
             disk, site.bundle, pair_of(site), seed=arguments.seed, workers=arguments.workers,
-            tell=lambda line: print(line, flush=True),
+            tell=lambda line: print(line, flush=True), log=lambda line: print(f"{time.strftime('%H:%M:%S')} {line}", file=log),
         )  # fmt: skip
         found = chaos.run(arguments.steps, stop_at_first=arguments.stop)
     print(f"{found.steps} steps in {(time.monotonic() - began) / 60:.1f} minutes, seed {found.seed}", flush=True)

@@ -30,8 +30,6 @@ from service.runtime.keys import hash_of, new_key
 #: Until all workers must agree, and until a service must have ended.
 SETTLED_S, ENDED_S = 30.0, 40.0
 _SAME_M = 0.01
-#: A process that was killed is gone after this long.
-_CUT_S = 0.1
 _MOST_BUNDLES, _MOST_DAMAGED, _MOST_HALVES, _MOST_SOCKETS, _FULL_STEPS = 6, 3, 2, 24, 5
 
 
@@ -68,20 +66,20 @@ class Step:
     Attributes:
         expected: what may serve after it.
         strict_s: from when on nothing but the last version may answer; None: when it has settled.
-        cut: when workers were killed: a request that ran then may be lost.
+        cut: spans from the moment when a worker was killed until it was gone: a request that ran then may be lost.
         is_away: spans of time in which the service was down: a request that began then may be lost.
         outcomes: that the step itself has seen.
     """
 
     expected: Expected
     strict_s: float | None = None
-    cut: list[float] = field(default_factory=list)
+    cut: list[tuple[float, float]] = field(default_factory=list)
     is_away: list[tuple[float, float]] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
 
     def excuses(self, outcome: Outcome) -> bool:
         """Whether a request could not be answered, whatever the service did."""
-        cut = any(outcome.began_s < at + _CUT_S and outcome.ended_s > at for at in self.cut)
+        cut = any(outcome.began_s <= gone and outcome.ended_s >= killed for killed, gone in self.cut)
         return cut or any(start <= outcome.began_s <= end for start, end in self.is_away)
 
 
@@ -95,13 +93,15 @@ class Chaos:
         seed: of all choices.
         workers: of the service.
         tell: takes a line for people.
+        log: takes a line of what is done, and of what the service logs.
     """
 
     def __init__(
-        self, disk: Disk, bundle: Path, pair: Pair, *, seed: int, workers: int, tell: Callable[[str], None]
-    ) -> None:
+        self, disk: Disk, bundle: Path, pair: Pair, *, seed: int, workers: int, tell: Callable[[str], None],
+        log: Callable[[str], None] = lambda _: None,
+    ) -> None:  # fmt: skip
         self._random = Random(seed)  # noqa: S311  # replayable
-        self._disk, self._workers, self._tell = disk, workers, tell
+        self._disk, self._workers, self._tell, self._record = disk, workers, tell, log
         self._shelf = Shelf(disk.folder, bundle, self._random)
         self._temporary = disk.folder / "tmp"
         self._temporary.mkdir()
@@ -172,6 +172,7 @@ class Chaos:
             self._wrong(f"the service ended by itself, with {self._server.process.returncode}")
             heard()
             return
+        self._record(self._done[-1])
         probes, settled_s = self._settle(step.expected)
         for face in FACES:
             probes.append(self._caller.ask(face, "full"))
@@ -314,18 +315,26 @@ class Chaos:
 
     def _kill_all(self) -> Step:
         step = self._kill_workers(self._workers)
-        step.is_away = [(step.cut[0], time.monotonic() + SETTLED_S)]
+        step.is_away = [(step.cut[0][0], time.monotonic() + SETTLED_S)]
         return step
 
     def _kill_workers(self, count: int) -> Step:
+        """Kill so many workers; one that answers is left, unless all are to go."""
         there = sorted(self._pids() - {self._running.process.pid})
-        cut = []
-        for pid in self._random.sample(there, min(count, len(there))):
-            cut.append(time.monotonic())
+        victims = self._random.sample(there, min(count, len(there)))
+        answering = _listeners(self._caller.port, there)
+        if count < self._workers and not answering - set(victims):
+            victims = [pid for pid in victims if answering and pid != min(answering)]
+        killed = time.monotonic()
+        for pid in victims:
             try:
                 os.kill(pid, signal.SIGKILL)
             except ProcessLookupError:  # it ended by itself
                 continue
+        while any(map(_runs, victims)):  # the system closes its sockets some time after
+            time.sleep(0.005)
+        cut = [(killed, time.monotonic())]
+        self._note(f"{len(victims)} of {len(there)}")
         self._started_again_s = time.monotonic() + SETTLED_S
         return Step(self._oracle.worker_started_again(), cut=cut)
 
@@ -601,6 +610,7 @@ class Chaos:
 
     def _take_line(self, line: str) -> None:
         self._log.append(line.rstrip())
+        self._record(line.rstrip())
         self.findings.tracebacks += line.startswith("Traceback")
 
     def _start_or_free(self) -> None:
@@ -687,6 +697,7 @@ class Chaos:
 
     def _found(self, findings: list[str], kind: str, told: str) -> None:
         findings.append(f"step {self._number}: {told}")
+        self._record(f"{kind}, step {self._number}: {told}")
         here = sum(each.startswith(f"step {self._number}: ") for each in findings[-4:])
         if here <= 3:  # one cause may have hundreds of answers
             self._tell(f"{kind}, step {self._number}: {told}")
@@ -704,6 +715,29 @@ def _request_head(key: str, length: int, content_type: str) -> bytes:
         f"POST /v1/localize HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {key}\r\n"
         f"Content-Type: {content_type}\r\nContent-Length: {length}\r\n\r\n"
     ).encode()
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process is neither gone nor a zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def _listeners(port: int, pids: Iterable[int]) -> set[int]:
+    """Those of some processes that listen on a port of 127.0.0.1."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    sockets = {f"socket:[{row[9]}]" for row in rows if row[1] == f"0100007F:{port:04X}" and row[3] == "0A"}
+    found = set()
+    for pid in pids:
+        try:
+            files = {os.readlink(each) for each in Path(f"/proc/{pid}/fd").iterdir()}
+        except OSError:  # it has ended, or closes a file
+            continue
+        if files & sockets:
+            found.add(pid)
+    return found
 
 
 def _free_port() -> int:

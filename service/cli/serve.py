@@ -150,6 +150,7 @@ def _answer_by_workers(settings: "Settings") -> None:
     Each listens on a socket of its own, between which the system spreads connections: of one socket that all share, whoever is quick
     takes all connections of clients that keep them.
     """
+    from service.cli.shared_counts import reserve
     from service.cli.workers import supervise
     from service.runtime.serving_table import SharedMemory, SharedServingTable
 
@@ -171,6 +172,10 @@ def _answer_by_workers(settings: "Settings") -> None:
                 _listen_for_health(shared, shared=True) as health,
             ):
                 table = SharedServingTable(memory, number)
+                if (error := reserve(counts)) is not None:
+                    del os.environ[METRICS_FOLDER]
+                    told = f"worker {number} counts for itself alone until it is started again ({counts}: {error.strerror})"
+                    typer.echo(f"streetfix: {told}", err=True)
                 _answer(shared, listener, health, table=table, ready=ready, says_where=number == 0)
 
         def ended(pid: int) -> None:

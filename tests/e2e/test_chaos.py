@@ -23,7 +23,9 @@ def payload_of(parts: dict[str, bytes]) -> Payload:
     return Payload(*multipart(parts), message, None)
 
 
-def test_nothing_is_wrong_or_lost_and_workers_agree(bundle_path: Path, parts_of: Callable[..., dict[str, bytes]]) -> None:
+def test_nothing_is_wrong_or_lost_and_workers_agree(
+    bundle_path: Path, parts_of: Callable[..., dict[str, bytes]]
+) -> None:
     pair = Pair(payload_of(parts_of()), payload_of(parts_of(options={"refine": False})))
     told: list[str] = []
     with small_disk(64, may_mount=False) as disk:

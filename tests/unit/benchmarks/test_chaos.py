@@ -104,8 +104,8 @@ NEW = Expected(("new",))
         (Step(OLD_TO_NEW, strict_s=5.0), [answer("old", 4, 7)], 0, 0),
         (Step(OLD_TO_NEW, strict_s=5.0), [answer("old", 6, 7)], 0, 1),
         (Step(NEW), [lost(1, 2)], 1, 0),
-        (Step(NEW, cut=[1.5]), [lost(1, 2)], 0, 0),
-        (Step(NEW, cut=[2.5]), [lost(1, 2)], 1, 0),
+        (Step(NEW, cut=[(1.5, 1.6)]), [lost(1, 2)], 0, 0),
+        (Step(NEW, cut=[(2.5, 2.6)]), [lost(1, 2)], 1, 0),
         (Step(NEW, is_away=[(0.5, 3.0)]), [lost(1, 2)], 0, 0),
         (Step(NEW, is_away=[(1.5, 3.0)]), [lost(1, 2)], 1, 0),  # it was asked before the service was told to leave
     ],
