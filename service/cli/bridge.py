@@ -4,7 +4,6 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -14,6 +13,7 @@ from service.errors import RequestError
 
 if TYPE_CHECKING:
     from service.bridge.bridge import Localize, Published
+    from service.runtime.wakeup import Wakeup
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Answer a robot's own messages with its pose in the map."
@@ -148,9 +148,11 @@ def _asking(
 
 
 @contextmanager
-def _until_told() -> Iterator[Event]:
+def _until_told() -> Iterator["Wakeup"]:
     """Set by the first SIGINT or SIGTERM; the second does what it did before."""
-    over = Event()
+    from service.runtime.wakeup import Wakeup
+
+    over = Wakeup()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def end(number: int, _frame: object) -> None:

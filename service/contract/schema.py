@@ -480,6 +480,22 @@ class Health(BaseModel):
     status: Literal["ok"] = "ok"
 
 
+class RefusedBundle(BaseModel):
+    """A bundle in a maps folder that is not mounted."""
+
+    bundle: str = Field(description="the folder's name")
+    reason: str
+
+
+class Readiness(BaseModel):
+    """The service is ready; what it could not mount all the same."""
+
+    status: Literal["ok"] = "ok"
+    refused: list[RefusedBundle] = Field(
+        description="bundles that are not mounted, as this process found them; at most 20, the log has all"
+    )
+
+
 class Truth(_Strict):
     """Where a pair of pictures was really taken: for people who compare."""
 

@@ -43,6 +43,10 @@ class Settings(BaseSettings):
     )
 
     maps: Annotated[tuple[Path, ...], NoDecode] = Field((), description="map bundles, or folders of them; ':' between")
+    strict: bool = Field(
+        False,
+        description="do not start if any bundle cannot be mounted, or if there is none; else those that can be serve",
+    )
     host: str = Field("127.0.0.1", description="address to listen on; loopback unless told otherwise")
     port: int = Field(8000, ge=0, le=65535, description="0 lets the system choose")
     grpc_port: int | None = Field(
