@@ -181,7 +181,7 @@ class MapRegistry:
 
     def unmount(self, name: str, version: str) -> None:
         """Take a version out of all workers; if it served, the newest of the others does. Nothing happens if it is not there."""
-        self.table.remove(name, version)
+        self.table.remove([(name, version)])
 
     def _maps(self) -> Mapping[str, _Map]:
         if self._view.table is not self.table.read():
