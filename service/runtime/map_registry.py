@@ -162,6 +162,7 @@ class MapRegistry:
 
     def wants(self, version: MapVersion) -> bool:
         """Whether a version should be opened here: it is mounted, or would be if every worker had it, and is not open yet."""
+        self._maps()  # lets go of what was taken out meanwhile
         if (known := self._open.get(version.key)) is not None and _made_at(known.bundle.manifest) >= version.made_at:
             return False
         table = self.table.read()

@@ -62,8 +62,8 @@ class Service:
 
     def __init__(self, folder: Path) -> None:
         self.maps, self.log = folder / "maps", folder / "log"
-        self.pids, self.hangups = folder / "pids", folder / "hangups"
-        for each in (self.maps, self.pids, self.hangups):
+        self.pids, self.hangups, self.answering = folder / "pids", folder / "hangups", folder / "answering"
+        for each in (self.maps, self.pids, self.hangups, self.answering):
             each.mkdir()
         self.memory = SharedMemory()
         self.newest = 0
@@ -98,6 +98,7 @@ class Service:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
         log = os.open(self.log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         ready()
+        told(self.answering / str(number), "")
         while True:
             asked = time.monotonic()
             try:
@@ -220,7 +221,8 @@ def main(folder: Path, steps: int, seed: int) -> None:
         os._exit(workers.supervise(WORKERS, service.work))
     try:
         driver = Driver(service, supervisor, seed)
-        driver.until(lambda: len(driver.table.read().offers) == WORKERS and service.log.exists())
+        # A worker that ends before it ever answered ends the service.
+        driver.until(lambda: all((service.answering / str(number)).exists() for number in range(WORKERS)))
         first = driver.serving
         driver.run(steps)
     finally:
