@@ -25,7 +25,8 @@ StreetfixError                     code            kind
 ├── EncoderError                   encoder         not_ready    an encoder file is missing or is not an encoder of ours
 ├── UnreachableError               unreachable     not_ready    a service does not answer
 │   ├── NoAnswerInTimeError        no-answer       not_ready    a service was asked, and the caller's time ended
-│   └── ForeignServiceError        foreign         not_ready    what answers speaks another language
+│   ├── ForeignServiceError        foreign         not_ready    what answers speaks another language
+│   └── HandshakeError             handshake       not_ready    a service and its client do not agree on TLS
 ├── RefusedError                   refused         invalid      a service refused a request (seen by its client)
 │   └── UnavailableError           unavailable     not_ready    it refused for now, and still did when patience ended
 ├── AddressError                   address         not_ready    the service cannot listen where it was told to
@@ -34,6 +35,9 @@ StreetfixError                     code            kind
 └── UnsupportedPlatformError       platform        unsupported  the service does not run on this operating system or processor
 
 No number of HTTP or gRPC stands here: each face has one table over ``kind``.
+
+``NotFiniteError`` stands outside the tree: the service is at fault, not the request. Both faces answer such errors with 500 or INTERNAL
+and the request id, and log the story.
 """
 
 from typing import Any, ClassVar, Literal
@@ -235,6 +239,12 @@ class ForeignServiceError(UnreachableError):
     code = "foreign"
 
 
+class HandshakeError(UnreachableError):
+    """A service and its client do not agree on TLS: an unknown authority, another name, a missing client certificate."""
+
+    code = "handshake"
+
+
 class RefusedError(StreetfixError):
     """A service refused a request; the message carries the problem it answered with.
 
@@ -284,6 +294,18 @@ class KeysError(StreetfixError):
 
     code = "keys"
     kind = "not_ready"
+
+
+class NotFiniteError(ArithmeticError):
+    """A number of an answer is not finite; no such number may leave the core.
+
+    Args:
+        path: of the number in the answer.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__(f"{path} of the answer is not finite")
+        self.path = path
 
 
 class ExtraMissingError(StreetfixError):

@@ -10,7 +10,6 @@ import json
 import signal
 import ssl
 import time
-import uuid
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
 from benchmarks.report import Report
+from benchmarks.serving.bodies import multipart
 from benchmarks.serving.guard import Collector, Guard, guard
 from benchmarks.serving.hostile import part_of
 from benchmarks.serving.machines import Held, Server, held
@@ -563,18 +563,11 @@ def _multipart(
     document: dict[str, Any], pairs: Sequence[pb.LocalizeRequest], *, numbered: bool = True
 ) -> tuple[bytes, str]:
     """Body and content type of a document with the pictures of some requests."""
-    boundary = uuid.uuid4().hex
     parts = {"request": json.dumps(document).encode()}
     for k, each in enumerate(pairs):
         suffix = str(k) if numbered else ""
         parts |= {f"rgb{suffix}": each.rgb, f"depth{suffix}": each.depth}
-    body = b"".join(
-        f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"; filename="{name}"\r\n\r\n'.encode()
-        + content
-        + b"\r\n"
-        for name, content in parts.items()
-    )
-    return body + f"--{boundary}--\r\n".encode(), f"multipart/form-data; boundary={boundary}"
+    return multipart(parts)
 
 
 def _as_json(T: NDArray[np.float64]) -> dict[str, dict[str, float]]:

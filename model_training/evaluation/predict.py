@@ -81,7 +81,7 @@ class Predictions:
     @staticmethod
     def load(path: Path) -> "Predictions":
         """Read what ``save`` wrote."""
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return Predictions(
                 **{
                     name: arrays[name]

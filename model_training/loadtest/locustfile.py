@@ -3,7 +3,8 @@
     pip install locust
     STREETFIX_CLIENT_DATASET=data/small locust -f model_training/loadtest/locustfile.py --host http://127.0.0.1:8000
 
-``STREETFIX_CLIENT_QUERIES`` names a query set, ``STREETFIX_CLIENT_MAP`` a map, ``STREETFIX_API_KEY`` a key; ``STREETFIX_CLIENT_REFINE=0`` asks retrieval alone.
+``STREETFIX_CLIENT_QUERIES`` names a query set, ``STREETFIX_CLIENT_MAP`` a map, ``STREETFIX_API_KEY`` a key.
+``STREETFIX_CLIENT_REFINE=0`` asks for retrieval alone.
 """
 
 import itertools
@@ -16,9 +17,12 @@ from model_training.datasets.dataset import Dataset
 from model_training.loadtest.payloads import payloads
 
 PAYLOADS = payloads(
-    Dataset(Path(os.environ["STREETFIX_CLIENT_DATASET"])), os.environ.get("STREETFIX_CLIENT_QUERIES"), map_name=os.environ.get("STREETFIX_CLIENT_MAP"),
-    refine=os.environ.get("STREETFIX_CLIENT_REFINE", "1") != "0", most=50,
-)  # fmt: skip
+    Dataset(Path(os.environ["STREETFIX_CLIENT_DATASET"])),
+    os.environ.get("STREETFIX_CLIENT_QUERIES"),
+    map_name=os.environ.get("STREETFIX_CLIENT_MAP"),
+    refine=os.environ.get("STREETFIX_CLIENT_REFINE", "1") != "0",
+    most=50,
+)
 KEY = os.environ.get("STREETFIX_API_KEY")
 
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import ssl
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
@@ -11,6 +12,7 @@ import grpc
 from yarl import URL
 
 from model_training.loadtest.payloads import Payload
+from service.client.tls import ClientTls
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 
@@ -53,9 +55,16 @@ class Target(Protocol):
 
 
 class Rest:
-    """``POST /v1/localize``, by aiohttp: for bodies of this size it takes a third of httpx's processor time (decision log)."""
+    """``POST /v1/localize``, by aiohttp: for bodies of this size it takes a third of httpx's processor time (decision log).
 
-    def __init__(self, url: str, *, key: str | None) -> None:
+    Args:
+        url: of the service.
+        key: of its API.
+        tls: of an ``https`` address; None trusts the public authorities.
+    """
+
+    def __init__(self, url: str, *, key: str | None, tls: ClientTls | None = None) -> None:
+        self._tls = tls
         self._url = URL(f"{url.rstrip('/')}/v1/localize")
         # Nothing is gained by compressing a few kilobytes, and some servers do it wherever they may.
         self._headers = {"Accept-Encoding": "identity"}
@@ -65,7 +74,7 @@ class Rest:
     async def __aenter__(self) -> Self:
         """Be ready to open as many connections as it takes."""
         self._session = aiohttp.ClientSession(
-            connector=aiohttp.TCPConnector(limit=0), headers=self._headers, auto_decompress=False,
+            connector=aiohttp.TCPConnector(limit=0, ssl=self._context()), headers=self._headers, auto_decompress=False,
             trust_env=self._url.host not in ("127.0.0.1", "localhost", "::1"),
         )  # fmt: skip
         return self
@@ -75,6 +84,10 @@ class Rest:
     ) -> None:
         """Close them."""
         await self._session.close()
+
+    def _context(self) -> ssl.SSLContext | bool:
+        """Of TLS; True takes the library's, which is not asked without TLS."""
+        return True if self._tls is None or self._url.scheme != "https" else self._tls.context()
 
     async def ask(self, payload: Payload, timeout_s: float) -> Reply:
         """Send one request and wait for what becomes of it."""
@@ -104,16 +117,27 @@ def _xyz(vector: dict[str, float]) -> tuple[float, float, float]:
 
 
 class Grpc:
-    """``LocalizationService.Localize``."""
+    """``LocalizationService.Localize``.
 
-    def __init__(self, address: str, *, key: str | None) -> None:
+    Args:
+        address: HOST:PORT.
+        key: of its API.
+        tls: to speak; None speaks without.
+    """
+
+    def __init__(self, address: str, *, key: str | None, tls: ClientTls | None = None) -> None:
         self._address = address
+        self._credentials = None if tls is None else grpc.ssl_channel_credentials(*tls.pems())
         self._metadata = () if key is None else (("authorization", f"Bearer {key}"),)
 
     async def __aenter__(self) -> Self:
         """Open a channel."""
         options = (("grpc.max_receive_message_length", -1), ("grpc.max_send_message_length", -1))
-        self._channel = grpc.aio.insecure_channel(self._address, options=options)
+        self._channel = (
+            grpc.aio.insecure_channel(self._address, options=options)
+            if self._credentials is None
+            else grpc.aio.secure_channel(self._address, self._credentials, options=options)
+        )
         self._stub = LocalizationServiceStub(self._channel)  # type: ignore[no-untyped-call]  # generated code
         return self
 

@@ -73,6 +73,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
+    except OSError as error:
+        if error.errno is None:  # not the system's: a defect of ours, to be seen whole
+            raise
+        typer.echo(f"streetfix: {_told_by_system(error)}", err=True)
+        sys.exit(1)
+
+
+def _told_by_system(error: OSError) -> str:
+    """What the system says of a file, in a line: it vanished, may not be read, or the disk is full or fails."""
+    files = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+    return f"{files or 'a file'}: {error.strerror}; check the file, its folder and the disk, and start again"
 
 
 def _run(arguments: list[str]) -> None:

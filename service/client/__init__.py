@@ -16,6 +16,8 @@ from service.contract.schema import (
 )
 from service.errors import (
     ForeignServiceError,
+    HandshakeError,
+    KeysError,
     NoAnswerInTimeError,
     NotLocalizedError,
     RefusedError,
@@ -34,6 +36,8 @@ __all__ = [
     "ForeignServiceError",
     "Frame",
     "GrpcClient",
+    "HandshakeError",
+    "KeysError",
     "LocalizeAnswer",
     "MapEntry",
     "NoAnswerInTimeError",

@@ -121,7 +121,7 @@ def _prior(prior: schema.Prior | None) -> pb.Prior | None:
     )  # fmt: skip
 
 
-def _vector(vector: schema.Vector | None) -> pb.Vector3 | None:
+def _vector(vector: schema.Direction | None) -> pb.Vector3 | None:
     return None if vector is None else pb.Vector3(x=vector.x, y=vector.y, z=vector.z)
 
 

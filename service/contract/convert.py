@@ -244,6 +244,17 @@ def _require_supported(camera: schema.Camera) -> None:
         )
 
 
+def require_camera(camera: PinholeCamera) -> None:
+    """Hold intrinsics that came by no request against the contract's bounds.
+
+    Raises:
+        RequestError: a number makes no sense.
+    """
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    with fields_under("camera"):
+        checked(numbers, schema.Camera)
+
+
 def _camera(camera: schema.Camera) -> PinholeCamera:
     return PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
@@ -290,7 +301,7 @@ def _spread(spread: Spread) -> schema.Spread:
     )
 
 
-def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
+def _direction(vector: schema.Direction, field: str) -> NDArray[np.float64]:
     direction = np.array([vector.x, vector.y, vector.z])
     length = math.hypot(*direction)
     if not 1e-6 < length < 1e9:
@@ -300,7 +311,7 @@ def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
     return direction / length
 
 
-def _down(gravity: schema.Vector) -> NDArray[np.float64]:
+def _down(gravity: schema.Direction) -> NDArray[np.float64]:
     """Gravity's direction; along the optical axis it leaves no heading to localize."""
     down = _direction(gravity, "gravity")
     if abs(down[2]) > np.cos(np.deg2rad(20.0)):

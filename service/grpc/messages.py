@@ -20,6 +20,8 @@ _ENCODINGS = {
     pb.DEPTH_ENCODING_COMPRESSED_DEPTH: "compressed_depth",
 }
 _MODELS = {pb.CAMERA_MODEL_UNSPECIFIED: "PINHOLE", pb.CAMERA_MODEL_PINHOLE: "PINHOLE"}
+#: One more than the contract takes, so that more are refused, and a message of millions does not become a list of as many.
+_MOST_COEFFICIENTS = 15
 _STATUS = {
     "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED, "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
     "OUT_OF_MAP": pb.LOCALIZATION_STATUS_OUT_OF_MAP,
@@ -80,7 +82,10 @@ def _of_pair(message: pb.LocalizeRequest | pb.SequenceFrame) -> dict[str, Any]:
 
 def _camera(message: pb.Camera) -> dict[str, Any]:
     numbers = {name: getattr(message, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return numbers | {"model": _MODELS.get(message.model, message.model), "distortion": list(message.distortion)}
+    return numbers | {
+        "model": _MODELS.get(message.model, message.model),
+        "distortion": list(message.distortion[:_MOST_COEFFICIENTS]),
+    }
 
 
 def _depth(message: pb.DepthFormat) -> dict[str, Any]:

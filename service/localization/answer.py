@@ -1,5 +1,6 @@
 """What is known about where a query was taken."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+from service.errors import NotFiniteError
 from service.geometry.rigid import Transform
 from service.localization.hypotheses import Hypothesis
 from service.localization.judge import Candidate
@@ -72,3 +74,46 @@ class Answer:
     measured_share: float
     height_m: float
     timings: Timings
+
+
+def require_finite(answer: Answer) -> None:
+    """Refuse an answer with a number that is not finite: NaN would reach a robot's controller, or pass as OUT_OF_MAP without a word.
+
+    Every field is looked at, with all that it holds, so that a new one cannot be left out.
+
+    Raises:
+        NotFiniteError: naming the first such number's path, as ``candidates.0.support``.
+    """
+    numbers: list[float] = []
+    _gather(answer, numbers)
+    if np.isfinite(numbers).all():
+        return
+    for path, value in _paths(answer, ""):  # a sum may overflow without any such number
+        if not np.isfinite(value).all():
+            raise NotFiniteError(path)
+
+
+def _gather(value: object, numbers: list[float]) -> None:
+    """Append every number below a value; of an array its sum, which is not finite if any number in it is not."""
+    if isinstance(value, float):
+        numbers.append(value)
+    elif isinstance(value, np.ndarray):
+        numbers.append(float(value.sum()))
+    elif isinstance(value, tuple):
+        for each in value:
+            _gather(each, numbers)
+    else:
+        for name in getattr(value, "__dataclass_fields__", ()):
+            _gather(getattr(value, name), numbers)
+
+
+def _paths(value: object, path: str) -> Iterator[tuple[str, float | NDArray[np.generic]]]:
+    """Every number and array below a value, with its path."""
+    if isinstance(value, (float, np.ndarray)):
+        yield path, value
+    elif isinstance(value, tuple):
+        for number, each in enumerate(value):
+            yield from _paths(each, f"{path}.{number}")
+    else:
+        for name in getattr(value, "__dataclass_fields__", ()):
+            yield from _paths(getattr(value, name), f"{path}.{name}".removeprefix("."))

@@ -9,7 +9,7 @@ from service.errors import BundleError, RequestError
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews, query_views
 from service.imaging.view_grid import ViewGrid
-from service.localization.answer import Answer, Timings
+from service.localization.answer import Answer, Timings, require_finite
 from service.localization.decide import decide
 from service.localization.encoder import Encoder, Provider
 from service.localization.evidence import evidence_of
@@ -113,7 +113,8 @@ class Localizer:
         matches = search_views(
             self.bundle, descriptors, turns_rad=views.turns_rad, places=_places_of(query), fewest=self.clusters.views
         )
-        noise = inverse_depth_noise(query.depth_m) if query.refine else np.nan  # only registration asks
+        # Without registration nobody asks for it, but a later frame of a stream may be registered together with this one.
+        noise = inverse_depth_noise(query.depth_m)
         return Frame(
             query, np.eye(4), views, descriptors, matches, noise,
             fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,
@@ -127,6 +128,7 @@ class Localizer:
 
         Raises:
             RequestError: fewer false accepts are wanted than the map's calibration can promise.
+            NotFiniteError: a number of the answer is not finite, by a defect of ours or of the map.
         """
         started = perf_counter()
         query, matches = frames[0].query, frames[0].matches
@@ -161,7 +163,7 @@ class Localizer:
             sum(getattr(frame, name) for frame in frames) for name in ("fuse_s", "encode_s", "search_s")
         )
         T_map_camera = self._pose_of(hypotheses[0], frames[0].views) if refined is None else refined.best.T_map_camera
-        return Answer(
+        answer = Answer(
             status="LOCALIZED" if decision is None else decision.status,
             confidence=None if decision is None else decision.confidence,
             street=self._street_of(T_map_camera, hypotheses[0], registered=refined is not None),
@@ -187,6 +189,8 @@ class Localizer:
                 total_ms=1e3 * (done - started + fused + encoded + searched),
             ),
         )
+        require_finite(answer)
+        return answer
 
     def _spread_of(self, candidates: tuple[Candidate, ...], frames: int, confidence: float) -> Spread:
         distinct = distinct_candidates(candidates)

@@ -38,6 +38,8 @@ class MapBundle:
     views: NDArray[Any]
     view_index: ViewIndex
     streets: Streets | None
+    #: The streets' GeoJSON, in memory: the bundle's folder may go while the map still serves.
+    streets_document: bytes | None
     calibration: Calibration | None
     cloud: SurfelMap | None
     #: Where the places lie on the ground, in memory: x of all, y of all.
@@ -59,6 +61,7 @@ class MapBundle:
         """
         manifest = read_manifest(path)
         _require_files(path, manifest, verify=verify)
+        document = (path / streets.FILE).read_bytes() if streets.FILE in manifest.files else None
         bundle = cls(
             path=path,
             manifest=manifest,
@@ -67,7 +70,8 @@ class MapBundle:
             places=_load(path / parts.PLACES_FILE, expected=parts.PLACE),
             views=_load(path / parts.VIEWS_FILE, expected=parts.VIEW),
             view_index=ViewIndex.open(path / index.FILE),
-            streets=_streets(path, manifest),
+            streets=None if document is None else Streets.from_geojson(_json_object(document, path / streets.FILE)),
+            streets_document=document,
             calibration=read_calibration(
                 (path / parts.CALIBRATION_FILE).read_bytes(), path=str(path / parts.CALIBRATION_FILE)
             ),
@@ -117,9 +121,9 @@ class MapBundle:
 
     def streets_geojson(self) -> bytes:
         """The streets as they were given; an empty collection where the map has none."""
-        if self.streets is None:
+        if self.streets_document is None:
             return b'{"type": "FeatureCollection", "features": []}\n'
-        return (self.path / streets.FILE).read_bytes()
+        return self.streets_document
 
 
 def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
@@ -149,20 +153,14 @@ def _load(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
     return array  # type: ignore[no-any-return]  # np.load is not typed for one array
 
 
-def _json_object(path: Path) -> dict[str, Any]:
+def _json_object(content: bytes, path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_bytes())
+        document = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise _defect(path, "it is no JSON") from error
     if not isinstance(document, dict):
         raise _defect(path, "it is no JSON object")
     return document
-
-
-def _streets(path: Path, manifest: Manifest) -> Streets | None:
-    if streets.FILE not in manifest.files:
-        return None
-    return Streets.from_geojson(_json_object(path / streets.FILE))
 
 
 def _cloud(path: Path, manifest: Manifest, *, verify: bool) -> SurfelMap | None:

@@ -228,3 +228,9 @@ def test_one_query_of_three_thousand_makes_another_value():
     assert Reason(None, "").fits(None)
     assert not Reason(None, "").fits(0.5)
     assert not Reason(0.5, "").fits(None)
+
+
+def test_every_typed_reason_names_the_value_that_it_explains():
+    for row_id, reason in WHY_MISSED.items():
+        assert isinstance(reason, Reason), row_id
+        assert reason.text, row_id

@@ -164,6 +164,33 @@ def test_an_error_of_ours_is_a_message_without_a_traceback(
     assert capsys.readouterr().err == "streetfix: queries/a: poses.txt is missing; give a set with truth\n"
 
 
+@pytest.mark.parametrize(
+    "error", [FileNotFoundError(2, "No such file", "scans/7.bin"), OSError(28, "No space left on device")]
+)
+def test_what_the_system_refuses_is_a_line_and_no_traceback(
+    error: OSError, mount: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def evaluate() -> None:
+        raise error
+
+    mount(evaluate=evaluate)
+    assert run("evaluate") == 1
+    told = capsys.readouterr().err
+    assert (
+        told
+        == f"streetfix: {error.filename or 'a file'}: {error.strerror}; check the file, its folder and the disk, and start again\n"
+    )
+
+
+def test_an_error_of_a_package_that_calls_itself_an_os_error_is_seen_whole(mount: Callable[..., None]) -> None:
+    def evaluate() -> None:
+        raise OSError("a defect")
+
+    mount(evaluate=evaluate)
+    with pytest.raises(OSError, match="a defect"):
+        run("evaluate")
+
+
 @pytest.fixture
 def service_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """An installation without the package that builds maps, as in the container image."""

@@ -71,7 +71,7 @@ def test_sigterm_at_any_moment_ends_the_supervisor_and_all_workers(started: list
             assert os.waitstatus_to_exitcode(status) in (0, -signal.SIGTERM), status
             os.close(alive)
         """,
-        str(random.randrange(2**32)), "60",
+        str(random.randrange(2**32)), "60",  # noqa: S311  # no secret
     )  # fmt: skip
     started.append(process)
     _, told = process.communicate(timeout=300)

@@ -14,6 +14,7 @@ import pytest
 
 from service.client import AsyncClient, Client, Frame, Options, PinholeCamera, Prior, PriorPosition, PriorWgs84, rest
 from service.client.retry import RetryPolicy
+from service.client.tls import ClientTls
 from service.errors import (
     ForeignServiceError,
     NoAnswerInTimeError,
@@ -315,7 +316,7 @@ OF_HTTPX = sorted(
 def test_every_exception_of_httpx_is_one_of_ours(kind: type[Exception]) -> None:
     error = kind.__new__(kind)
     Exception.__init__(error, "why")
-    with pytest.raises(StreetfixError) as caught, rest.errors_of_httpx("http://x", 1.0):
+    with pytest.raises(StreetfixError) as caught, rest.errors_of_httpx("http://x", 1.0, ClientTls()):
         raise error
     assert caught.value.__cause__ is error
     assert "http://x" in caught.value.message

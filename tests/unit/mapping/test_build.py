@@ -262,3 +262,25 @@ def test_a_calibration_that_is_missing_or_none_stops_the_build_before_any_place(
 def test_a_map_is_described_in_one_line(bundle):
     text = describe(bundle.manifest)
     assert text.startswith(f"map small, version {bundle.manifest.version}: {bundle.manifest.counts.places} places")
+
+
+def test_a_survey_with_poses_of_two_frames_is_refused_before_the_work(small_dataset, encoder_file, tmp_path):
+    """One pose in UTM among local ones: its voxels would have had the keys of others."""
+
+    class OneInUtm(Dataset):
+        def survey_poses(self):
+            poses = super().survey_poses()
+            poses[7, :2, 3] = [447_000.0, 5_411_000.0]
+            return poses
+
+    told = []
+    with pytest.raises(DatasetError, match=r"survey/poses\.txt: scan 7 lies .* km from the middle of the map"):
+        build_map(
+            OneInUtm(small_dataset.folder),
+            encoder_file,
+            tmp_path / "m",
+            SETTINGS,
+            report=lambda *each: told.append(each),
+        )
+    assert told == []
+    assert not (tmp_path / "m").exists()
