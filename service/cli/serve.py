@@ -8,7 +8,7 @@ import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -69,7 +69,7 @@ def command(
     ] = None,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.03]"),
+        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
     ] = None,
 ) -> None:
     """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
@@ -156,6 +156,7 @@ def _answer_by_workers(settings: "Settings") -> None:
 
     with (
         tempfile.TemporaryDirectory(prefix="streetfix-") as folder,
+        closing(SharedMemory()) as memory,
         _held_port(settings.host, settings.port) as port,
         _held_port(settings.host, settings.grpc_port) as grpc_port,
         _held_port(settings.health_host or settings.host, settings.health_port) as health_port,
@@ -164,7 +165,6 @@ def _answer_by_workers(settings: "Settings") -> None:
         counts.mkdir()
         os.environ[METRICS_FOLDER] = str(counts)  # Prometheus' client looks here when it is imported, which workers do
         shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port, "health_port": health_port})
-        memory = SharedMemory()
 
         def work(number: int, ready: Callable[[], None]) -> None:
             with (

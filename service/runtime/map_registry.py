@@ -162,6 +162,7 @@ class MapRegistry:
 
     def wants(self, version: MapVersion) -> bool:
         """Whether a version should be opened here: it is mounted, or would be if every worker had it, and is not open yet."""
+        self._maps()  # lets go of what was taken out meanwhile
         if (known := self._open.get(version.key)) is not None and _made_at(known.bundle.manifest) >= version.made_at:
             return False
         table = self.table.read()
@@ -181,7 +182,7 @@ class MapRegistry:
 
     def unmount(self, name: str, version: str) -> None:
         """Take a version out of all workers; if it served, the newest of the others does. Nothing happens if it is not there."""
-        self.table.remove(name, version)
+        self.table.remove([(name, version)])
 
     def _maps(self) -> Mapping[str, _Map]:
         if self._view.table is not self.table.read():

@@ -101,10 +101,9 @@ class MapWatcher:
         """
         if drop_missing:
             self._failed.clear()
+            self._is_drop_due = True
         bundles = self._bundles()
         told = self._mount_new(bundles)
-        if drop_missing:
-            self._is_drop_due = True
         if self._is_drop_due and (dropped := self._drop()):
             told += dropped + self._mount_new(bundles)  # older versions may have found room
         self._tell_refused()
@@ -230,7 +229,8 @@ class MapWatcher:
         present = set(self._present())
         held = {manifest_key(manifest) for path, (_, manifest) in self._manifests.items() if path in present}
         unread = [path for path, (_, error) in self._failed.items() if _is_unreadable(error)]
-        told, self._is_drop_due = [], False
+        gone: list[Key] = []
+        self._is_drop_due = False
         for localizer in [v for each in self._registry for v in self._registry.versions(each.bundle.name)]:
             bundle = localizer.bundle
             name, version = manifest_key(bundle.manifest)
@@ -241,10 +241,12 @@ class MapWatcher:
             if serves and any(each.name == name for each in table.offers.get(number, ())):
                 self._is_drop_due = True  # other workers are still opening what is to serve instead
                 continue
-            self._registry.unmount(name, version)
-            told.append(f"unmounted {name} {version}")
+            gone.append((name, version))
+        # In one change: the next one to serve must not be one that is gone as well.
+        self._registry.table.remove(gone)
+        for name, version in gone:
             _log.warning("map_unmounted name=%s version=%s", name, version)
-        return told
+        return [f"unmounted {name} {version}" for name, version in gone]
 
     def _require(self, *, strict: bool) -> None:
         """Raise what keeps the service from its first start."""

@@ -23,6 +23,7 @@ import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any
 
 from service.errors import BundleError, UnknownMapError
@@ -126,15 +127,10 @@ class ServingTable:
             alone = not set(table.offers) - {self.number}
             mounted = [(each, known.serving) for known in table.maps.values() for each in known.versions]
             missing = [(each, serving) for each, serving in mounted if each.key not in keys]
-            lacking = frozenset(
-                each for each, serving in missing
-                if each.key not in given_up or (each.version == serving and not alone)
-            )  # fmt: skip
-            if lacking:
+            if any(each.key not in given_up or (each.version == serving and not alone) for each, serving in missing):
                 lacking = frozenset(each for each, _ in missing)
                 return table
-            for each, _ in missing:
-                table = _without(table, each.key)
+            table = reduce(_without, (each.key for each, _ in missing), table)
             return replace(table, offers={**table.offers, self.number: frozenset(opened)}, started=True)
 
         self._change(change)
@@ -169,9 +165,12 @@ class ServingTable:
 
         self._change(change)
 
-    def remove(self, name: str, version: str) -> None:
-        """Take a version out; if it served, the newest of the others does. Nothing happens if it is not there."""
-        self._change(lambda table: _without(table, (name, version)))
+    def remove(self, keys: Collection[Key]) -> None:
+        """Take versions out, all in one change; if one of them served, the newest that is left does.
+
+        Those that are not there do not matter.
+        """
+        self._change(lambda table: reduce(_without, keys, table))
 
     def settle(self) -> None:
         """Mount what waited only for workers that have ended."""
@@ -217,8 +216,14 @@ class SharedMemory:
             -1, mmap.PAGESIZE + 2 * _MOST_BYTES
         )  # shared; pages that nobody touches take no memory
         self._words = memoryview(self._memory)[: mmap.PAGESIZE].cast("I")
-        self._locks = tempfile.TemporaryFile()  # noqa: SIM115  # open as long as the service runs
+        self._locks = tempfile.TemporaryFile()  # noqa: SIM115  # `close` does
         self._store(0, Table())
+
+    def close(self) -> None:
+        """Let go of it; for the supervisor, after all workers have ended."""
+        self._words.release()
+        self._memory.close()
+        self._locks.close()
 
     @property
     def counter(self) -> int:
