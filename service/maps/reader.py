@@ -136,10 +136,14 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
         file = path / name
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
             raise _defect(file, "it is missing, or lies outside the bundle")
-        size = file.stat().st_size
+        try:
+            size = file.stat().st_size
+            found = sha256_of(file) if verify and size == entry.size else entry.sha256
+        except OSError as error:  # as when the bundle is being removed
+            raise _defect(file, f"it cannot be read ({error.strerror})") from error
         if size != entry.size:
             raise _defect(file, f"it has {size} bytes instead of {entry.size}")
-        if verify and sha256_of(file) != entry.sha256:
+        if found != entry.sha256:
             raise _defect(file, "its content is not what the manifest says")
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
         raise _defect(path / parts.ENCODER_FILE, "it is not the encoder that made the descriptors")
