@@ -42,9 +42,12 @@ def answering(
     except StreetfixError as error:
         code = error.code
         refuse(context, error)
-    except (GeneratorExit, grpc.RpcError, CancelledError):  # the client has gone
+    except (GeneratorExit, grpc.RpcError):  # the client has gone
         code = "CANCELLED"
         raise
+    except CancelledError:  # it has as well; gRPC would take this one for a defect, and log a traceback
+        code = "CANCELLED"
+        context.abort(grpc.StatusCode.CANCELLED, "the caller has gone")
     except Exception as error:
         code = "INTERNAL"
         fail(context, error, request_id)
