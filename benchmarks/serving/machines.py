@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
@@ -33,14 +34,18 @@ class Server:
     Args:
         maps: bundle, or folder of bundles.
         core: it is pinned to; None for all.
+        enter: called in its process before it begins, as to enter a control group.
         settings: as in the environment, lower case.
     """
 
-    def __init__(self, maps: Path, *, core: int | None = SERVED_CORE, **settings: object) -> None:
+    def __init__(
+        self, maps: Path, *, core: int | None = SERVED_CORE, enter: Callable[[], None] | None = None, **settings: object
+    ) -> None:
         environment = os.environ | {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
         began = time.perf_counter()
         self.process = subprocess.Popen(
-            [*_SERVE, str(maps), "--port", "0", "--grpc-port", "0"], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
+            [*_SERVE, str(maps), "--port", "0", "--grpc-port", "0"], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True,
+            preexec_fn=enter,  # the load generator has not begun its threads yet
         )  # fmt: skip
         pin(self.process.pid, core)
         told = _until(self.process.stdout, r"serving gRPC at (\S+)", r"serving at (\S+)")

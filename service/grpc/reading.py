@@ -1,12 +1,14 @@
-"""Reads a call's message in the call's own thread, with patience, and looks at its size before it is parsed."""
+"""Reads a call's message in the call's own thread, in its turn, with patience, and looks at its size before it is parsed."""
 
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import grpc
+from google.protobuf.message import DecodeError
 
-from service.errors import RequestError
+from service.errors import RequestError, StreetfixError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.memory import MessageMemory, held_by_call
 from service.grpc.patience import Patience
 from service.grpc.status import refuse
 
@@ -18,33 +20,93 @@ else:  # generic in its stub alone
 SERVICE: str = pb.DESCRIPTOR.services_by_name["LocalizationService"].full_name
 #: Fields of a message at its top, repeated ones counted each: more make no sense, and each may cost a hundred times its bytes.
 MOST_FIELDS = 64
+#: Seconds in which a message of another service (health, reflection) must be there: it is small.
+OTHERS_S = 3.0
 
 
 class ReadingInterceptor(_Interceptor):
     """Takes raw bytes where gRPC would parse in its one serving thread, and ends calls that never send them."""
 
-    def __init__(self, patience: Patience, *, timeout_s: float) -> None:
+    def __init__(
+        self,
+        patience: Patience,
+        memory: MessageMemory,
+        requested: Callable[[str, str, str, float | None], None],
+        *,
+        timeout_s: float,
+    ) -> None:
         self._patience = patience
+        self._memory = memory
+        self._requested = requested
         self._timeout_s = timeout_s
 
     def intercept_service(
         self, continuation: Callable[[grpc.HandlerCallDetails], Any], details: grpc.HandlerCallDetails
     ) -> Any:
-        """The handler of a call of ours, in another form."""
+        """The handler of a call, in another form where its message is read here."""
         handler = continuation(details)
-        if handler is None or handler.unary_unary is None or not details.method.startswith(f"/{SERVICE}/"):
+        if handler is None:
+            return None
+        ours = details.method.startswith(f"/{SERVICE}/")
+        if handler.unary_unary is not None:
+            answer = (
+                self._answer(handler, details.method.rsplit("/", 1)[-1]) if ours else self._answer_of_others(handler)
+            )
+            return grpc.stream_unary_rpc_method_handler(answer, response_serializer=handler.response_serializer)
+        if ours or handler.stream_stream is None:
             return handler
+        return grpc.stream_stream_rpc_method_handler(
+            self._stream_of_others(handler), handler.request_deserializer, handler.response_serializer
+        )
 
+    def _answer(self, handler: Any, method: str) -> Callable[[Iterator[bytes], grpc.ServicerContext], Any]:
         def answer(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
-            with self._patience.at_most(self._timeout_s, context.cancel):
-                raw = next(messages, b"")
-            try:
-                require_few_fields(raw)
-            except RequestError as error:
-                refuse(context, error)
-            return handler.unary_unary(handler.request_deserializer(raw), context)
+            with self._memory.hold() as hold:
+                try:
+                    with self._memory.turn(hold), self._patience.at_most(self._timeout_s, context.cancel):
+                        raw = next(messages, b"")
+                    hold.shrink_to(2 * len(raw))  # as bytes and, parsed, once more
+                    require_few_fields(raw)
+                except StreetfixError as error:
+                    self._requested("grpc", method, error.code, None)
+                    refuse(context, error)
+                size, message = len(raw), handler.request_deserializer(raw)
+                del raw
+                hold.shrink_to(size)
+                held_by_call.set(hold)
+                return handler.unary_unary(message, context)
 
-        return grpc.stream_unary_rpc_method_handler(answer, response_serializer=handler.response_serializer)
+        return answer
+
+    def _answer_of_others(self, handler: Any) -> Callable[[Iterator[bytes], grpc.ServicerContext], Any]:
+        def answer(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
+            try:
+                with self._memory.turn_of_others(streams=False), self._patience.at_most(OTHERS_S, context.cancel):
+                    message = handler.request_deserializer(next(messages, b""))
+            except StreetfixError as error:
+                refuse(context, error)
+            except DecodeError:
+                refuse(context, _no_message())
+            return handler.unary_unary(message, context)
+
+        return answer
+
+    def _stream_of_others(self, handler: Any) -> Callable[[Iterator[Any], grpc.ServicerContext], Iterator[Any]]:
+        def in_turn(messages: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
+            while True:
+                try:
+                    with self._memory.turn_of_others(streams=True), self._patience.at_most(OTHERS_S, context.cancel):
+                        message = next(messages, None)
+                except StreetfixError as error:
+                    refuse(context, error)
+                if message is None:
+                    return
+                yield message
+
+        def answers(messages: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
+            yield from handler.stream_stream(in_turn(messages, context), context)
+
+        return answers
 
 
 def require_few_fields(raw: bytes, *, most: int = MOST_FIELDS) -> None:
