@@ -1,7 +1,7 @@
 """Memory for gRPC messages: gRPC reads a whole message before our code sees how long it is.
 
-A message is read only when somebody asks for it (until then flow control keeps it at the client, but for 64 KiB). So whoever asks
-reserves the largest size first, and gives back what the message did not take.
+A message is read only when somebody asks for it (until then flow control keeps it at the client, but for 64 KiB). So no more calls
+ask at once than there is memory for messages of the largest size. When a message is here its own size is reserved, or it is refused.
 """
 
 import threading
@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 from service.errors import BusyError
-from service.runtime.memory import Hold, MemoryBudget
+from service.runtime.memory import GRPC_OTHERS, GRPC_PARSED, Hold, MemoryBudget
 
-#: Shares of the budget for messages that are being read, and for open streams, each of which may be read at any time.
-READING_SHARE, STREAMS_SHARE = 0.25, 0.5
+#: Share of the budget for open streams, each of which may send a message of the largest size at any time.
+STREAMS_SHARE = 0.5
 #: Calls and streams of other services (health, reflection) that are read at once, outside of the budget: they are answered when it is
 #: spent.
-OTHER_CALLS, OTHER_STREAMS = 2, 1
+OTHER_CALLS, OTHER_STREAMS = 1, GRPC_OTHERS - 1
 #: A call waits so long for its turn: reading takes milliseconds, so this is an overload.
 TURN_S = 1.0
 
@@ -36,7 +36,8 @@ class MessageMemory:
     def __init__(self, budget: MemoryBudget, *, most_bytes: int, most_streams: int) -> None:
         self._budget = budget
         self._most_bytes = most_bytes
-        self._reading = threading.Semaphore(max(1, int(budget.limit * READING_SHARE) // most_bytes))
+        self._reading = threading.Semaphore(max(1, budget.messages))
+        self._parsing = threading.Semaphore(GRPC_PARSED)
         self._other_calls = threading.Semaphore(OTHER_CALLS)
         self._other_streams = threading.Semaphore(OTHER_STREAMS)
         self.streams = min(most_streams, int(budget.limit * STREAMS_SHARE) // most_bytes)
@@ -47,15 +48,21 @@ class MessageMemory:
         return self._budget.hold()
 
     @contextmanager
-    def turn(self, hold: Hold) -> Iterator[None]:
-        """Read one message inside, for which the largest size is reserved.
+    def turn(self) -> Iterator[None]:
+        """Read one message inside.
 
         Raises:
-            BusyError: others read, or the memory for requests is taken.
+            BusyError: more calls read than there is memory for.
         """
         with _taken(self._reading, "more calls send messages than there is memory for; try again in a second"):
-            hold.grow(self._most_bytes)
             yield
+
+    @contextmanager
+    def parsing(self, count: int) -> Iterator[None]:
+        """Parse a message of so many bytes inside, while its bytes are there, too."""
+        with self._parsing:
+            yield
+        self._budget.freed(count)  # the pieces that it came in, and its bytes
 
     @contextmanager
     def turn_of_others(self, *, streams: bool) -> Iterator[None]:

@@ -63,16 +63,17 @@ class ReadingInterceptor(_Interceptor):
         def answer(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
             with self._memory.hold() as hold:
                 try:
-                    with self._memory.turn(hold), self._patience.at_most(self._timeout_s, context.cancel):
-                        raw = next(messages, b"")
-                    hold.shrink_to(2 * len(raw))  # as bytes and, parsed, once more
+                    with self._memory.turn():
+                        with self._patience.at_most(self._timeout_s, context.cancel):
+                            raw = next(messages, b"")
+                        hold.grow(len(raw))
                     require_few_fields(raw)
                 except StreetfixError as error:
                     self._requested("grpc", method, error.code, None)
                     refuse(context, error)
-                size, message = len(raw), handler.request_deserializer(raw)
-                del raw
-                hold.shrink_to(size)
+                with self._memory.parsing(len(raw)):
+                    message = handler.request_deserializer(raw)
+                    del raw
                 held_by_call.set(hold)
                 return handler.unary_unary(message, context)
 

@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from service.errors import BusyError, RequestError, TooLargeError
+from service.runtime.heap import LARGE_BYTES, Trimmer
 
 if TYPE_CHECKING:
     from service.runtime.settings import Settings
@@ -29,9 +30,12 @@ THREAD_BYTES = 32 * MIB
 SPARE_SHARE = 0.125
 #: Pages of maps can be read again from their files, but an answer that has to do so is slow: so much of the limit stays for them.
 MAPS_SHARE = 0.25
-#: Largest messages that gRPC may hold beside the budget: copies while its one thread takes a message over from C, and three calls
-#: of health and reflection, which must be answered when the budget is spent.
-GRPC_MESSAGES = 5.2
+#: Largest messages that gRPC holds beside the budget: 2.2 copies while its one thread takes a message over from C, those of health
+#: and reflection, which must be answered when the budget is spent, and those that are parsed.
+GRPC_PARSED, GRPC_OTHERS = 2, 2
+GRPC_COPIES = 2.2
+#: Share of the memory for messages that are being read, whose sizes nobody knows yet.
+GRPC_READING_SHARE = 0.25
 #: Below this the service would refuse what robots usually send.
 LEAST_BYTES = 64 * MIB
 
@@ -51,15 +55,18 @@ class MemoryBudget:
 
     Args:
         limit: bytes.
+        messages: of the largest size that gRPC may read at once, outside of the limit.
     """
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, messages: int = 0) -> None:
         self.limit = limit
+        self.messages = messages
         self._lock = threading.Lock()
         self._held = 0
         # Pictures give back where the interpreter drops them, which may be inside of this lock: that only appends here.
         self._returned: deque[int] = deque()
         self._told: Callable[[float], None] = lambda _: None
+        self._trimmer = Trimmer()
 
     @property
     def held(self) -> int:
@@ -93,6 +100,12 @@ class MemoryBudget:
             self._take_back()
             self._held -= count
             self._told(self._held)
+        self.freed(count)
+
+    def freed(self, count: int) -> None:
+        """Take note of memory that was freed, so that the system gets it back."""
+        if count >= LARGE_BYTES:
+            self._trimmer.soon()
 
     def give_back_later(self, count: int) -> None:
         """Give back so many bytes, from wherever the interpreter drops an object."""
@@ -108,7 +121,8 @@ class Hold:
 
     def __init__(self, budget: MemoryBudget) -> None:
         self._budget = budget
-        self._under_way: list[Future[Any]] = []
+        self._lock = threading.Lock()
+        self._users = 1  # the request itself, and the work on it
         self.bytes = 0
 
     def __enter__(self) -> Self:
@@ -119,7 +133,7 @@ class Hold:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Give back what is held, when all work is over."""
-        self._finish()
+        self._one_less()
 
     def grow(self, count: int) -> None:
         """Reserve so many bytes more, before they are allocated.
@@ -149,7 +163,9 @@ class Hold:
 
     def until(self, work: "Future[Any]") -> None:
         """Keep what is held at least until some work is over, also where its caller has gone meanwhile."""
-        self._under_way = [each for each in self._under_way if not each.done()] + [work]
+        with self._lock:
+            self._users += 1
+        work.add_done_callback(lambda _: self._one_less())
 
     def leave_with(self, owner: Any) -> None:
         """Leave what is held to an object: it is given back when that is no more."""
@@ -157,12 +173,12 @@ class Hold:
             weakref.finalize(owner, self._budget.give_back_later, self.bytes).atexit = False
         self.bytes = 0
 
-    def _finish(self) -> None:
-        for each in self._under_way:
-            if not each.done():
-                each.add_done_callback(lambda _: self._finish())
-                return
-        self.shrink_to(0)
+    def _one_less(self) -> None:
+        with self._lock:
+            self._users -= 1
+            over = self._users == 0
+        if over:
+            self.shrink_to(0)
 
 
 def budget_of(settings: "Settings", *, threads: int, maps_bytes: int) -> MemoryBudget:
@@ -174,32 +190,30 @@ def budget_of(settings: "Settings", *, threads: int, maps_bytes: int) -> MemoryB
         maps_bytes: of the files of the open maps, which all processes share.
 
     Raises:
-        RequestError: the limit leaves too little for requests.
+        RequestError: too little is left for requests.
     """
-    least = max(LEAST_BYTES, 2 * settings.limits.max_request_bytes)
-    if settings.request_memory_mib is not None:
-        share = settings.request_memory_mib * MIB // settings.workers
-        if share < least:
-            raise RequestError(
-                f"setting request_memory_mib: {_mib(share)} for each of {settings.workers} processes, and {_mib(least)} is the least: "
-                "two of the largest requests; set more, or a smaller limits.max_request_bytes",
-                field="request_memory_mib",
-            )
-        return MemoryBudget(share)
-    limit = memory_limit()
-    shared = limit * SPARE_SHARE + min(maps_bytes, limit * MAPS_SHARE)
-    process = max(anonymous_bytes(), PROCESS_BYTES) + threads * THREAD_BYTES
-    if settings.grpc_port is not None:
-        process += round(GRPC_MESSAGES * settings.limits.max_request_bytes)
-    left = int((limit - shared) / settings.workers - process)
+    message = settings.limits.max_request_bytes
+    if settings.request_memory_mib is None:
+        limit = memory_limit()
+        shared = limit * SPARE_SHARE + min(maps_bytes, limit * MAPS_SHARE)
+        process = max(anonymous_bytes(), PROCESS_BYTES) + threads * THREAD_BYTES
+        if settings.grpc_port is not None:
+            process += round((GRPC_COPIES + GRPC_PARSED + GRPC_OTHERS) * message)
+        left = int((limit - shared) / settings.workers - process)
+        of = f"the memory limit of {_mib(limit)} leaves"
+    else:
+        left = settings.request_memory_mib * MIB // settings.workers
+        of = f"setting request_memory_mib: {settings.request_memory_mib} MiB leave"
+    least = max(LEAST_BYTES, 3 * message)
     if left < least:
         raise RequestError(
-            f"the memory limit of {_mib(limit)} leaves {_mib(max(0, left))} for the requests of each of {settings.workers} processes with "
-            f"{threads} threads, and {_mib(least)} is the least; raise the limit, set fewer workers or threads or a smaller "
-            "limits.max_request_bytes, or set request_memory_mib",
+            f"{of} {_mib(max(0, left))} for the requests of each of {settings.workers} processes with {threads} threads, and {_mib(least)} "
+            "is the least (three of the largest requests); give it more memory, fewer workers or threads, or a smaller "
+            "limits.max_request_bytes",
             field="request_memory_mib",
         )
-    return MemoryBudget(left)
+    messages = 0 if settings.grpc_port is None else max(1, int(left * GRPC_READING_SHARE) // message)
+    return MemoryBudget(left - messages * message, messages)
 
 
 def memory_limit(cgroups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int:
