@@ -13,10 +13,11 @@ from service.http.protocol import HEAD_BYTES, PIPELINED, BoundedHttp
 _BODY = b"a=1&" * 40
 #: Good ones, and two beyond the bounds; the first byte says into how large pieces a connection would have cut the rest.
 SEEDS = (
-    b"\x00GET /livez HTTP/1.1\r\nHost: x\r\nAccept: */*\r\n\r\n",
-    b"\x09POST /v1/localize?a=%%41 HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\nExpect: 100-continue\r\n\r\n%s" % (len(_BODY), _BODY),
-    b"\x05POST / HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nabcde\r\n1;x=y\r\nf\r\n0\r\nX-T: 1\r\n\r\n",
-    b"\x00" + 3 * b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+    b"\x00GET /livez HTTP/1.1\r\nHost: localhost\r\nAccept: */*\r\n\r\n",
+    b"\x09POST /v1/localize?a=%%41 HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\nExpect: 100-continue\r\n\r\n%s"
+    % (len(_BODY), _BODY),
+    b"\x05POST / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nabcde\r\n1;x=y\r\nf\r\n0\r\nX-T: 1\r\n\r\n",
+    b"\x00" + 3 * b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n",
     b"\x00" + 2 * PIPELINED * b"GET / HTTP/1.1\r\n\r\n",
     b"\xffGET / HTTP/1.1\r\n" + HEAD_BYTES // 64 * (b"X-A: " + 90 * b"a" + b"\r\n"),
     b"\x20GET / HTTP/1.0\r\nConnection: upgrade\r\nUpgrade: websocket\r\n\r\n",

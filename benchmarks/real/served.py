@@ -12,12 +12,16 @@ from service.geometry.rigid import rotation_from_quaternion_xyzw, transform_from
 
 
 def answers(bundle: Path, dataset: Dataset, queries: str) -> NDArray[np.float64]:
-    """T_map_camera (n, 4, 4) of every query's answer, whatever its status: the best hypothesis counts."""
+    """T_map_camera (n, 4, 4) of every query's answer, whatever its status: the best hypothesis counts; infinite where there is none."""
     found = []
     with serving(bundle, 0) as service, Client(service.url) as client:
         for frame in dataset.queries(queries):
             answer = client.localize(frame.rgb(), frame.depth_m(), frame.camera.pinhole())
-            position, turned = answer.pose.position, answer.pose.orientation
+            pose = answer.hypotheses[0].pose if answer.hypotheses else answer.pose
+            if pose is None:
+                found.append(np.full((4, 4), np.inf))
+                continue
+            position, turned = pose.position, pose.orientation
             R = rotation_from_quaternion_xyzw(np.array([turned.x, turned.y, turned.z, turned.w]))
             found.append(transform_from(R, np.array([position.x, position.y, position.z])))
     return np.array(found).reshape(-1, 4, 4)

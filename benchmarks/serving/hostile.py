@@ -26,7 +26,7 @@ _REQUEST = json.dumps({"camera": _CAMERA}).encode()
 def hostile_rows(report: Report, site: Site, *, core: int | None) -> None:
     """Memory over what it was, requests of others that failed, and how each kind was answered."""
     sent = site.payloads(refine=True)
-    good = {"rgb": _part(sent[0].body, b"rgb"), "depth": _part(sent[0].body, b"depth"), "request": _REQUEST}
+    good = {"rgb": part_of(sent[0].body, b"rgb"), "depth": part_of(sent[0].body, b"depth"), "request": _REQUEST}
     kinds = hostile_kinds(good)
     with Server(site.bundle, core=core, request_timeout_s=10) as server:
         with asking(server.url, sent[:2]) as (answers, failed):
@@ -128,7 +128,7 @@ def _first_line(connection: socket.socket) -> str:
 def _announce(url: str, length: int, *, wait_s: float = 0.0) -> str:
     with _connected(url) as connection:
         connection.sendall(
-            b"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+            b"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
             + f"Content-Length: {length}\r\n\r\n".encode()
         )
         if wait_s:
@@ -141,7 +141,8 @@ def _slow(url: str) -> str:
     """A byte a second until the service has had enough."""
     with _connected(url) as connection:
         connection.sendall(
-            b"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=b\r\nContent-Length: 1000\r\n\r\n"
+            b"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+            b"Content-Length: 1000\r\n\r\n"
         )
         connection.settimeout(1.0)
         for _ in range(15):
@@ -162,7 +163,7 @@ def _slow(url: str) -> str:
 def _endless_headers(url: str) -> str:
     with _connected(url) as connection:
         try:
-            connection.sendall(b"GET /livez HTTP/1.1\r\nHost: x\r\n")
+            connection.sendall(b"GET /livez HTTP/1.1\r\nHost: localhost\r\n")
             for _ in range(64):
                 connection.sendall(b"X-A: " + b"a" * 65_536 + b"\r\n")
         except OSError:
@@ -170,7 +171,7 @@ def _endless_headers(url: str) -> str:
         return _first_line(connection)
 
 
-def _part(body: bytes, name: bytes) -> bytes:
+def part_of(body: bytes, name: bytes) -> bytes:
     """Content of a part of a body that we made."""
     start = body.index(b"\r\n\r\n", body.index(b'name="' + name + b'"')) + 4
     boundary = body[: body.index(b"\r\n")]

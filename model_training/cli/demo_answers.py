@@ -22,7 +22,10 @@ from service.geometry.rigid import heading_of_camera, wrap_angle
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A question and its answer of the REST contract, or why there is none; ``elapsed_s`` over HTTP."""
+    """A question and its answer of the REST contract, or why there is none; ``elapsed_s`` over HTTP.
+
+    An answer that is not LOCALIZED has neither street nor pose, so it is neither right nor wrong.
+    """
 
     question: Question
     answer: dict[str, Any] | None
@@ -31,21 +34,23 @@ class Outcome:
 
     @property
     def right(self) -> bool | None:
-        """Whether the street, or where places are single frames the first place, is the true one; None: not known."""
+        """Whether the street, or where places are single frames the first place, is the true one; None: not known, or no pose."""
         if self.question.place is None and self.question.street is None:
             return None
         if self.answer is None:
             return False
         if self.question.place is not None:
             return bool(self.answer["neighbours"][0]["place"] == self.question.place)
+        if self.answer["pose"] is None:
+            return None
         street = self.answer["street"]
         return street is not None and self.question.street is not None and street["id"] == self.question.street[0]
 
     @property
     def error_m(self) -> float | None:
-        """Horizontal distance of the answered position from the true one; None in another one of single places."""
+        """Horizontal distance of the answered position from the true one; None without a pose, or in another one of single places."""
         T = self.question.T_map_camera
-        if T is None or self.answer is None or self._is_elsewhere:
+        if T is None or self.answer is None or self.answer["pose"] is None or self._is_elsewhere:
             return None
         position = self.answer["pose"]["position"]
         return math.hypot(position["x"] - T[0, 3], position["y"] - T[1, 3])
@@ -54,7 +59,7 @@ class Outcome:
     def heading_error_deg(self) -> float | None:
         """Angle between the answered heading and the true one; None where ``error_m`` is."""
         T = self.question.T_map_camera
-        if T is None or self.answer is None or self._is_elsewhere:
+        if T is None or self.answer is None or self.answer["pose"] is None or self._is_elsewhere:
             return None
         return abs(math.degrees(wrap_angle(math.radians(self.answer["pose"]["heading_deg"]) - heading_of_camera(T))))
 
@@ -140,7 +145,9 @@ def _answered(outcome: Outcome) -> str:
     if answer is None:
         return _flat(outcome.problem)
     pose, street = answer["pose"], answer["street"]
-    text = _where(street and street["name"], pose["position"]["x"], pose["position"]["y"], pose["heading_deg"])
+    text = "no pose"
+    if pose is not None:
+        text = _where(street and street["name"], pose["position"]["x"], pose["position"]["y"], pose["heading_deg"])
     sure = "" if answer["confidence"] is None else f" {answer['confidence']:.3f}"
     return f"{text}\n{answer['status']}{sure}"
 
@@ -167,6 +174,9 @@ def _summary(outcomes: list[Outcome], what: str) -> str:
     verdicts = [outcome.right for outcome in outcomes if outcome.right is not None]
     errors = sorted(error for outcome in outcomes if (error := outcome.error_m) is not None)
     parts = [f"{sum(verdicts)} of {len(verdicts)} {what} right"]
+    without = sum(outcome.answer is not None and outcome.answer["pose"] is None for outcome in outcomes)
+    if without:
+        parts.append(f"{without} of {len(outcomes)} answers without a pose, since they are not LOCALIZED")
     if errors:
         parts.append(f"position off by {median(errors):.2f} m (median), {errors[-1]:.2f} m (largest)")
     parts.append(f"{1e3 * median(outcome.elapsed_s for outcome in outcomes):.0f} ms a query over HTTP (median)")

@@ -81,7 +81,7 @@ class Predictions:
     @staticmethod
     def load(path: Path) -> "Predictions":
         """Read what ``save`` wrote."""
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return Predictions(
                 **{
                     name: arrays[name]
@@ -173,7 +173,7 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
     for k, (answer, _) in enumerate(answers):
         if answer is None:
             continue
-        T_answer[k] = answer.T_map_camera
+        T_answer[k] = answer.T_map_camera_guess
         status[k] = answer.status
         if answer.confidence is not None:
             confidence[k] = answer.confidence

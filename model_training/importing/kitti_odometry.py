@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from model_training.datasets.files import read_bytes
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
 from model_training.importing.trajectory import Trajectory
@@ -47,7 +48,7 @@ def _times(path: Path, last: int) -> list[float]:
     if not path.is_file():
         return [n / RATE_HZ for n in range(last + 1)]
     try:
-        times = [float(line) for line in path.read_text(encoding="ascii").split()]
+        times = [float(line) for line in read_bytes(path).decode("ascii").split()]
     except ValueError as error:
         raise DatasetError(f"{path}: not a number a line: {error}", field=path.name) from error
     if len(times) <= last:
@@ -60,7 +61,7 @@ def _poses(path: Path, stamps: list[float], T_lidar_cam0: np.ndarray) -> Traject
     if not path.is_file():
         return None
     poses, times = [], []
-    for number, line in enumerate(path.read_text(encoding="ascii", errors="replace").splitlines()):
+    for number, line in enumerate(read_bytes(path).decode("ascii", errors="replace").splitlines()):
         try:
             values = np.array(line.split(), np.float64).reshape(3, 4)
         except ValueError as error:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from model_training.datasets.files import read_bytes
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
 from model_training.importing.oxts import read_oxts
@@ -90,7 +91,7 @@ def _stamps(path: Path, numbers: list[int]) -> dict[int, float] | None:
     """Seconds by a frame's number, or None where no times were recorded."""
     if not path.is_file():
         return None
-    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    lines = read_bytes(path).decode("ascii", errors="replace").splitlines()
     if numbers and numbers[-1] >= len(lines):
         raise DatasetError(
             f"{path} has {len(lines)} lines, and there is a frame {numbers[-1]:010d}; take the file from the recording again",

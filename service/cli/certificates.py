@@ -1,4 +1,4 @@
-"""TLS for both faces, from the settings' PEM files."""
+"""TLS for both faces, from the settings' PEM files, which may be replaced while the service runs."""
 
 import ssl
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.errors import KeysError
+from service.runtime.readable import why_unreadable
 
 if TYPE_CHECKING:
     import grpc
@@ -14,53 +15,139 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Certificates:
-    """PEM files that were found good.
+class _Loaded:
+    """One state of the files.
 
     Attributes:
-        certificate: chain of the service.
-        key: its private key.
-        client_ca: authorities of the clients' certificates; None asks for none.
+        context: for the handshakes of REST.
+        certificate: PEM chain.
+        key: PEM.
+        client_ca: PEM; None asks for no certificates.
     """
 
-    certificate: Path
-    key: Path
-    client_ca: Path | None
+    context: ssl.SSLContext
+    certificate: bytes
+    key: bytes
+    client_ca: bytes | None
+
+
+class Certificates:
+    """Certificate, key and the clients' authorities; handshakes take the state of the last successful ``reload``.
+
+    Args:
+        certificate: file of the service's chain.
+        key: file of its private key.
+        client_ca: file of the authorities of the clients' certificates; None asks for none.
+
+    Raises:
+        KeysError: one cannot be read, or key and certificate do not belong together.
+    """
+
+    def __init__(self, certificate: Path, key: Path, client_ca: Path | None) -> None:
+        self._certificate = certificate
+        self._key = key
+        self._client_ca = client_ca
+        self._now = self._load()
 
     @classmethod
     def read(cls, settings: "Settings") -> "Certificates":
         """Check the settings' files before anything listens.
 
         Raises:
-            KeysError: one cannot be read, or key and certificate do not belong together.
+            KeysError: as above, or the settings name none.
         """
         if settings.tls_certificate is None or settings.tls_key is None:
             raise KeysError("tls_certificate and tls_key are not set")
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        try:
-            context.load_cert_chain(settings.tls_certificate, settings.tls_key)
-        except (OSError, ssl.SSLError) as error:
-            raise KeysError(
-                f"{settings.tls_certificate}, {settings.tls_key}: no certificate with its key ({error})"
-            ) from error
-        if settings.tls_client_ca is not None:
-            try:
-                context.load_verify_locations(settings.tls_client_ca)
-            except (OSError, ssl.SSLError) as error:
-                raise KeysError(f"{settings.tls_client_ca}: no certificates of authorities ({error})") from error
         return cls(settings.tls_certificate, settings.tls_key, settings.tls_client_ca)
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files."""
+        return tuple(path for path in (self._certificate, self._key, self._client_ca) if path is not None)
+
+    def reload(self) -> None:
+        """Read the files again, for handshakes from now on; connections that are open go on as they are.
+
+        Raises:
+            KeysError: they cannot be used; what was in force stays so.
+        """
+        self._now = self._load()
 
     def for_uvicorn(self) -> dict[str, Any]:
         """Arguments of its configuration."""
-        found: dict[str, Any] = {"ssl_certfile": str(self.certificate), "ssl_keyfile": str(self.key)}
-        if self.client_ca is not None:
-            found |= {"ssl_ca_certs": str(self.client_ca), "ssl_cert_reqs": ssl.CERT_REQUIRED}
-        return found
+        return {"ssl_context_factory": lambda _config, _default: _context_of(self)}
 
     def for_grpc(self) -> "grpc.ServerCredentials":
         """Credentials of its server."""
         import grpc
 
-        pair = (self.key.read_bytes(), self.certificate.read_bytes())
-        roots = None if self.client_ca is None else self.client_ca.read_bytes()
-        return grpc.ssl_server_credentials([pair], root_certificates=roots, require_client_auth=roots is not None)
+        def configuration(loaded: _Loaded) -> Any:
+            return grpc.ssl_server_certificate_configuration(
+                [(loaded.key, loaded.certificate)], root_certificates=loaded.client_ca
+            )
+
+        given = self._now
+
+        def newer() -> Any:
+            """Asked before every handshake; None where nothing has changed."""
+            nonlocal given
+            now = self._now
+            if now is given:
+                return None
+            given = now
+            return configuration(now)
+
+        return grpc.dynamic_ssl_server_credentials(
+            configuration(given), newer, require_client_authentication=self._client_ca is not None
+        )
+
+    def wrap_bio(self, *given: Any, **named: Any) -> ssl.SSLObject:
+        """Begin a handshake of REST."""
+        return self._now.context.wrap_bio(*given, **named)
+
+    def _load(self) -> _Loaded:
+        before = self._bytes()
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        try:
+            context.load_cert_chain(self._certificate, self._key, password=_no_password)
+        except (OSError, ssl.SSLError) as error:
+            raise KeysError(f"{self._certificate}, {self._key}: no certificate with its key ({error})") from error
+        if self._client_ca is not None:
+            try:
+                context.load_verify_locations(self._client_ca)
+            except (OSError, ssl.SSLError) as error:
+                raise KeysError(f"{self._client_ca}: no certificates of authorities ({error})") from error
+            context.verify_mode = ssl.CERT_REQUIRED
+        if self._bytes() != before:
+            raise KeysError(f"{self._certificate}, {self._key}: they changed while they were read; they are read again")
+        return _Loaded(context, before[0] or b"", before[1] or b"", before[2])
+
+    def _bytes(self) -> tuple[bytes | None, ...]:
+        found: list[bytes | None] = []
+        for path in (self._certificate, self._key, self._client_ca):
+            try:
+                found.append(None if path is None else path.read_bytes())
+            except OSError as error:
+                raise KeysError(f"{path}: the PEM file cannot be read ({why_unreadable(path, error)})") from error  # type: ignore[arg-type]
+        return tuple(found)
+
+
+class _DelegatingContext(ssl.SSLContext):
+    """What asyncio's server is given once; every handshake is one of the certificates in force."""
+
+    certificates: Certificates
+
+    def wrap_bio(self, *given: Any, **named: Any) -> ssl.SSLObject:
+        """Begin a handshake."""
+        return self.certificates.wrap_bio(*given, **named)
+
+
+def _context_of(certificates: Certificates) -> ssl.SSLContext:
+    context = _DelegatingContext(ssl.PROTOCOL_TLS_SERVER)
+    context.certificates = certificates
+    return context
+
+
+def _no_password() -> bytes:
+    """Else OpenSSL asks for one at the terminal."""
+    return b""

@@ -18,6 +18,9 @@ import typer
 from service.errors import AddressError, BundleError
 
 if TYPE_CHECKING:
+    import uvicorn
+    from fastapi import FastAPI
+
     from service.cli.certificates import Certificates
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
@@ -66,7 +69,7 @@ def command(
     ] = None,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.03]"),
+        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
     ] = None,
 ) -> None:
     """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
@@ -134,8 +137,12 @@ def serve(settings: "Settings") -> None:
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
     if settings.workers == 1:
-        with _listen(settings.host, settings.port) as listener:
-            _answer(settings, listener)
+        with (
+            _hangup_held_back(),
+            _listen(settings.host, settings.port) as listener,
+            _listen_for_health(settings) as health,
+        ):
+            _answer(settings, listener, health)
     else:
         _answer_by_workers(settings)
     typer.echo("stopped")
@@ -147,6 +154,7 @@ def _answer_by_workers(settings: "Settings") -> None:
     Each listens on a socket of its own, between which the system spreads connections: of one socket that all share, whoever is quick
     takes all connections of clients that keep them.
     """
+    from service.cli.shared_counts import reserve
     from service.cli.workers import supervise
     from service.runtime.serving_table import SharedMemory, SharedServingTable
 
@@ -155,16 +163,24 @@ def _answer_by_workers(settings: "Settings") -> None:
         closing(SharedMemory()) as memory,
         _held_port(settings.host, settings.port) as port,
         _held_port(settings.host, settings.grpc_port) as grpc_port,
+        _held_port(settings.health_host or settings.host, settings.health_port) as health_port,
     ):
         counts = Path(folder) / "metrics"
         counts.mkdir()
         os.environ[METRICS_FOLDER] = str(counts)  # Prometheus' client looks here when it is imported, which workers do
-        shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port})
+        shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port, "health_port": health_port})
 
         def work(number: int, ready: Callable[[], None]) -> None:
-            with _bind_shared(shared.host, shared.port) as listener:
+            with (
+                _bind_shared(shared.host, shared.port) as listener,
+                _listen_for_health(shared, shared=True) as health,
+            ):
                 table = SharedServingTable(memory, number)
-                _answer(shared, listener, table=table, ready=ready, says_where=number == 0)
+                if (error := reserve(counts)) is not None:
+                    del os.environ[METRICS_FOLDER]
+                    told = f"worker {number} counts for itself alone until it is started again ({counts}: {error.strerror})"
+                    typer.echo(f"streetfix: {told}", err=True)
+                _answer(shared, listener, health, table=table, ready=ready, says_where=number == 0)
 
         def ended(pid: int) -> None:
             for path in counts.glob(f"gauge_live*_{pid}.db"):  # what it had in hand it has no more
@@ -197,6 +213,7 @@ def _held_port(host: str, port: int | None) -> Iterator[int | None]:
 def _answer(
     settings: "Settings",
     listener: socket.socket,
+    health: socket.socket | None,
     *,
     table: "ServingTable | None" = None,
     ready: Callable[[], None] = lambda: None,
@@ -207,7 +224,8 @@ def _answer(
 
     from service.cli.certificates import Certificates
     from service.cli.draining import DrainingServer
-    from service.http.app import create_app
+    from service.cli.reloading import reloading
+    from service.http.app import create_app, create_health_app
     from service.http.protocol import BoundedHttp
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
@@ -218,24 +236,40 @@ def _answer(
     tls = None if settings.tls_certificate is None else Certificates.read(settings)
     if settings.grpc_port is not None:
         import service.grpc.server  # noqa: F401  # so that it is among what stays
-    with _settled(), _hangup_held_back():
+    with _settled():
         engine = Engine.open(settings, table)
         try:
             config = uvicorn.Config(
                 create_app(engine, keys), http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False,
                 lifespan="off", timeout_graceful_shutdown=math.ceil(settings.grace_s), **({} if tls is None else tls.for_uvicorn()),
             )  # fmt: skip
-            with _grpc(engine, keys, tls) as (grpc_port, leave), _reloading(engine):
-                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave)
+            beside = [] if health is None else [(health, _plain(create_health_app(engine)))]
+            with (
+                _grpc(engine, keys, tls) as (grpc_port, leave),
+                _reloading(engine),
+                reloading(keys, tls, every_s=settings.watch_s),
+            ):
+                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave, beside=beside)
                 # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
                 for number in (signal.SIGINT, signal.SIGTERM):
                     signal.signal(number, server.handle_exit)
                 ready()
                 if says_where:
-                    _say_where(engine, listener, grpc_port, "http" if tls is None else "https")
+                    _say_where(engine, listener, grpc_port, "http" if tls is None else "https", health)
                 server.run(sockets=[listener])
         finally:
             engine.close()
+
+
+def _plain(app: "FastAPI") -> "uvicorn.Config":
+    """Configuration of a listener without TLS."""
+    import uvicorn
+
+    from service.http.protocol import BoundedHttp
+
+    return uvicorn.Config(
+        app, http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False, lifespan="off"
+    )
 
 
 @contextmanager
@@ -275,7 +309,10 @@ def _grpc(
 
 @contextmanager
 def _hangup_held_back() -> Iterator[None]:
-    """SIGHUP waits inside until ``_reloading`` has a handler for it; without one it would end the process."""
+    """SIGHUP waits inside until ``_reloading`` has a handler for it; without one it would end the process.
+
+    The supervisor does the same for workers.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
         yield
@@ -306,6 +343,21 @@ def _reloading(engine: "Engine") -> Iterator[None]:
         watcher.stop()
 
 
+@contextmanager
+def _listen_for_health(settings: "Settings", *, shared: bool = False) -> Iterator[socket.socket | None]:
+    """The health port's listener, where the settings want one.
+
+    Raises:
+        AddressError: the address is taken or not ours.
+    """
+    if settings.health_port is None:
+        yield None
+        return
+    listen = _bind_shared if shared else _listen
+    with listen(settings.health_host or settings.host, settings.health_port) as listener:
+        yield listener
+
+
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
@@ -334,7 +386,9 @@ def _cannot_listen(host: str, port: int, error: OSError) -> AddressError:
     return AddressError(f"cannot listen on {host}:{port} ({error.strerror}); choose another --host or --port")
 
 
-def _say_where(engine: "Engine", listener: socket.socket, grpc_port: int | None, scheme: str) -> None:
+def _say_where(
+    engine: "Engine", listener: socket.socket, grpc_port: int | None, scheme: str, health: socket.socket | None
+) -> None:
     host, port = listener.getsockname()[:2]
     for localizer in engine.registry:
         manifest = localizer.bundle.manifest
@@ -346,6 +400,9 @@ def _say_where(engine: "Engine", listener: socket.socket, grpc_port: int | None,
     shown = f"[{host}]" if ":" in host else host
     if grpc_port is not None:
         typer.echo(f"serving gRPC at {shown}:{grpc_port} (what it can do: proto/, or by reflection)")
+    if health is not None:
+        address, health_port = health.getsockname()[:2]
+        typer.echo(f"health at http://{f'[{address}]' if ':' in address else address}:{health_port}/readyz")
     if engine.settings.console:
         typer.echo(f"console at {scheme}://{shown}:{port}/console/")
     typer.echo(f"serving at {scheme}://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")

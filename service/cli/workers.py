@@ -116,7 +116,8 @@ class _Supervisor:
                 self._code = self._code or int(code not in _AS_TOLD)
             else:
                 if number in self._answered:
-                    typer.echo(f"streetfix: worker {number} ended by itself and is started again", err=True)
+                    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+                    typer.echo(f"streetfix: worker {number} ended by itself and is started again ({how})", err=True)
                 self._not_running(number)
 
     def _not_running(self, number: int) -> None:

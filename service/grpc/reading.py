@@ -1,14 +1,22 @@
-"""Reads a call's message in the call's own thread, with patience, and looks at its size before it is parsed."""
+"""Reads a call's messages in the call's own thread, with patience, and looks at their size before they are parsed.
+
+Left to gRPC, bytes that do not parse end a call with its own words, a traceback in the log, and no count in the metrics.
+"""
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import grpc
+from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor_pool import Default
+from google.protobuf.message import Message
 
 from service.errors import RequestError
+from service.grpc.call import Call
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.parsing import parsed
 from service.grpc.patience import Patience
-from service.grpc.status import refuse
 
 if TYPE_CHECKING:
     _Interceptor = grpc.ServerInterceptor[Any, Any]
@@ -16,79 +24,79 @@ else:  # generic in its stub alone
     _Interceptor = grpc.ServerInterceptor
 
 SERVICE: str = pb.DESCRIPTOR.services_by_name["LocalizationService"].full_name
-#: Fields of a message at its top, repeated ones counted each: more make no sense, and each may cost a hundred times its bytes.
-MOST_FIELDS = 64
+#: Ends a call of that name as the contract says; ``service.grpc.answering.answering`` of an engine.
+Answering = Callable[[str, grpc.ServicerContext], AbstractContextManager[Call]]
 
 
 class ReadingInterceptor(_Interceptor):
-    """Takes raw bytes where gRPC would parse in its one serving thread, and ends calls that never send them."""
+    """Takes raw bytes where gRPC would parse, ends calls that never send them, and refuses what does not parse.
 
-    def __init__(self, patience: Patience, *, timeout_s: float) -> None:
+    Args:
+        patience: ends calls.
+        timeout_s: that a call of ours may take to send its only message.
+        answering: how refused calls end.
+    """
+
+    def __init__(self, patience: Patience, *, timeout_s: float, answering: Answering) -> None:
         self._patience = patience
         self._timeout_s = timeout_s
+        self._answering = answering
 
     def intercept_service(
         self, continuation: Callable[[grpc.HandlerCallDetails], Any], details: grpc.HandlerCallDetails
     ) -> Any:
-        """The handler of a call of ours, in another form."""
+        """The handler of a call, in another form: of ours, of health and of reflection."""
         handler = continuation(details)
-        if handler is None or handler.unary_unary is None or not details.method.startswith(f"/{SERVICE}/"):
-            return handler
+        if handler is None:
+            return None
+        service, _, method = details.method.removeprefix("/").partition("/")
+        message = Default().FindServiceByName(service).methods_by_name[method].input_type
+        serializer = handler.response_serializer
+        if handler.request_streaming:
 
-        def answer(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
+            def stream(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
+                if service == SERVICE:  # our servicer ends its streams itself
+                    return handler.stream_stream((parsed(raw, message) for raw in messages), context)
+                return handler.stream_stream((self._parsed(raw, message, method, context) for raw in messages), context)
+
+            return grpc.stream_stream_rpc_method_handler(stream, response_serializer=serializer)
+        if service != SERVICE:  # health, which needs no key: a call must not hold a thread before its message is there
+            behaviour = handler.unary_stream if handler.response_streaming else handler.unary_unary
+
+            def one(raw: bytes, context: grpc.ServicerContext) -> Any:
+                return behaviour(self._parsed(raw, message, method, context), context)
+
+            if handler.response_streaming:
+                return grpc.unary_stream_rpc_method_handler(one, response_serializer=serializer)
+            return grpc.unary_unary_rpc_method_handler(one, response_serializer=serializer)
+
+        def patient(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
+            raw = self._next(messages, method, context)
+            return handler.unary_unary(self._parsed(raw, message, method, context), context)
+
+        return grpc.stream_unary_rpc_method_handler(patient, response_serializer=serializer)
+
+    def _next(self, messages: Iterator[bytes], method: str, context: grpc.ServicerContext) -> bytes:
+        """The only message of a call; the call ends where none comes."""
+        try:
             with self._patience.at_most(self._timeout_s, context.cancel):
-                raw = next(messages, b"")
-            try:
-                require_few_fields(raw)
-            except RequestError as error:
-                refuse(context, error)
-            return handler.unary_unary(handler.request_deserializer(raw), context)
+                raw = next(messages, None)
+        except grpc.RpcError as error:
+            self._end(error, method, context)
+        if (
+            raw is None
+        ):  # gRPC says no more of a call that was cancelled meanwhile, or whose message was beyond the limit
+            self._end(RequestError("the call ended before its message had come; send exactly one"), method, context)
+        return raw
 
-        return grpc.stream_unary_rpc_method_handler(answer, response_serializer=handler.response_serializer)
+    def _parsed(self, raw: bytes, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
+        """A message of a call; the call ends where the bytes are none."""
+        try:
+            return parsed(raw, message)
+        except RequestError as error:
+            self._end(error, method, context)
 
-
-def require_few_fields(raw: bytes, *, most: int = MOST_FIELDS) -> None:
-    """Walk over the fields of a message without looking into them.
-
-    Raises:
-        RequestError: there are more than a message of ours has, or the bytes are no message.
-    """
-    at, count = 0, 0
-    while at < len(raw):
-        count += 1
-        if count > most:
-            raise RequestError(
-                f"the message has more than {most} fields at its top; send fewer requests or frames at once"
-            )
-        tag, at = _varint(raw, at)
-        kind = tag & 7
-        if kind == 0:
-            _, at = _varint(raw, at)
-        elif kind == 1:
-            at += 8
-        elif kind == 2:
-            length, at = _varint(raw, at)
-            at += length
-        elif kind == 5:
-            at += 4
-        else:
-            raise _no_message()
-    if at != len(raw):
-        raise _no_message()
-
-
-def _varint(raw: bytes, at: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        if at >= len(raw):
-            break
-        byte = raw[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, at
-    raise _no_message()
-
-
-def _no_message() -> RequestError:
-    return RequestError("the bytes are no protobuf message; use the proto in this service's repository")
+    def _end(self, error: Exception, method: str, context: grpc.ServicerContext) -> NoReturn:
+        with self._answering(method, context):
+            raise error
+        raise AssertionError("a call went on after its end")

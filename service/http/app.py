@@ -11,10 +11,11 @@ from service.contract.oscp import GeoPoseRequest
 from service.http import problems
 from service.http.asking import Asking
 from service.http.auth import AuthMiddleware
-from service.http.direct import DirectMiddleware
+from service.http.host_check import HostMiddleware
 from service.http.request_id import RequestIdMiddleware
 from service.http.routes import answers, console, drawing, explain, health, localize, maps, oscp, samples
 from service.runtime.engine import Engine
+from service.runtime.hosts import AllowedHosts
 from service.runtime.keys import KeyRing
 
 _DESCRIPTION = """Street, position and heading of one RGB and one depth picture against a LiDAR map.
@@ -37,8 +38,7 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
         title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False, docs_url=None, redoc_url=None
     )  # fmt: skip
     asking = Asking(engine)
-    localizing = localize.router_for(asking)
-    app.include_router(localizing)
+    app.include_router(localize.router_for(asking))
     app.include_router(oscp.router_for(asking))
     app.include_router(maps.router_for(engine))
     app.include_router(health.router_for(engine, version))
@@ -47,14 +47,26 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
             app.include_router(routes)
         for routes in (samples.router_for(engine.settings), answers.router_for(engine)):
             app.include_router(routes)
-    app.add_middleware(DirectMiddleware, router=localizing)
     if keys is not None:
         app.add_middleware(AuthMiddleware, keys=keys)
+    app.add_middleware(HostMiddleware, hosts=AllowedHosts.of(engine.settings))
     app.add_middleware(
         RequestIdMiddleware, requested=engine.metrics.requested, tracing=engine.tracing
     )  # outermost: the last one added
     problems.install(app)
     app.openapi = lambda: _openapi_of(app)  # type: ignore[method-assign]  # FastAPI's documented way
+    return app
+
+
+def create_health_app(engine: Engine) -> FastAPI:
+    """What the health port serves: ``/livez`` and ``/readyz``, and ``/metrics`` if the settings say so. Nobody needs a key there."""
+    wanted = {"/livez", "/readyz"} | ({"/metrics"} if engine.settings.health_metrics else set())
+    app = FastAPI(openapi_url=None, redirect_slashes=False)
+    router = health.router_for(engine, installed_version("streetfix"))
+    router.routes = [route for route in router.routes if getattr(route, "path", None) in wanted]
+    app.include_router(router)
+    app.add_middleware(RequestIdMiddleware, requested=engine.metrics.requested, tracing=engine.tracing)
+    problems.install(app)
     return app
 
 

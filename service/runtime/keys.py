@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.errors import KeysError, UnauthorizedError
+from service.runtime.readable import why_unreadable
 
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _HASH = re.compile(r"[0-9a-f]{64}")
@@ -22,15 +23,20 @@ class Caller:
     operator: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class KeyRing:
     """Callers by the SHA-256 of their keys.
+
+    Attributes:
+        caller_of: replaced as a whole by ``reload``, so that a request sees the old ones or the new ones.
+        path: file that they were read from.
 
     A key is 256 random bits, so no table of likely keys can be made and a plain hash is enough; a slow one would only cost
     every request.
     """
 
     caller_of: dict[str, Caller]
+    path: Path | None = None
 
     @classmethod
     def open(cls, path: Path) -> "KeyRing":
@@ -43,10 +49,12 @@ class KeyRing:
             with path.open("rb") as file:
                 content = file.read(_MOST_BYTES + 1)
             text = content.decode("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+        except OSError as error:
             raise KeysError(
-                f"{path}: the file of API keys cannot be read ({error}); streetfix keys makes its lines"
+                f"{path}: the file of API keys cannot be read ({why_unreadable(path, error)}); streetfix keys makes its lines"
             ) from error
+        except UnicodeDecodeError as error:
+            raise KeysError(f"{path}: no file of API keys ({error}); streetfix keys makes its lines") from error
         if len(content) > _MOST_BYTES:
             raise KeysError(f"{path}: over {_MOST_BYTES} bytes is no file of API keys")
         found: dict[str, Caller] = {}
@@ -64,7 +72,16 @@ class KeyRing:
             found[words[1]] = Caller(words[0], operator=len(words) == 3)
         if not found:
             raise KeysError(f"{path}: there is no key in it, so nobody could ask; streetfix keys NAME >> {path}")
-        return cls(found)
+        return cls(found, path)
+
+    def reload(self) -> None:
+        """Read the file again.
+
+        Raises:
+            KeysError: it cannot be used; the keys stay as they were.
+        """
+        if self.path is not None:
+            self.caller_of = KeyRing.open(self.path).caller_of
 
     def require(self, presented: str | None) -> Caller:
         """The caller.

@@ -14,6 +14,7 @@ from service.maps.manifest import Manifest, read_manifest
 from service.maps.reader import MapBundle
 from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
 from service.runtime.serving_table import Key, MapVersion
+from service.runtime.wakeup import Wakeup
 
 _log = logging.getLogger("streetfix.maps")
 #: Name, size and time of every file: what tells one content of a folder from another without reading it.
@@ -52,7 +53,7 @@ class MapWatcher:
         self._registry = registry
         self._paths = tuple(paths)
         self._warm = warm
-        self._stop, self._told = threading.Event(), threading.Event()
+        self._stop, self._told = threading.Event(), Wakeup()
         self._thread: threading.Thread | None = None
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
         self._failed: dict[Path, tuple[Stamp, StreetfixError]] = {}

@@ -18,10 +18,10 @@ from pydantic_settings import (
 from service.errors import RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.localization.encoder import Provider
-from service.localization.query import FALSE_ACCEPT_RATE
-
-#: Names the settings file where no flag does.
-_CONFIG = "STREETFIX_CONFIG"
+from service.localization.query import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
+from service.runtime.environment import CLIENT_KEY, CONFIG, did_you_mean, require_known, setting_names
+from service.runtime.hosts import require_host_pattern
+from service.runtime.readable import why_unreadable
 
 
 class Limits(BaseModel):
@@ -29,10 +29,10 @@ class Limits(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_request_bytes: int = Field(40 * 2**20, ge=1024, description="whole body of a request")
-    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, description="one picture, encoded")
-    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, description="one picture, decoded")
-    max_parts: int = Field(8, ge=3, description="parts of a multipart body")
+    # gRPC takes the length of a message in 32 bits.
+    max_request_bytes: int = Field(40 * 2**20, ge=1024, le=2**31 - 1, description="whole body of a request")
+    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, le=2**31 - 1, description="one picture, encoded")
+    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, le=2**30, description="one picture, decoded")
 
 
 class Settings(BaseSettings):
@@ -52,6 +52,17 @@ class Settings(BaseSettings):
     grpc_port: int | None = Field(
         None, ge=0, le=65535, description="gRPC beside REST, on the same host; default: not served"
     )
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = Field(
+        (),
+        description="names by which clients reach the service, ',' between; '*.example.org' stands for all below, '*' for any",
+    )
+    health_port: int | None = Field(
+        None, ge=0, le=65535, description="/livez and /readyz alone, always without TLS and keys; default: not served"
+    )
+    health_host: str | None = Field(None, description="address of the health port; default: as host")
+    health_metrics: bool = Field(
+        False, description="serve /metrics on the health port too, to everybody who reaches it"
+    )
     api_keys: Path | None = Field(
         None, description="file of API keys (streetfix keys); with it every request needs one"
     )
@@ -64,7 +75,10 @@ class Settings(BaseSettings):
         False, description="listen beyond loopback although nobody has to show a key or certificate"
     )
     watch_s: float = Field(
-        10.0, ge=0, le=86400, description="look for new bundles in the mounted folders this often; 0: on SIGHUP alone"
+        10.0,
+        ge=0,
+        le=86400,
+        description="look for new bundles, keys and certificates this often, seconds; 0: on SIGHUP alone",
     )
     log_style: Literal["text", "json"] = Field("text", description="of the log on stderr")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
@@ -97,9 +111,15 @@ class Settings(BaseSettings):
         "cpu", description="what runs the encoder: ONNX Runtime's provider, where it is installed"
     )
     queue: int = Field(64, ge=0, le=100_000, description="requests that may wait in a process before 503")
-    request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
+    request_memory_mib: int | None = Field(
+        None,
+        ge=1,
+        le=2**24,
+        description="memory for requests in all processes together; default: what the container's limit leaves",
+    )
+    request_timeout_s: float = Field(30.0, gt=0, le=86400, description="from a request's first byte to its answer")
     false_accept_rate: float = Field(
-        FALSE_ACCEPT_RATE, gt=0, lt=1,
+        FALSE_ACCEPT_RATE, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
         description="share of the queries taken outside the map that one can live with being answered LOCALIZED",
     )  # fmt: skip
     console: bool = Field(True, description="serve the browser console at /console, and what it asks for")
@@ -128,6 +148,16 @@ class Settings(BaseSettings):
     def _split(cls, value: object) -> object:
         return tuple(part for part in value.split(":") if part) if isinstance(value, str) else value
 
+    @field_validator("allowed_hosts", mode="before")
+    @classmethod
+    def _split_hosts(cls, value: object) -> object:
+        return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
+
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _host_patterns(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(require_host_pattern(each) for each in value)
+
 
 def is_loopback(host: str) -> bool:
     """Whether an address is reached from this machine alone."""
@@ -147,21 +177,39 @@ def load_settings(config: Path | None = None, **flags: object) -> Settings:
         flags: by name.
 
     Raises:
-        RequestError: the file cannot be read, or a value makes no sense; its name is in the message.
+        RequestError: the file cannot be read, a value makes no sense, or a variable ``STREETFIX_*`` or a line of the file
+            is no setting; its name is in the message.
     """
+    require_known(os.environ, Settings)
     given: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
-    named = config or (Path(os.environ[_CONFIG]) if os.environ.get(_CONFIG) else None)
+    named = config or (Path(os.environ[CONFIG]) if os.environ.get(CONFIG) else None)
     try:
-        return Settings.model_validate(_with_file(named)(**given).model_dump())
+        settings = Settings.model_validate(_with_file(named)(**given).model_dump())
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        what = f"setting {where}: {first['msg']} (it is {first['input']!r})" if where else f"settings: {first['msg']}"
+        if first["type"] == "extra_forbidden":
+            what = f"setting {where}: there is no such setting{did_you_mean(where, setting_names(Settings))}; docs/serving.md lists them"
+        elif where:
+            what = f"setting {where}: {first['msg']} (it is {first['input']!r})"
+        else:
+            what = f"settings: {first['msg']}"
         raise RequestError(what, field=where) from error
+    except PermissionError as error:
+        raise RequestError(
+            f"settings file {named}: {why_unreadable(Path(str(named)), error)}", field="config"
+        ) from error
     except (OSError, tomllib.TOMLDecodeError) as error:
         raise RequestError(
             f"settings file {named}: {error}; write TOML such as  port = 8000", field="config"
         ) from error
+    if CLIENT_KEY in os.environ and settings.api_keys is None:
+        raise RequestError(
+            f"{CLIENT_KEY} is the key that a client sends, and no request would need one; set {CLIENT_KEY}S to the file of keys "
+            f"(streetfix keys), or unset {CLIENT_KEY}",
+            field="api_keys",
+        )
+    return settings
 
 
 def _with_file(path: Path | None) -> type[Settings]:

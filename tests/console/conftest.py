@@ -12,7 +12,7 @@ from benchmarks.console.browser import browsing, open_page
 from benchmarks.console.served import Demo, demo, serving
 from benchmarks.report import ROOT
 
-SHOTS = Path(os.environ.get("STREETFIX_SHOTS", ROOT / "out" / "console"))
+SHOTS = Path(os.environ.get("CONSOLE_SHOTS", ROOT / "out" / "console"))
 
 
 @pytest.fixture(scope="session")

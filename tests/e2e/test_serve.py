@@ -80,7 +80,7 @@ def test_an_oversized_body_is_refused_over_the_socket(url: str) -> None:
     address = httpx.URL(url)
     with socket.create_connection((address.host, address.port or 80), timeout=30) as connection:
         connection.sendall(
-            b"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=X\r\n"
+            b"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=X\r\n"
             b"Content-Length: 10000000000\r\n\r\n"
         )
         answer = connection.recv(4096)

@@ -174,7 +174,7 @@ def test_hostile_requests_are_refused_and_others_are_answered(start: Any, parts_
         address = httpx.URL(service.url)
         with socket.create_connection((address.host, address.port or 80), timeout=30) as connection:
             connection.sendall(
-                b"POST /v1/localize HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+                b"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
                 b"Content-Length: 100000\r\n\r\n--b"
             )
             return connection.recv(100)

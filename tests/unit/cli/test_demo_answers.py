@@ -74,13 +74,20 @@ def test_a_refused_question_is_wrong_and_its_problem_is_shown(monkeypatch: pytes
     ("status", "confidence", "wanted"),
     [
         ("LOCALIZED", 0.9871, "LOCALIZED 0.987"),
-        ("AMBIGUOUS", 0.0, "AMBIGUOUS 0.000"),
         ("LOCALIZED", None, "LOCALIZED  "),
     ],
 )
 def test_an_answers_status_and_confidence_are_shown(status: str, confidence: float | None, wanted: str) -> None:
     answer = answer_of() | {"status": status, "confidence": confidence}
     assert wanted in printed([Outcome(IN_STREET, answer, "", 0.05)])
+
+
+def test_an_answer_without_a_pose_is_neither_right_nor_wrong_and_counted_on_its_own() -> None:
+    refused = Outcome(IN_STREET, answer_of() | {"status": "OUT_OF_MAP", "pose": None, "street": None}, "", 0.05)
+    assert (refused.right, refused.error_m, refused.heading_error_deg) == (None, None, None)
+    text = printed([outcome_of(), refused])
+    assert "no pose" in text
+    assert "1 of 1 streets right\n1 of 2 answers without a pose, since they are not LOCALIZED" in text
 
 
 def test_the_next_command_is_one_line_with_a_pair_that_was_right() -> None:

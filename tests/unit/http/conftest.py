@@ -32,17 +32,17 @@ class AppTransport(httpx.BaseTransport):
 @pytest.fixture(scope="session")
 def app_client() -> Callable[[FastAPI], httpx.Client]:
     """A client of an application."""
-    return lambda app: httpx.Client(transport=AppTransport(app), base_url="http://app")
+    return lambda app: httpx.Client(transport=AppTransport(app), base_url="http://127.0.0.1")
 
 
 @pytest.fixture(scope="session")
 def client_of() -> Callable[[Engine], httpx.Client]:
-    return lambda engine: httpx.Client(transport=AppTransport(create_app(engine)), base_url="http://app")
+    return lambda engine: httpx.Client(transport=AppTransport(create_app(engine)), base_url="http://127.0.0.1")
 
 
 @pytest.fixture(scope="module")
 def engine(bundle_path: Path) -> Iterator[Engine]:
-    limits = Limits(max_request_bytes=200_000, max_part_bytes=150_000, max_pixels=10_000, max_parts=4)
+    limits = Limits(max_request_bytes=200_000, max_part_bytes=150_000, max_pixels=10_000)
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1, queue=1, limits=limits))
     yield engine
     engine.close()

@@ -246,3 +246,18 @@ def test_the_days_folder_will_do_where_it_holds_one_drive(raw):
 def test_a_folder_of_something_else_is_refused(tmp_path, kind, why):
     with pytest.raises(DatasetError, match=why):
         open_recording(kind, tmp_path, OpenSettings())
+
+
+def test_a_scan_that_vanishes_during_an_import_is_an_error_and_a_picture_is_left_out(raw):
+    recording = open_recording("kitti-raw", raw, OpenSettings(depth="stored"))
+    events = recording.events()
+    assert [type(next(events)) for _ in range(2)] == [RecordedScan, RecordedPicture]
+    frame = recording.frames[1]
+    frame.left.unlink()
+    assert isinstance(next(events), RecordedScan)
+    left_out = next(events)
+    assert isinstance(left_out, Unusable)
+    assert "it is missing, or vanished" in left_out.why
+    recording.frames[2].scan.unlink()
+    with pytest.raises(DatasetError, match=r"0000000002\.bin: it is missing, or vanished"):
+        next(events)

@@ -1,10 +1,13 @@
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from service.errors import RequestError
-from service.runtime.settings import Settings, load_settings
+from service.runtime.environment import require_known, setting_names
+from service.runtime.settings import Limits, Settings, load_settings
 
 
 def test_the_service_binds_to_loopback_unless_told_otherwise() -> None:
@@ -75,3 +78,107 @@ def test_a_file_that_makes_no_sense_is_refused_with_what_is_wrong(file: Path, te
         file.write_text(text)
     with pytest.raises(RequestError, match=says):
         load_settings(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("STREETFIX_THREDS", "STREETFIX_THREADS"),
+        ("STREETFIX_APIKEYS", "STREETFIX_API_KEYS"),
+        ("STREETFIX_TLS_CERTIFICATES", "STREETFIX_TLS_CERTIFICATE"),
+        ("STREETFIX_TLS_CLIENTCA", "STREETFIX_TLS_CLIENT_CA"),
+        ("STREETFIX_LIMITS__MAX_PIXEL", "STREETFIX_LIMITS__MAX_PIXELS"),
+        ("STREETFIX_LIMITS_MAX_PIXELS", "STREETFIX_LIMITS__MAX_PIXELS"),
+        ("STREETFIX_MAP", "STREETFIX_MAPS"),
+        ("streetfix_threds", "STREETFIX_THREADS"),
+    ],
+)
+def test_a_misspelt_variable_is_refused_with_the_nearest_name(
+    monkeypatch: pytest.MonkeyPatch, name: str, nearest: str
+) -> None:
+    monkeypatch.setenv(name, "7")
+    with pytest.raises(RequestError, match=rf"{name} \(did you mean {nearest}\?\)"):
+        load_settings()
+
+
+def test_a_variable_that_is_near_nothing_is_refused_and_its_value_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_XYZZY", "a secret")
+    with pytest.raises(RequestError, match="STREETFIX_XYZZY") as refused:
+        load_settings()
+    assert "secret" not in refused.value.message
+
+
+@pytest.mark.parametrize(
+    "name", ["STREETFIX_CLIENT_CA", "STREETFIX_CLIENT_ANYTHING", "STREETFIX_MAPS_FOLDER", "STREETFIX", "STREETFIXED_THREDS"]
+)  # fmt: skip
+def test_variables_of_other_programs_are_left_alone(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv(name, "1")
+    assert load_settings().threads is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("STREETFIX_PORT", "tcp://10.0.0.1:8000"),
+        ("STREETFIX_SERVICE_HOST", "10.0.0.1"),
+        ("STREETFIX_SERVICE_PORT_HTTP", "8000"),
+        ("STREETFIX_PORT_8000_TCP_ADDR", "10.0.0.1"),
+        ("STREETFIX_STREETFIX_PORT_50051_TCP", "tcp://10.0.0.1:50051"),
+    ],
+)
+def test_what_kubernetes_injects_is_recognised(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+    monkeypatch.setenv(name, value)
+    with pytest.raises(RequestError, match=f"{name}.*enableServiceLinks: false"):
+        load_settings()
+
+
+def test_every_setting_can_be_set_by_its_variable() -> None:
+    known = {f"STREETFIX_{name.upper().replace('.', '__')}": "" for name in setting_names(Settings)}
+    require_known(known, Settings)
+    assert {"STREETFIX_PORT", "STREETFIX_LIMITS", "STREETFIX_LIMITS__MAX_PIXELS"} <= set(known)
+
+
+def test_the_clients_key_is_not_taken_for_the_services_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_API_KEY", "keys.txt")
+    with pytest.raises(RequestError, match="STREETFIX_API_KEYS"):
+        load_settings()
+    assert load_settings(api_keys=Path("keys.txt")).api_keys == Path("keys.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("threds = 7", r"threds: there is no such setting \(did you mean threads\?\)"),
+     ("[limits]\nmax_pixel = 7", r"limits.max_pixel: there is no such setting \(did you mean limits.max_pixels\?\)")],
+)  # fmt: skip
+def test_a_misspelt_line_of_the_file_is_refused_with_the_nearest_name(file: Path, text: str, says: str) -> None:
+    file.write_text(text)
+    with pytest.raises(RequestError, match=says):
+        load_settings(file)
+
+
+@pytest.mark.parametrize(
+    "value", ["http://maps.example", "maps.example:8000", "maps/x", "*maps.example", "-", "a,,*.*.b"]
+)
+def test_an_allowed_host_that_is_no_name_is_refused(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    monkeypatch.setenv("STREETFIX_ALLOWED_HOSTS", value)
+    with pytest.raises(RequestError, match=r"allowed_hosts.*no host name"):
+        load_settings()
+
+
+def test_allowed_hosts_are_joined_by_commas(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STREETFIX_ALLOWED_HOSTS", "Maps.example, *.robots.example,")
+    assert load_settings().allowed_hosts == ("maps.example", "*.robots.example")
+
+
+def test_every_number_has_a_least_and_a_most() -> None:
+    """An endless timeout, or a limit that gRPC's 32 bits do not hold, would fail at the first request."""
+
+    def bounds_of(model: type[BaseModel]) -> Iterator[tuple[str, set[str]]]:
+        for name, field in model.model_fields.items():
+            kinds = {field.annotation, *get_args(field.annotation)}
+            if bool not in kinds and kinds & {int, float}:
+                yield name, {key for each in field.metadata for key in ("ge", "gt", "le", "lt") if hasattr(each, key)}
+
+    found = dict([*bounds_of(Settings), *bounds_of(Limits)])
+    assert len(found) > 15
+    assert [name for name, bounds in found.items() if not (bounds & {"ge", "gt"} and bounds & {"le", "lt"})] == []

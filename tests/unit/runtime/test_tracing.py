@@ -35,7 +35,7 @@ def spans(engine: Engine, ask: Ask, *, share: float = 1.0):
 
     async def run() -> None:
         transport = httpx.ASGITransport(create_app(engine), raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url="http://service") as client:
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
             await ask(client)
 
     asyncio.run(run())

@@ -1,0 +1,27 @@
+"""Says why a file that an operator mounted cannot be read: who asks, whose it is, and what to do."""
+
+import os
+import stat
+from pathlib import Path
+
+
+def why_unreadable(path: Path, error: OSError) -> str:
+    """The reason and, where permissions are it, both users and the remedy.
+
+    Args:
+        path: of the file.
+        error: what opening it raised.
+    """
+    if not isinstance(error, PermissionError) or not hasattr(os, "geteuid"):
+        return error.strerror or str(error)
+    user, group = os.geteuid(), os.getegid()
+    who = f"the service runs as user {user} and group {group}"
+    try:
+        found = path.stat()
+    except OSError:
+        return f"permission denied: {who}, and may not enter a folder of its path; chmod the folder to 755, or chown it to {user}"
+    mode = f"{stat.S_IMODE(found.st_mode):o}"
+    return (
+        f"permission denied: {who}, and the file belongs to user {found.st_uid} and group {found.st_gid} with mode {mode}; "
+        f"chown {user} {path}, or chgrp {group} {path} and chmod 640 {path}"
+    )

@@ -1,0 +1,110 @@
+"""Files that change while the service runs."""
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from service.errors import KeysError
+from service.runtime.reload import Reloader
+
+
+class Loaded:
+    """Counts, and fails when it is told to."""
+
+    def __init__(self) -> None:
+        self.times = 0
+        self.error: Exception | None = None
+
+    def __call__(self) -> None:
+        if self.error is not None:
+            raise self.error
+        self.times += 1
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "file"
+    path.write_text("1")
+    return path
+
+
+def test_what_changes_is_loaded_once(path: Path) -> None:
+    loaded, reloader = Loaded(), Reloader()
+    reloader.watch("x", [path], loaded)
+    reloader.look()
+    assert loaded.times == 1
+    path.write_text("22")
+    reloader.look()
+    reloader.look()
+    assert loaded.times == 2
+    reloader.look(everything=True)
+    assert loaded.times == 3
+
+
+def test_a_link_that_is_turned_counts_as_a_change(path: Path) -> None:
+    """So does Kubernetes replace the files of a secret, all at once."""
+    (path.parent / "old").mkdir()
+    (path.parent / "new").mkdir()
+    for name in ("old", "new"):
+        (path.parent / name / "key").write_text("same size")
+    link, file = path.parent / "..data", path.parent / "key"
+    link.symlink_to("old")
+    file.symlink_to("..data/key")
+    loaded, reloader = Loaded(), Reloader()
+    reloader.watch("x", [file], loaded)
+    (path.parent / "..tmp").symlink_to("new")
+    (path.parent / "..tmp").rename(link)
+    reloader.look()
+    assert loaded.times == 2
+
+
+@pytest.mark.parametrize("error", [KeysError("no key in it"), OSError("broken")])
+def test_what_cannot_be_used_is_logged_once_and_tried_again_when_it_changes(
+    path: Path, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    loaded, reloader = Loaded(), Reloader()
+    reloader.watch("x", [path], loaded)
+    loaded.error = error
+    path.write_text("bad one")
+    with caplog.at_level(logging.WARNING):
+        reloader.look()
+        reloader.look()
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+    assert "reload_failed name=x" in caplog.text
+    loaded.error = None
+    path.write_text("a good one")
+    reloader.look()
+    assert loaded.times == 2
+
+
+def test_a_file_that_is_gone_and_comes_back_is_loaded(path: Path) -> None:
+    loaded, reloader = Loaded(), Reloader()
+    reloader.watch("x", [path], loaded)
+    path.unlink()
+    loaded.error = KeysError("gone")
+    reloader.look()
+    loaded.error = None
+    path.write_text("1")
+    reloader.look()
+    assert loaded.times == 2
+
+
+def test_what_cannot_be_used_at_first_is_the_callers(path: Path) -> None:
+    loaded = Loaded()
+    loaded.error = KeysError("bad")
+    with pytest.raises(KeysError):
+        Reloader().watch("x", [path], loaded)
+
+
+def test_one_that_fails_does_not_keep_the_others_back(path: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.write_text("1")
+    first, second, reloader = Loaded(), Loaded(), Reloader()
+    reloader.watch("first", [path], first)
+    reloader.watch("second", [other], second)
+    first.error = KeysError("bad")
+    path.write_text("bad one")
+    other.write_text("22")
+    reloader.look()
+    assert second.times == 2
