@@ -65,10 +65,11 @@ _CORE = (
     "service/maps",
     "service/registration",
     "service/localization",
+    "native",  # how the C code of these is compiled
     "model_training/stock",
 )
 _DATA = ("model_training/simulation", "model_training/datasets", "model_training/mapping", "model_training/evaluation")
-_ALL = ("service", "model_training")
+_ALL = ("service", "model_training", "native")
 #: What rows of each report measure, by the beginning of their ids: the longest that fits counts, "" is for all others. Programs that
 #: measure are left out: a row is as old as what it measures.
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
@@ -83,7 +84,7 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "paper": {"": (*_CORE, *_DATA, "model_training/baselines", "model_training/training")},
     "real_data": {"": (*_CORE, *_DATA, "model_training/importing", "model_training/odometry", "model_training/exporting"),
                   "ros2.": (*_CORE, "service/bridge")},
-    "serving": {"": ("service", "hatch_build.py"), "fuzz.": (*_ALL, "hatch_build.py")},
+    "serving": {"": ("service", "native"), "fuzz.": _ALL},
     "training": {"": ("model_training/training", "model_training/simulation", "service/imaging", "service/geometry"),
                  "demo.": _ALL, "test.": (*_ALL, "tests")},
 }  # fmt: skip

@@ -41,6 +41,7 @@ def launch(
     grpc_port: int = 0,
     stderr: IO[str] | int | None = None,
     temporary: Path | None = None,
+    enter: Callable[[], None] | None = None,
     **settings: object,
 ) -> subprocess.Popen[str]:
     """Start the real command; its first lines on standard output say where it listens.
@@ -51,6 +52,7 @@ def launch(
         grpc_port: of gRPC; 0 lets the system choose.
         stderr: where its log goes; None shows it.
         temporary: folder of its temporary files; None leaves that to the system.
+        enter: called in its process before it begins, as to enter a control group.
         settings: as in the environment, lower case.
     """
     environment = os.environ | {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
@@ -60,6 +62,7 @@ def launch(
         [*_SERVE, str(maps), "--port", str(port), "--grpc-port", str(grpc_port)], cwd=ROOT, env=environment,
         stdout=subprocess.PIPE, stderr=stderr, text=True,
         process_group=0,  # Ctrl-C ends the measurement, which then ends the service
+        preexec_fn=enter,  # the load generator has not begun its threads yet
     )  # fmt: skip
 
 
@@ -74,6 +77,7 @@ class Server:
         grpc_port: of gRPC; 0 lets the system choose.
         stderr: where its log goes; None shows it.
         temporary: folder of its temporary files; None leaves that to the system.
+        enter: called in its process before it begins, as to enter a control group.
         settings: as in the environment, lower case.
 
     Raises:
@@ -82,11 +86,14 @@ class Server:
 
     def __init__(
         self, maps: Path, *, core: int | None = SERVED_CORE, trusted: ssl.SSLContext | None = None, port: int = 0,
-        grpc_port: int = 0, log: Callable[[str], None] | None = None, temporary: Path | None = None, **settings: object,
+        grpc_port: int = 0, log: Callable[[str], None] | None = None, temporary: Path | None = None,
+        enter: Callable[[], None] | None = None, **settings: object,
     ) -> None:  # fmt: skip
         began = time.perf_counter()
         stderr = None if log is None else subprocess.PIPE
-        self.process = launch(maps, port=port, grpc_port=grpc_port, stderr=stderr, temporary=temporary, **settings)
+        self.process = launch(
+            maps, port=port, grpc_port=grpc_port, stderr=stderr, temporary=temporary, enter=enter, **settings
+        )
         pin(self.process.pid, core)
         self._hearing: threading.Thread | None = None
         if log is not None and self.process.stderr is not None:

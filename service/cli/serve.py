@@ -134,8 +134,12 @@ def serve(settings: "Settings") -> None:
         StreetfixError: no map is given, or none of the given ones can be mounted; with ``strict``, one of them cannot.
         AddressError: the address is taken or not ours.
     """
+    from service.runtime.heap import keep_little
+    from service.runtime.threads import usable_cores
+
     if not settings.maps:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
+    keep_little(settings.threads or usable_cores())
     if settings.workers == 1:
         with _listen(settings.host, settings.port) as listener, _listen_for_health(settings) as health:
             _answer(settings, listener, health)
