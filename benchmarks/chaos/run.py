@@ -648,10 +648,9 @@ class Chaos:
         Raises:
             _ServiceError: it did not end, or not well.
         """
-        process = self._running.process
         self._signal(number)
         try:
-            code = process.wait(ENDED_S)
+            code = self._running.wait(ENDED_S)
         except subprocess.TimeoutExpired as error:
             raise _ServiceError(f"the service did not end within {ENDED_S:g} s of {number.name}") from error
         if code:
@@ -664,7 +663,7 @@ class Chaos:
     def _kill(self) -> None:
         if self._server is not None:
             kill_tree(self._server.process.pid)
-            self._server.process.wait(30)
+            self._server.wait(30)
             self._server = None
 
     def _begin_again(self, heard: Callable[[], list[Outcome]]) -> None:

@@ -95,15 +95,19 @@ class Server:
             maps, port=port, grpc_port=grpc_port, stderr=stderr, temporary=temporary, enter=enter, **settings
         )
         pin(self.process.pid, core)
+        self._hearing: threading.Thread | None = None
         if log is not None and self.process.stderr is not None:
-            threading.Thread(target=_pass_on, args=(self.process.stderr, log), daemon=True).start()
+            self._hearing = threading.Thread(target=_pass_on, args=(self.process.stderr, log), daemon=True)
+            self._hearing.start()
         late = threading.Timer(_READY_S, kill_tree, (self.process.pid,))
         late.start()
         try:
             self.grpc, self.url = _until(self.process.stdout, r"serving gRPC at (\S+)", r"serving at (\S+)")
             while httpx.get(f"{self.url}/readyz", timeout=30, verify=trusted or True).status_code != 200:
                 time.sleep(0.005)
-        except httpx.TransportError as error:
+        except (httpx.TransportError, RuntimeError) as error:
+            kill_tree(self.process.pid)
+            self.wait()
             raise RuntimeError(f"the service ended before it was ready: {error!r}") from error
         finally:
             late.cancel()
@@ -119,7 +123,23 @@ class Server:
         """Stop it."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-        self.process.communicate(timeout=120)
+        self.wait(120)
+
+    def wait(self, timeout_s: float | None = None) -> int:
+        """Wait for its end and for the end of its log; its exit code.
+
+        Raises:
+            subprocess.TimeoutExpired: it has not ended.
+        """
+        if self._hearing is None:
+            self.process.communicate(timeout=timeout_s)
+            return self.process.returncode
+        code = self.process.wait(timeout_s)
+        self._hearing.join(timeout_s)
+        for stream in (self.process.stdout, self.process.stderr):
+            if stream is not None:
+                stream.close()
+        return code
 
     @property
     def used(self) -> Usage:
