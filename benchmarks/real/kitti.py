@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.real.served import answers, away_m
+from benchmarks.real.served import away_m, served
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset, read_tum
 from model_training.importing.kinds import OpenSettings, open_recording
@@ -65,7 +65,7 @@ def stereo_rows(report: Report, data: Path, work: Path) -> None:
     dataset = Dataset(folder)
     build_map(dataset, ENCODER, bundle, BuildSettings(name="kitti-stereo", expected_lidar_height_m=LIDAR_HEIGHT_M))
     truth = np.array([frame.T_map_camera for frame in dataset.queries("frames")])
-    away = away_m(answers(bundle, dataset, "frames"), truth)
+    away = away_m(served(bundle, dataset, "frames").T_map_camera, truth)
     report.share("kitti_stereo.served.within_1_m", away <= 1.0, bar=1.0)
     report.row("kitti_stereo.served.median_m", float(np.median(away)), "m", n=len(away))
 
@@ -86,7 +86,8 @@ def _both_halves(source: Path, poses: Trajectory, work: Path, reference: Path) -
         frames = list(dataset.queries("recorded"))
         camera = np.array(frames[0].camera.T_vehicle_sensor)
         stamps = np.array([frame.stamp_s for frame in frames], np.float64)
-        away.append(away_m(answers(bundle, dataset, "recorded"), read_pose_file(reference).between(stamps) @ camera))
+        answered = served(bundle, dataset, "recorded").T_map_camera
+        away.append(away_m(answered, read_pose_file(reference).between(stamps) @ camera))
     return np.concatenate(away)
 
 

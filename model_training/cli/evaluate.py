@@ -12,13 +12,16 @@ from rich.table import Table
 
 from model_training.baselines.raw_range import raw_best_views
 from model_training.cli.progress import bars
+from model_training.cli.stages_table import print_stages
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.evaluate import evaluate, write_trajectory
 from model_training.evaluation.measures import recall_at
 from model_training.evaluation.predict import Predictions
 from model_training.evaluation.saved_run import save_run
+from model_training.evaluation.stages import stages_of
 from model_training.reporting.run_page import write_run_page
 from service.errors import DatasetError
+from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 SHOWN = (
@@ -52,6 +55,9 @@ def command(
         Path | None,
         typer.Option("--report", help="folder for a page to read (index.html), the answers and the run's settings"),
     ] = None,
+    stages: Annotated[
+        bool, typer.Option("--stages", help="say for each query which stage of the answer loses it; asks twice")
+    ] = False,
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="register each query on the cloud, or measure retrieval alone")
     ] = True,
@@ -79,6 +85,11 @@ def command(
         if raw_baseline:
             places = raw_best_views(opened, data, list(result.predictions), report=report)
             _add_raw(figures, opened, places, result.predictions)
+        traced = (
+            {name: stages_of(Localizer.open(opened), data, name, report=report) for name in names} if stages else {}
+        )
+    if stages:
+        figures["stages"] = {name: [each.as_json() for each in found] for name, found in traced.items()}
     if trajectory is not None:
         write_trajectory(trajectory, next(iter(result.predictions.values())))
     if predictions is not None:
@@ -92,6 +103,8 @@ def command(
         part.write_text(json.dumps(figures, indent=1) + "\n")
         part.rename(json_file)
     Console().print(_table(figures))
+    for name, found in traced.items():
+        print_stages(name, found, Console())
     if report_folder is not None:
         Console(soft_wrap=True).print(f"report: {page}")
 

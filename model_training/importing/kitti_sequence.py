@@ -131,7 +131,7 @@ class KittiSequence:
         depth_m: Float32[NDArray[np.float32], "H W"] = depth_from_stereo(
             picture.rgb, right, focal_baseline_px_m=self.calibration.focal_baseline_px_m
         )
-        return replace(picture, depth=depth_m)
+        return replace(picture, depth=depth_m, baseline_m=self.calibration.baseline_m)
 
 
 def _without_names(message: str, files: tuple[Path | None, ...]) -> str:

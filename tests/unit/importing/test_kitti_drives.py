@@ -4,9 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
+from model_training.datasets.dataset import Dataset
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.oxts import read_oxts
 from model_training.importing.recording import RecordedPicture, RecordedScan, Unusable
+from model_training.importing.take import TakeSettings, take
 from service.errors import DatasetError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z
 
@@ -120,6 +122,15 @@ def test_scans_and_pictures_come_with_the_mounting_of_the_calibration(drive):
 def test_matched_depth_is_that_of_the_wall(drive):
     depth = events_of(drive, RecordedPicture, "sgbm")[0].depth[:, 140:]
     assert abs(np.median(depth[depth > 0]) - 5.0) < 0.02
+
+
+@pytest.mark.parametrize(("depth", "baseline_m"), [("sgbm", BASELINE_M), ("stored", None)])
+def test_only_matched_depth_has_a_baseline(drive, depth, baseline_m, tmp_path):
+    recording = opened(drive, depth)
+    assert [p.baseline_m for p in events_of(drive, RecordedPicture, depth)] == [pytest.approx(baseline_m)] * 3
+    take(recording, recording.trajectory(), tmp_path / "taken", TakeSettings())
+    (camera,) = Dataset(tmp_path / "taken").description.sensors.cameras
+    assert camera.depth.baseline_m == pytest.approx(baseline_m)
 
 
 def test_depth_of_the_scans_is_left_to_who_takes_them(drive):
