@@ -79,9 +79,7 @@ def _both_halves(source: Path, poses: Trajectory, work: Path, reference: Path) -
         recording = open_recording("kitti-raw", source, SETTINGS)
         take(recording, poses, folder, TakeSettings(depth="lidar", hold_out=2, hold_out_first=first))
         dataset = Dataset(folder)
-        settings = BuildSettings(
-            name="kitti-drive", spacing_m=0.0, expected_lidar_height_m=LIDAR_HEIGHT_M, traffic_vote=True
-        )
+        settings = BuildSettings(name="kitti-drive", spacing_m=0.0, expected_lidar_height_m=LIDAR_HEIGHT_M)
         build_map(dataset, ENCODER, bundle, settings)
         frames = list(dataset.queries("recorded"))
         camera = np.array(frames[0].camera.T_vehicle_sensor)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.evaluation.failures import RIGHT_M, position_errors
-from model_training.evaluation.measures import recall_at
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.measures import RIGHT_M, recall_at
 from model_training.evaluation.paired import PairedErrors, PairedShares, paired_errors, paired_shares
 from model_training.evaluation.predict import RANKED, Predictions, joined
 from model_training.evaluation.saved_run import SavedRun

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from model_training.datasets.dataset import Dataset, QueryFrame
-from model_training.evaluation.failures import RIGHT_M
-from model_training.evaluation.measures import RIGHT_PLACE_M
+from model_training.evaluation.measures import RIGHT_M, RIGHT_PLACE_M
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import Rotation, Transform, heading_of_camera, transform_from, wrap_angle
 from service.localization.answer import Answer

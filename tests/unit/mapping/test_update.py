@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping import places
+from model_training.mapping import places, update
 from model_training.mapping.area import CELL_M, covered_by, polygon_of
 from model_training.mapping.stored_map import voxels_of
 from model_training.mapping.update import update_map
@@ -262,3 +262,20 @@ def test_votes_are_recorded_only_where_both_drives_had_them(half_maps, halves, m
     assert (
         "passes_vote" not in update_map(half_maps[0], halves[1], tmp_path / "x", passes_vote=True, threads=1).parameters
     )
+
+
+def test_a_drive_is_cleared_of_traffic_if_the_maps_was(halves, map_of, tmp_path, monkeypatch):
+    """And where the map was built without, the update is, too; what is said of the map holds of all of its drives."""
+    asked = []
+    real = update.moved
+
+    def listening(*args, each_scan=False, **more):
+        asked.append(each_scan)
+        return real(*args, each_scan=each_scan, **more)
+
+    monkeypatch.setattr(update, "moved", listening)
+    for voted in (True, False):
+        made = update_map(map_of(halves[0], traffic_vote=voted), halves[1], tmp_path / f"m{voted}", threads=1)
+        assert asked == [True] * voted
+        assert made.parameters.get("traffic_vote") == (1.0 if voted else None)
+        asked.clear()
