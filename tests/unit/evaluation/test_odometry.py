@@ -39,3 +39,9 @@ def test_the_odometry_errs_by_a_hundredth_of_the_way_and_a_fifth_of_a_degree(fra
     errors = np.array([inverse(truth) @ step for step in steps])
     np.testing.assert_allclose(errors[:, :3, 3].std(axis=0), 0.01 * way_m, rtol=0.15)
     assert np.rad2deg(np.arctan2(errors[:, 1, 0], errors[:, 0, 0])).std() == pytest.approx(0.2, rel=0.15)
+
+
+def test_exact_odometry_is_the_truth(frames):
+    _, poses = as_query(frames, np.random.default_rng(0), grid=GRID, ranked=3, exact=True)
+    for T, frame in zip(poses, frames[::-1], strict=True):
+        np.testing.assert_allclose(T, inverse(frames[-1].T_map_camera) @ frame.T_map_camera, atol=1e-9)
