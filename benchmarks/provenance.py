@@ -65,10 +65,11 @@ _CORE = (
     "service/maps",
     "service/registration",
     "service/localization",
+    "native",  # how the C code of these is compiled
     "model_training/stock",
 )
 _DATA = ("model_training/simulation", "model_training/datasets", "model_training/mapping", "model_training/evaluation")
-_ALL = ("service", "model_training")
+_ALL = ("service", "model_training", "native")
 #: What rows of each report measure, by the beginning of their ids: the longest that fits counts, "" is for all others. Programs that
 #: measure are left out: a row is as old as what it measures.
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {

@@ -1,6 +1,6 @@
 """What a service must answer from, worked out from what was done to it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 #: Versions of one map that stay open (docs/serving.md): the one that serves, and what may be rolled back to.
 MOST_OPEN = 3
@@ -26,10 +26,12 @@ class Expected:
     Attributes:
         path: versions in the order in which they may serve; the last one stays.
         instead: versions that may stay in place of the last one, where the service has a choice.
+        dropped: versions that the service must not list any more.
     """
 
     path: tuple[str, ...]
     instead: frozenset[str] = frozenset()
+    dropped: frozenset[str] = frozenset()
 
     @property
     def finals(self) -> frozenset[str]:
@@ -38,7 +40,8 @@ class Expected:
 
     def then(self, after: "Expected") -> "Expected":
         """This, and then that."""
-        return Expected(self.path + after.path[after.path[:1] == self.path[-1:] :], self.instead | after.instead)
+        path = self.path + after.path[after.path[:1] == self.path[-1:] :]
+        return Expected(path, self.instead | after.instead, self.dropped | after.dropped)
 
 
 @dataclass
@@ -93,6 +96,7 @@ class Oracle:
         self._unseen_by_some.clear()
         self._seen = {folder: version for folder, version in self._seen.items() if folder in self.on_disk}
         there = set(self.on_disk.values())
+        dropped = frozenset(version.id for version in self.open if version not in there)
         self.open = [version for version in self.open if version in there]
         instead: set[str] = set()
         if self.serving not in there:
@@ -105,7 +109,7 @@ class Oracle:
             self.open
         ):  # there is room again for one that was left out, and it is newer than all that are open
             instead.add(max(there).id)
-        return Expected(_path(before, self.serving), frozenset(instead - {before.id}))
+        return Expected(_path(before, self.serving), frozenset(instead - {before.id}), dropped)
 
     def choose(self, version: Version) -> Expected:
         """An operator chose an open version."""
@@ -122,7 +126,7 @@ class Oracle:
         """What else may serve as long as it is not known what workers have dropped: the newest bundle on the disk."""
         if not self.is_unsure:
             return expected
-        return Expected(expected.path, expected.instead | {max(self.on_disk.values()).id})
+        return replace(expected, instead=expected.instead | {max(self.on_disk.values()).id})
 
     def unchanged(self) -> Expected:
         """Whatever happened, the same version serves."""

@@ -29,6 +29,8 @@ from service.runtime.keys import hash_of, new_key
 
 #: Until all workers must agree, and until a service must have ended.
 SETTLED_S, ENDED_S = 30.0, 40.0
+#: Until every worker has looked at the folder after SIGHUP.
+_LOOKED_S = 3.0
 _SAME_M = 0.01
 _MOST_BUNDLES, _MOST_DAMAGED, _MOST_HALVES, _MOST_SOCKETS, _FULL_STEPS = 6, 3, 2, 24, 5
 
@@ -110,7 +112,7 @@ class Chaos:
         self._keys_are_broken = False
         self._sockets: list[socket.socket] = []
         self._number = self._full_since = 0
-        self._started_again_s = 0.0
+        self._started_again_s = self._sighup_s = 0.0
         self._valid = [new_key()]
         self._caller = Caller(_free_port(), _free_port(), pair, self._valid[0])
         self._reference: dict[tuple[Face, What], tuple[float, float, float]] = {}
@@ -253,18 +255,27 @@ class Chaos:
         return self._maybe_sighup(name)
 
     def _stash(self) -> Step:
+        self._let_sighup_pass()
         name = self._random.choice(sorted(self._oracle.on_disk))
         self._shelf.stash(name, self._oracle.on_disk[name])
         return self._removed(name)
 
     def _delete(self) -> Step:
+        self._let_sighup_pass()
         name = self._random.choice(sorted(self._oracle.on_disk))
         self._shelf.delete(name)
         return self._removed(name)
 
+    def _let_sighup_pass(self) -> None:
+        """An earlier SIGHUP must not find that a folder has gone, which only the next one is to find."""
+        time.sleep(max(0.0, self._sighup_s + _LOOKED_S - time.monotonic()))
+
     def _removed(self, name: str) -> Step:
         self._oracle.removed(name)
-        return self._maybe_sighup(name)
+        if self._random.random() < 0.5:
+            self._note(name)
+            return self._sighup()
+        return self._same(name)
 
     def _maybe_sighup(self, told: str) -> Step:
         self._note(told)
@@ -331,7 +342,7 @@ class Chaos:
                 os.kill(pid, signal.SIGKILL)
             except ProcessLookupError:  # it ended by itself
                 continue
-        while any(map(_runs, victims)):  # the system closes its sockets some time after
+        while any(Path(f"/proc/{pid}").exists() for pid in victims):  # its sockets are closed when its last thread ends
             time.sleep(0.005)
         cut = [(killed, time.monotonic())]
         self._note(f"{len(victims)} of {len(there)}")
@@ -481,7 +492,9 @@ class Chaos:
             found = [self._caller.ask(face, "maps") for face in turns]
             probes += found
             versions = {each.version for each in found if each.kind == "answer"}
+            listed = {version for each in found for version in each.listed}
             good = len(versions) == 1 and versions <= expected.finals and all(each.kind == "answer" for each in found)
+            good = good and not listed & expected.dropped
             alike = alike + 1 if good else 0
             if alike == 2:
                 everywhere = set.intersection(*(set(each.listed) for each in found))
@@ -490,15 +503,17 @@ class Chaos:
                     self._wrong(why)
                 return probes, began
             if time.monotonic() > until:
-                self._not_settled(found, versions, expected)
+                self._not_settled(found, versions, listed, expected)
                 return probes, began
 
-    def _not_settled(self, found: list[Outcome], versions: set[str], expected: Expected) -> None:
+    def _not_settled(self, found: list[Outcome], versions: set[str], listed: set[str], expected: Expected) -> None:
         told = f"{', '.join(sorted(versions)) or 'nothing'} answers, and {' or '.join(sorted(expected.finals))} should"
         if len(versions) > 1:
             self._disagree(f"workers do not agree: {told}")
         elif versions - expected.finals:
             self._wrong(f"the wrong version serves: {told}")
+        elif stale := listed & expected.dropped:
+            self._wrong(f"{', '.join(sorted(stale))} is listed after SIGHUP, though its folder is gone")
         else:
             others = {str(each) for each in found if each.kind != "answer"}
             self._wrong(f"no answer: {told}; {'; '.join(sorted(others)[:3])}")
@@ -633,22 +648,22 @@ class Chaos:
         Raises:
             _ServiceError: it did not end, or not well.
         """
-        process = self._running.process
         self._signal(number)
         try:
-            code = process.wait(ENDED_S)
+            code = self._running.wait(ENDED_S)
         except subprocess.TimeoutExpired as error:
             raise _ServiceError(f"the service did not end within {ENDED_S:g} s of {number.name}") from error
         if code:
             raise _ServiceError(f"the service ended with {code} after {number.name}")
 
     def _signal(self, number: signal.Signals) -> None:
+        self._sighup_s = time.monotonic()
         self._running.process.send_signal(number)
 
     def _kill(self) -> None:
         if self._server is not None:
             kill_tree(self._server.process.pid)
-            self._server.process.wait(30)
+            self._server.wait(30)
             self._server = None
 
     def _begin_again(self, heard: Callable[[], list[Outcome]]) -> None:
@@ -715,14 +730,6 @@ def _request_head(key: str, length: int, content_type: str) -> bytes:
         f"POST /v1/localize HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {key}\r\n"
         f"Content-Type: {content_type}\r\nContent-Length: {length}\r\n\r\n"
     ).encode()
-
-
-def _runs(pid: int) -> bool:
-    """Whether a process is neither gone nor a zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
 
 
 def _listeners(port: int, pids: Iterable[int]) -> set[int]:

@@ -16,6 +16,7 @@ from benchmarks.serving.decoding import decoding_rows
 from benchmarks.serving.fire import overload_rows, sigterm_rows, swap_rows
 from benchmarks.serving.hostile import hostile_rows
 from benchmarks.serving.machines import LOADING_CORE, SERVED_CORE, pin
+from benchmarks.serving.memory import memory_rows
 from benchmarks.serving.native import native_rows, sanitizer_rows
 from benchmarks.serving.peers.measure import PEERS, peer_rows
 from benchmarks.serving.ratios import Site, ratio_rows, tail_rows
@@ -56,7 +57,7 @@ def main() -> None:
     parser.add_argument(
         "--only",
         nargs="+",
-        help="parts: ratios decoding tail overload swap sigterm sizes hostile both_cores peers soak native sanitizers",
+        help="parts: ratios decoding tail overload swap sigterm sizes hostile memory both_cores peers soak native sanitizers",
     )
     parser.add_argument("--peers", nargs="+", default=PEERS, choices=PEERS, help="who else hosts the pipeline")
     arguments = parser.parse_args()
@@ -74,6 +75,7 @@ def main() -> None:
         "sigterm": lambda: sigterm_rows(report, site, core=core),
         "sizes": lambda: size_rows(report, site, core=core),
         "hostile": lambda: hostile_rows(report, site, core=core),
+        "memory": lambda: memory_rows(report, site),
         "both_cores": lambda: ratio_rows(report, site, seconds=seconds, rounds=1, core=None, suffix=".both_cores"),
         "peers": lambda: peer_rows(
             report, site, seconds=seconds, rounds=arguments.rounds, core=core, names=arguments.peers
@@ -96,7 +98,7 @@ def main() -> None:
     for name, part in parts.items():
         if arguments.only and name not in arguments.only:
             continue
-        pin(0, None if name in {"both_cores", *WITHOUT_A_MAP} else LOADING_CORE)
+        pin(0, None if name in {"both_cores", "memory", *WITHOUT_A_MAP} else LOADING_CORE)
         part()
         print(f"written: {report.write()}", flush=True)
 

@@ -41,6 +41,7 @@ def launch(
     grpc_port: int = 0,
     stderr: IO[str] | int | None = None,
     temporary: Path | None = None,
+    enter: Callable[[], None] | None = None,
     **settings: object,
 ) -> subprocess.Popen[str]:
     """Start the real command; its first lines on standard output say where it listens.
@@ -51,6 +52,7 @@ def launch(
         grpc_port: of gRPC; 0 lets the system choose.
         stderr: where its log goes; None shows it.
         temporary: folder of its temporary files; None leaves that to the system.
+        enter: called in its process before it begins, as to enter a control group.
         settings: as in the environment, lower case.
     """
     environment = os.environ | {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
@@ -60,6 +62,7 @@ def launch(
         [*_SERVE, str(maps), "--port", str(port), "--grpc-port", str(grpc_port)], cwd=ROOT, env=environment,
         stdout=subprocess.PIPE, stderr=stderr, text=True,
         process_group=0,  # Ctrl-C ends the measurement, which then ends the service
+        preexec_fn=enter,  # the load generator has not begun its threads yet
     )  # fmt: skip
 
 
@@ -74,6 +77,7 @@ class Server:
         grpc_port: of gRPC; 0 lets the system choose.
         stderr: where its log goes; None shows it.
         temporary: folder of its temporary files; None leaves that to the system.
+        enter: called in its process before it begins, as to enter a control group.
         settings: as in the environment, lower case.
 
     Raises:
@@ -82,21 +86,28 @@ class Server:
 
     def __init__(
         self, maps: Path, *, core: int | None = SERVED_CORE, trusted: ssl.SSLContext | None = None, port: int = 0,
-        grpc_port: int = 0, log: Callable[[str], None] | None = None, temporary: Path | None = None, **settings: object,
+        grpc_port: int = 0, log: Callable[[str], None] | None = None, temporary: Path | None = None,
+        enter: Callable[[], None] | None = None, **settings: object,
     ) -> None:  # fmt: skip
         began = time.perf_counter()
         stderr = None if log is None else subprocess.PIPE
-        self.process = launch(maps, port=port, grpc_port=grpc_port, stderr=stderr, temporary=temporary, **settings)
+        self.process = launch(
+            maps, port=port, grpc_port=grpc_port, stderr=stderr, temporary=temporary, enter=enter, **settings
+        )
         pin(self.process.pid, core)
+        self._hearing: threading.Thread | None = None
         if log is not None and self.process.stderr is not None:
-            threading.Thread(target=_pass_on, args=(self.process.stderr, log), daemon=True).start()
+            self._hearing = threading.Thread(target=_pass_on, args=(self.process.stderr, log), daemon=True)
+            self._hearing.start()
         late = threading.Timer(_READY_S, kill_tree, (self.process.pid,))
         late.start()
         try:
             self.grpc, self.url = _until(self.process.stdout, r"serving gRPC at (\S+)", r"serving at (\S+)")
             while httpx.get(f"{self.url}/readyz", timeout=30, verify=trusted or True).status_code != 200:
                 time.sleep(0.005)
-        except httpx.TransportError as error:
+        except (httpx.TransportError, RuntimeError) as error:
+            kill_tree(self.process.pid)
+            self.wait()
             raise RuntimeError(f"the service ended before it was ready: {error!r}") from error
         finally:
             late.cancel()
@@ -112,7 +123,23 @@ class Server:
         """Stop it."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
-        self.process.communicate(timeout=120)
+        self.wait(120)
+
+    def wait(self, timeout_s: float | None = None) -> int:
+        """Wait for its end and for the end of its log; its exit code.
+
+        Raises:
+            subprocess.TimeoutExpired: it has not ended.
+        """
+        if self._hearing is None:
+            self.process.communicate(timeout=timeout_s)
+            return self.process.returncode
+        code = self.process.wait(timeout_s)
+        self._hearing.join(timeout_s)
+        for stream in (self.process.stdout, self.process.stderr):
+            if stream is not None:
+                stream.close()
+        return code
 
     @property
     def used(self) -> Usage:

@@ -22,6 +22,7 @@ from service.registration.register import Registered
 from service.registration.rendered import REACH_M, SURFEL_M
 from service.registration.surfel_map import TILE_M, SurfelMap
 from service.runtime.engine import EncodedQuery, Engine, Located
+from service.runtime.memory import EXPLAIN_PEAK
 
 _WIDTH, _MAP_WIDTH = 320, 160  # of depth pictures; in a larger one the gaps between surfels show
 _POINTS_ACROSS = 160  # of the query's points in the map
@@ -60,7 +61,11 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
     answer, bundle = located.answer, located.bundle
     T_map_camera = answer.T_map_camera_guess
     registered = answer.candidates[0].registered if answer.candidates else None
-    depth_m = mapped_depth(frame, registered, localizer.refining)
+    with engine.memory.hold() as hold:
+        hold.grow(EXPLAIN_PEAK * frame.query.depth_m.size)
+        depth_m = mapped_depth(frame, registered, localizer.refining)
+        hold.shrink_to(depth_m.nbytes)
+        hold.leave_with(depth_m)
     drawn = {"depth": depth_picture(_small(depth_m)), "fused": _fused(frame, bundle.grid)}
     if bundle.cloud is not None:
         best = answer.neighbours[0]

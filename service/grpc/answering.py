@@ -11,6 +11,7 @@ import grpc
 
 from service.errors import StreetfixError
 from service.grpc.call import Call
+from service.grpc.memory import held_by_call
 from service.grpc.status import fail, refuse
 from service.runtime.engine import Engine
 from service.runtime.logs import log_request
@@ -38,13 +39,19 @@ def answering(
     span = engine.tracing.begin("grpc", metadata.get("traceparent"))
     try:
         context.send_initial_metadata(((REQUEST_ID, request_id),))
-        yield Call(engine.admission, context, span, timeout_s=engine.settings.request_timeout_s)
+        yield Call(
+            engine.admission, context, span, timeout_s=engine.settings.request_timeout_s,
+            hold=None if lives_long else held_by_call.get(),
+        )  # fmt: skip
     except StreetfixError as error:
         code = error.code
         refuse(context, error)
-    except (GeneratorExit, grpc.RpcError, CancelledError):  # the client has gone
+    except (GeneratorExit, grpc.RpcError):  # the client has gone
         code = "CANCELLED"
         raise
+    except CancelledError:  # it has as well; gRPC would take this one for a defect, and log a traceback
+        code = "CANCELLED"
+        context.abort(grpc.StatusCode.CANCELLED, "the caller has gone")
     except Exception as error:
         code = "INTERNAL"
         fail(context, error, request_id)

@@ -10,6 +10,7 @@ import grpc
 
 from service.errors import DeadlineError
 from service.runtime.admission import Admission
+from service.runtime.memory import Hold
 from service.runtime.tracing import RequestSpan
 
 T = TypeVar("T")
@@ -23,15 +24,17 @@ class Call:
         context: of the call.
         span: of its trace.
         timeout_s: that the service allows; the caller's deadline may be shorter.
+        hold: memory of the call's message, kept until the work is over; None where somebody else keeps it.
     """
 
     def __init__(
-        self, admission: Admission, context: grpc.ServicerContext, span: RequestSpan, *, timeout_s: float
-    ) -> None:
+        self, admission: Admission, context: grpc.ServicerContext, span: RequestSpan, *, timeout_s: float, hold: Hold | None = None
+    ) -> None:  # fmt: skip
         self.span = span
         self._admission = admission
         self._context = context
         self._timeout_s = timeout_s
+        self._hold = hold
         self._lock = threading.Lock()
         self._under_way: set[Future[object]] = set()  # no more than these: a stream's call has frames for hours
         self._gone = not context.add_callback(self._drop)
@@ -59,6 +62,8 @@ class Call:
             BusyError: the queue is full.
         """
         future = self._admission.submit(work)
+        if self._hold is not None:
+            self._hold.until(future)
         with self._lock:
             self._under_way.add(future)  # type: ignore[arg-type]  # a future of anything
             gone = self._gone

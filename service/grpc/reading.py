@@ -1,6 +1,7 @@
-"""Reads a call's messages in the call's own thread, with patience, and looks at their size before they are parsed.
+"""Reads a call's messages in the call's own thread, in its turn, with patience, and looks at their size before they are parsed.
 
-Left to gRPC, bytes that do not parse end a call with its own words, a traceback in the log, and no count in the metrics.
+Left to gRPC, bytes that do not parse end a call with its own words, a traceback in the log, and no count in the metrics. gRPC would
+also read the messages of all calls at once, whatever memory that takes.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,9 +13,10 @@ from google.protobuf.descriptor import Descriptor
 from google.protobuf.descriptor_pool import Default
 from google.protobuf.message import Message
 
-from service.errors import RequestError
+from service.errors import RequestError, StreetfixError
 from service.grpc.call import Call
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.memory import MessageMemory, held_by_call
 from service.grpc.parsing import parsed
 from service.grpc.patience import Patience
 
@@ -24,8 +26,11 @@ else:  # generic in its stub alone
     _Interceptor = grpc.ServerInterceptor
 
 SERVICE: str = pb.DESCRIPTOR.services_by_name["LocalizationService"].full_name
+#: Seconds in which a message of another service (health, reflection) must be there: it is small.
+OTHERS_S = 3.0
 #: Ends a call of that name as the contract says; ``service.grpc.answering.answering`` of an engine.
 Answering = Callable[[str, grpc.ServicerContext], AbstractContextManager[Call]]
+Messages = Iterator[bytes]
 
 
 class ReadingInterceptor(_Interceptor):
@@ -33,12 +38,14 @@ class ReadingInterceptor(_Interceptor):
 
     Args:
         patience: ends calls.
+        memory: gives calls their turns to read.
         timeout_s: that a call of ours may take to send its only message.
         answering: how refused calls end.
     """
 
-    def __init__(self, patience: Patience, *, timeout_s: float, answering: Answering) -> None:
+    def __init__(self, patience: Patience, memory: MessageMemory, *, timeout_s: float, answering: Answering) -> None:
         self._patience = patience
+        self._memory = memory
         self._timeout_s = timeout_s
         self._answering = answering
 
@@ -51,41 +58,109 @@ class ReadingInterceptor(_Interceptor):
             return None
         service, _, method = details.method.removeprefix("/").partition("/")
         message = Default().FindServiceByName(service).methods_by_name[method].input_type
-        serializer = handler.response_serializer
+        serializer, ours = handler.response_serializer, service == SERVICE
         if handler.request_streaming:
+            stream = self._our_stream if ours else self._stream_of_others
+            return grpc.stream_stream_rpc_method_handler(
+                stream(handler, message, method), response_serializer=serializer
+            )
+        if ours:
+            return grpc.stream_unary_rpc_method_handler(
+                self._our_answer(handler, message, method), response_serializer=serializer
+            )
+        if handler.response_streaming:
+            return grpc.stream_stream_rpc_method_handler(
+                self._answers_of_others(handler, message, method), response_serializer=serializer
+            )
+        return grpc.stream_unary_rpc_method_handler(
+            self._answer_of_others(handler, message, method), response_serializer=serializer
+        )
 
-            def stream(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
-                if service == SERVICE:  # our servicer ends its streams itself
-                    return handler.stream_stream((parsed(raw, message) for raw in messages), context)
-                return handler.stream_stream((self._parsed(raw, message, method, context) for raw in messages), context)
+    def _our_answer(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Any]:
+        def answer(messages: Messages, context: grpc.ServicerContext) -> Any:
+            with self._memory.hold() as hold:
+                try:
+                    with self._memory.turn():
+                        raw = self._next(messages, method, context, self._timeout_s)
+                    hold.grow(len(raw))
+                except StreetfixError as error:
+                    self._end(error, method, context)
+                with self._memory.parsing(len(raw)):
+                    request = self._parsed(raw, message, method, context)
+                    del raw
+                token = held_by_call.set(hold)
+                try:
+                    return handler.unary_unary(request, context)
+                finally:
+                    held_by_call.reset(token)
 
-            return grpc.stream_stream_rpc_method_handler(stream, response_serializer=serializer)
-        if service != SERVICE:  # health, which needs no key: a call must not hold a thread before its message is there
-            behaviour = handler.unary_stream if handler.response_streaming else handler.unary_unary
+        return answer
 
-            def one(raw: bytes, context: grpc.ServicerContext) -> Any:
-                return behaviour(self._parsed(raw, message, method, context), context)
+    def _our_stream(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Any]:
+        del method  # our servicer ends its streams itself
 
-            if handler.response_streaming:
-                return grpc.unary_stream_rpc_method_handler(one, response_serializer=serializer)
-            return grpc.unary_unary_rpc_method_handler(one, response_serializer=serializer)
+        def stream(messages: Messages, context: grpc.ServicerContext) -> Any:
+            return handler.stream_stream((parsed(raw, message) for raw in messages), context)
 
-        def patient(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
-            raw = self._next(messages, method, context)
-            return handler.unary_unary(self._parsed(raw, message, method, context), context)
+        return stream
 
-        return grpc.stream_unary_rpc_method_handler(patient, response_serializer=serializer)
+    def _answer_of_others(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Any]:
+        def answer(messages: Messages, context: grpc.ServicerContext) -> Any:
+            return handler.unary_unary(self._small(messages, message, method, context), context)
 
-    def _next(self, messages: Iterator[bytes], method: str, context: grpc.ServicerContext) -> bytes:
+        return answer
+
+    def _answers_of_others(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Iterator[Any]]:
+        def answers(messages: Messages, context: grpc.ServicerContext) -> Iterator[Any]:
+            yield from handler.unary_stream(self._small(messages, message, method, context), context)
+
+        return answers
+
+    def _stream_of_others(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Iterator[Any]]:
+        def in_turn(messages: Messages, context: grpc.ServicerContext) -> Iterator[Message]:
+            while True:
+                try:
+                    with self._memory.turn_of_others(streams=True), self._patience.at_most(OTHERS_S, context.cancel):
+                        raw = next(messages, None)
+                except StreetfixError as error:
+                    self._end(error, method, context)
+                if raw is None:
+                    return
+                yield self._parsed(raw, message, method, context)
+
+        def answers(messages: Messages, context: grpc.ServicerContext) -> Iterator[Any]:
+            yield from handler.stream_stream(in_turn(messages, context), context)
+
+        return answers
+
+    def _small(self, messages: Messages, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
+        """The only message of a call of another service."""
+        try:
+            with self._memory.turn_of_others(streams=False):
+                raw = self._next(messages, method, context, OTHERS_S)
+        except StreetfixError as error:
+            self._end(error, method, context)
+        return self._parsed(raw, message, method, context)
+
+    def _next(self, messages: Messages, method: str, context: grpc.ServicerContext, timeout_s: float) -> bytes:
         """The only message of a call; the call ends where none comes."""
         try:
-            with self._patience.at_most(self._timeout_s, context.cancel):
+            with self._patience.at_most(timeout_s, context.cancel):
                 raw = next(messages, None)
         except grpc.RpcError as error:
             self._end(error, method, context)
-        if (
-            raw is None
-        ):  # gRPC says no more of a call that was cancelled meanwhile, or whose message was beyond the limit
+        # gRPC says no more of a call that was cancelled meanwhile, or whose message was beyond the limit
+        if raw is None:
             self._end(RequestError("the call ended before its message had come; send exactly one"), method, context)
         return raw
 

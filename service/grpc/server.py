@@ -13,6 +13,7 @@ from service.grpc.answering import answering
 from service.grpc.auth import AuthInterceptor
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import add_LocalizationServiceServicer_to_server
 from service.grpc.health import Health
+from service.grpc.memory import MessageMemory
 from service.grpc.patience import Patience
 from service.grpc.reading import SERVICE, ReadingInterceptor
 from service.grpc.servicer import Servicer
@@ -22,6 +23,7 @@ from service.runtime.keys import KeyRing
 HEALTH: str = health_pb2.DESCRIPTOR.services_by_name["Health"].full_name
 #: Calls that are refused, or ask nothing of the workers, while every place of the queue is taken.
 _SPARE = 16
+_LOOKAHEAD_BYTES = 65_536
 
 
 class GrpcServer:
@@ -49,8 +51,11 @@ class GrpcServer:
     ) -> None:
         settings = engine.settings
         self._patience = Patience()
+        memory = MessageMemory(
+            engine.memory, most_bytes=settings.limits.max_request_bytes, most_streams=settings.grpc_streams
+        )
         reading = ReadingInterceptor(
-            self._patience, timeout_s=settings.request_timeout_s, answering=partial(answering, engine)
+            self._patience, memory, timeout_s=settings.request_timeout_s, answering=partial(answering, engine)
         )
         # A thread waits for each call; the work itself is the engine's workers'. A stream holds its thread while it lives.
         most = engine.admission.capacity + settings.grpc_streams + _SPARE
@@ -59,6 +64,9 @@ class GrpcServer:
             options=[
                 ("grpc.max_receive_message_length", settings.limits.max_request_bytes),
                 ("grpc.max_send_message_length", -1),
+                # What a client may send ahead of our asking for its message: gRPC would widen it to megabytes by itself.
+                ("grpc.http2.bdp_probe", 0),
+                ("grpc.http2.lookahead_bytes", _LOOKAHEAD_BYTES),
                 ("grpc.so_reuseport", int(settings.workers > 1)),  # else a taken port would go unnoticed
                 ("grpc.keepalive_time_ms", 30_000),  # a robot that lost its link must not keep its stream
                 ("grpc.keepalive_timeout_ms", 10_000),
@@ -66,7 +74,7 @@ class GrpcServer:
             maximum_concurrent_rpcs=most,
             interceptors=[reading] if keys is None else [AuthInterceptor(keys, engine.metrics.requested), reading],
         )
-        servicer = Servicer(engine, self._patience)
+        servicer = Servicer(engine, self._patience, memory)
         add_LocalizationServiceServicer_to_server(servicer, self._server)  # type: ignore[no-untyped-call]  # generated code
         health_pb2_grpc.add_HealthServicer_to_server(Health(engine, ("", SERVICE)), self._server)
         reflection.enable_server_reflection((SERVICE, HEALTH, reflection.SERVICE_NAME), self._server)

@@ -1,6 +1,5 @@
 """The calls of LocalizationService, on the same engine and the same admission as REST."""
 
-import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
@@ -16,6 +15,7 @@ from service.grpc.answering import answering
 from service.grpc.call import Call
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceServicer
+from service.grpc.memory import MessageMemory
 from service.grpc.messages import answer_message, map_message, request_from, sequence_request_from, transform_from
 from service.grpc.patience import Patience
 from service.grpc.status import problem_message
@@ -27,10 +27,10 @@ from service.runtime.tracing import RequestSpan
 class Servicer(LocalizationServiceServicer):
     """Answers calls; each runs in a thread of the gRPC server, which waits while a worker of the engine does the work."""
 
-    def __init__(self, engine: Engine, patience: Patience) -> None:
+    def __init__(self, engine: Engine, patience: Patience, memory: MessageMemory) -> None:
         self._engine = engine
         self._patience = patience
-        self._streams = threading.Semaphore(engine.settings.grpc_streams)  # each holds a thread as long as it lives
+        self._memory = memory
 
     def Localize(self, request: pb.LocalizeRequest, context: grpc.ServicerContext) -> pb.LocalizeResponse:
         """One pair."""
@@ -69,16 +69,13 @@ class Servicer(LocalizationServiceServicer):
         self, request_iterator: Iterator[pb.LocalizeStreamRequest], context: grpc.ServicerContext
     ) -> Iterator[pb.LocalizeStreamResponse]:
         """A robot that drives."""
-        with self._answering("LocalizeStream", context, lives_long=True) as call:
-            if not self._streams.acquire(blocking=False):
-                raise BusyError("all streams are taken; close one, or send sequences instead")
-            try:
-                stream, number = Stream(self._engine), 0
-                while (request := self._next_frame(number, request_iterator, context)) is not None:
-                    yield self._next_of(stream, number, request, call)
-                    number += 1
-            finally:
-                self._streams.release()
+        # A stream holds a thread, and memory for its next frame, as long as it lives.
+        with self._answering("LocalizeStream", context, lives_long=True) as call, self._memory.stream():
+            stream, number = Stream(self._engine), 0
+            while (request := self._next_frame(number, request_iterator, context)) is not None:
+                yield self._next_of(stream, number, request, call)
+                number += 1
+                del request  # before the next one is read: memory is reserved for one
 
     def ListMaps(self, request: pb.ListMapsRequest, context: grpc.ServicerContext) -> pb.ListMapsResponse:
         """All mounted maps."""

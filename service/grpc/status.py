@@ -32,7 +32,8 @@ _log = logging.getLogger("streetfix.grpc")
 
 
 def status_of(error: StreetfixError) -> status_pb2.Status:
-    """An error of ours with its details."""
+    """An error of ours with its details; its traceback is dropped, through which it would keep the request in memory."""
+    error.__traceback__ = None
     details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.code, domain=DOMAIN)]
     if error.kind in ("invalid", "unsupported", "too_large"):
         violation = error_details_pb2.BadRequest.FieldViolation(field=error.field, description=error.message)
@@ -55,6 +56,7 @@ def refuse(context: grpc.ServicerContext, error: StreetfixError) -> NoReturn:
 def fail(context: grpc.ServicerContext, error: Exception, request_id: str) -> NoReturn:
     """What nobody foresaw: the log gets the story, the caller the request id only."""
     _log.error("request_failed request_id=%s", request_id, exc_info=error)
+    error.__traceback__ = None  # it would keep the request in memory
     context.abort(
         grpc.StatusCode.INTERNAL, f"the service failed on this request; tell its operator the request id {request_id}"
     )
@@ -62,7 +64,8 @@ def fail(context: grpc.ServicerContext, error: Exception, request_id: str) -> No
 
 
 def problem_message(error: StreetfixError) -> pb.Problem:
-    """An error of one request among several."""
+    """An error of one request among several; its traceback is dropped, through which it would keep the request in memory."""
+    error.__traceback__ = None
     title = (type(error).__doc__ or "").strip().splitlines()[0]
     return pb.Problem(code=error.code, title=title, detail=error.message, field=error.field)
 

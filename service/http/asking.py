@@ -8,7 +8,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from service.errors import BusyError, DeadlineError
-from service.http.body import read_body
+from service.http.body import Body, read_body
 from service.runtime.engine import Engine
 
 T = TypeVar("T")
@@ -37,11 +37,11 @@ class Asking:
         except TimeoutError as error:
             raise DeadlineError(f"not done within {settings.request_timeout_s:g} s; try again later") from error
 
-    async def __call__(self, request: Request, work: Callable[[bytearray], Awaitable[Response]]) -> Response:
+    async def __call__(self, request: Request, work: Callable[[Body], Awaitable[Response]]) -> Response:
         """Read the body and work on it.
 
         Raises:
-            BusyError: as many come in, or wait, as may.
+            BusyError: as many come in, or wait, as may, or the memory for requests is taken.
             TooLargeError: the body is beyond the limit.
             DeadlineError: body and work took longer than a request may.
         """
@@ -51,9 +51,10 @@ class Asking:
                 f"{self.engine.admission.capacity} requests are coming in or wait already; try again in a second"
             )
         try:
-            async with asyncio.timeout(settings.request_timeout_s), self._bodies:
-                body = await read_body(request, max_bytes=settings.limits.max_request_bytes)
-                return await _unless_gone(request, work(body))
+            with self.engine.memory.hold() as hold:
+                async with asyncio.timeout(settings.request_timeout_s), self._bodies:
+                    content = await read_body(request, max_bytes=settings.limits.max_request_bytes, hold=hold)
+                    return await _unless_gone(request, work(Body(content, hold, self.engine.admission)))
         except TimeoutError as error:
             raise DeadlineError(
                 f"no answer within {settings.request_timeout_s:g} s; send the body faster, or try again later"

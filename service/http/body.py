@@ -4,32 +4,101 @@ Starlette bounds form fields but no files, and spools parts over 1 MiB to tempor
 file system and a limit of bytes does neither.
 """
 
+import asyncio
 import re
+from collections.abc import Callable
 from email.message import Message
+from typing import TypeVar
 
 from starlette.requests import Request
 
 from service.errors import RequestError, TooLargeError, UnsupportedFormatError
+from service.runtime.admission import Admission
+from service.runtime.memory import MIB, Hold
 
+T = TypeVar("T")
+
+#: A body of unknown length reserves memory in such steps.
+_STEP = MIB
 _HEADERS_AT_MOST = 4096
 _BOUNDARY = re.compile(r"[0-9A-Za-z'()+_,./:=? -]{0,69}[0-9A-Za-z'()+_,./:=?-]")
 
 
-async def read_body(request: Request, *, max_bytes: int) -> bytearray:
+async def read_body(request: Request, *, max_bytes: int, hold: Hold) -> bytearray:
     """The whole body, never more than the limit.
+
+    Args:
+        request: whose body has not been read.
+        max_bytes: the limit.
+        hold: where its memory is reserved: the announced length before a byte is read, else step by step as it comes.
 
     Raises:
         TooLargeError: the length announced, or the bytes that came, are beyond the limit.
+        BusyError: the memory for requests is taken.
     """
     announced = request.headers.get("content-length", "0")
-    if announced.isdecimal() and int(announced) > max_bytes:
-        raise _too_large(f"{announced} bytes", max_bytes)
+    if announced.isdecimal():
+        if int(announced) > max_bytes:
+            raise _too_large(f"{announced} bytes", max_bytes)
+        hold.grow(int(announced))
     body = bytearray()
     async for chunk in request.stream():
         if len(body) + len(chunk) > max_bytes:
             raise _too_large(f"over {len(body)} bytes so far", max_bytes)
+        if len(body) + len(chunk) > hold.bytes:
+            hold.grow(max(_STEP, len(chunk)))
         body += chunk
     return body
+
+
+class Body:
+    """A body that has come in whole, and the memory that it holds.
+
+    Args:
+        content: gone when it was read.
+        hold: its reservation.
+        admission: of the engine.
+    """
+
+    def __init__(self, content: bytearray, hold: Hold, admission: Admission) -> None:
+        self._content = content
+        self._hold = hold
+        self._admission = admission
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """Work on it, on a worker; its memory stays reserved until that is over.
+
+        Raises:
+            BusyError: the queue is full.
+        """
+        future = self._admission.submit(work)
+        self._hold.until(future)
+        return await asyncio.wrap_future(future)
+
+    def split(self, content_type: str, *, max_parts: int) -> dict[str, bytes]:
+        """The parts of a multipart/form-data body by their names.
+
+        Raises:
+            BusyError: the memory for requests is taken.
+            StreetfixError: as ``split_multipart``.
+        """
+        before = len(self._content)
+        self._hold.grow(before)  # parts are copies, beside the body until all are made
+        parts = split_multipart(self._content, content_type, max_parts=max_parts)
+        self._content.clear()
+        self._hold.shrink_to(before)
+        return parts
+
+    def whole(self, *, copies: int) -> bytes:
+        """All of it, for a reader that makes so many copies.
+
+        Raises:
+            BusyError: the memory for requests is taken.
+        """
+        self._hold.grow(copies * len(self._content))
+        content = bytes(self._content)
+        self._content.clear()
+        return content
 
 
 def _too_large(what: str, max_bytes: int) -> TooLargeError:

@@ -81,7 +81,8 @@ def problem_response(problem: Problem, headers: Any = None) -> Response:
 
 
 def problem_of(error: StreetfixError, request_id: str) -> Problem:
-    """An error of ours as a problem."""
+    """An error of ours as a problem; its traceback is dropped, through which it would keep the request in memory."""
+    error.__traceback__ = None
     return Problem(
         type=f"/problems/{error.code}",
         title=title_of(type(error)),
@@ -96,6 +97,7 @@ def problem_of(error: StreetfixError, request_id: str) -> Problem:
 def internal_error(error: Exception, request_id: str) -> Response:
     """What nobody foresaw: the log gets the story, the caller the request id only."""
     _log.error("request_failed request_id=%s", request_id, exc_info=error)
+    error.__traceback__ = None
     problem = Problem(
         type="/problems/internal", title="Internal error.", status=500,
         detail="The service failed on this request; tell its operator the request id.", code="internal", field=None, request_id=request_id,

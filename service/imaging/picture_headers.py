@@ -5,6 +5,7 @@ allocate nothing, follow no more than a bounded number of segments, and leave de
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -38,10 +39,12 @@ class ImageLimits:
     Attributes:
         max_bytes: of the encoded part.
         max_pixels: width x height of the decoded picture.
+        reserve: called with a picture's field and pixels when its header is read, before it is decoded; may raise.
     """
 
     max_bytes: int = 32 * 2**20
     max_pixels: int = 25_000_000
+    reserve: Callable[[str, int], None] | None = None
 
 
 DEFAULT_LIMITS = ImageLimits()
@@ -111,10 +114,11 @@ def require_bytes(data: bytes, limits: ImageLimits, *, field: str) -> None:
 
 
 def require_pixels(height: int, width: int, limits: ImageLimits, *, field: str) -> None:
-    """Refuse a picture with too many pixels, as its header says.
+    """Refuse a picture with too many pixels, as its header says, and reserve what decoding it takes.
 
     Raises:
         TooLargeError: more than ``limits.max_pixels``.
+        StreetfixError: ``limits.reserve`` has no room for it.
     """
     if height * width > limits.max_pixels:
         raise TooLargeError(
@@ -122,6 +126,8 @@ def require_pixels(height: int, width: int, limits: ImageLimits, *, field: str) 
             "scale it down.",
             field=field,
         )
+    if limits.reserve is not None:
+        limits.reserve(field, height * width)
 
 
 def damaged(field: str, why: str) -> DecodeError:

@@ -61,7 +61,7 @@ class MapBundle:
         """
         manifest = read_manifest(path)
         _require_files(path, manifest, verify=verify)
-        document = (path / streets.FILE).read_bytes() if streets.FILE in manifest.files else None
+        document = _read(path / streets.FILE) if streets.FILE in manifest.files else None
         bundle = cls(
             path=path,
             manifest=manifest,
@@ -72,9 +72,7 @@ class MapBundle:
             view_index=ViewIndex.open(path / index.FILE),
             streets=None if document is None else Streets.from_geojson(_json_object(document, path / streets.FILE)),
             streets_document=document,
-            calibration=read_calibration(
-                (path / parts.CALIBRATION_FILE).read_bytes(), path=str(path / parts.CALIBRATION_FILE)
-            ),
+            calibration=read_calibration(_read(path / parts.CALIBRATION_FILE), path=str(path / parts.CALIBRATION_FILE)),
             cloud=_cloud(path, manifest, verify=verify),
         )
         _require_consistent(bundle)
@@ -116,8 +114,12 @@ class MapBundle:
         return None if georeference is None else Georeference(**georeference)
 
     def encoder_bytes(self) -> bytes:
-        """The encoder that made the descriptors."""
-        return (self.path / parts.ENCODER_FILE).read_bytes()
+        """The encoder that made the descriptors.
+
+        Raises:
+            BundleError: the file has gone since the bundle was opened.
+        """
+        return _read(self.path / parts.ENCODER_FILE)
 
     def streets_geojson(self) -> bytes:
         """The streets as they were given; an empty collection where the map has none."""
@@ -134,13 +136,24 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
         file = path / name
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
             raise _defect(file, "it is missing, or lies outside the bundle")
-        size = file.stat().st_size
+        try:
+            size = file.stat().st_size
+            found = sha256_of(file) if verify and size == entry.size else entry.sha256
+        except OSError as error:  # as when the bundle is being removed
+            raise _defect(file, f"it cannot be read ({error.strerror})") from error
         if size != entry.size:
             raise _defect(file, f"it has {size} bytes instead of {entry.size}")
-        if verify and sha256_of(file) != entry.sha256:
+        if found != entry.sha256:
             raise _defect(file, "its content is not what the manifest says")
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
         raise _defect(path / parts.ENCODER_FILE, "it is not the encoder that made the descriptors")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:  # as when the bundle is being removed
+        raise _defect(path, f"it cannot be read ({error.strerror})") from error
 
 
 def _load(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:

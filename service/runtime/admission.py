@@ -1,6 +1,7 @@
 """A bounded pool of workers: so many at work, so many waiting, the next is refused at once."""
 
 import threading
+import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
@@ -75,6 +76,9 @@ class Admission:
             self._tell()
         try:
             return cell.pop()()
+        except BaseException as error:
+            forget_locals(error)
+            raise
         finally:
             with self._lock:
                 self._working -= 1
@@ -88,3 +92,17 @@ class Admission:
     def _tell(self) -> None:
         self._told_working(self._working)
         self._told_waiting(max(0, self._taken - self._working))
+
+
+def forget_locals(error: BaseException) -> None:
+    """Drop the variables of the functions that an error has left: its traceback would keep a request's pictures as long as it lives.
+
+    Futures and the functions that wait for them refer to each other through their error, so that can be until the garbage collector
+    comes by.
+    """
+    seen: set[int] = set()
+    one: BaseException | None = error
+    while one is not None and id(one) not in seen:
+        seen.add(id(one))
+        traceback.clear_frames(one.__traceback__)
+        one = one.__cause__ or one.__context__

@@ -1,5 +1,6 @@
 """The composition root: settings in, a running engine out; every face calls this and nothing below it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
@@ -22,6 +23,13 @@ from service.runtime.admission import Admission
 from service.runtime.last_answers import LastAnswers
 from service.runtime.map_registry import MapRegistry
 from service.runtime.map_watcher import MapWatcher
+from service.runtime.memory import (
+    DEPTH_KEPT,
+    DEPTH_PEAK,
+    DEPTH_PEAK_CONVERTED,
+    RGB_PEAK,
+    budget_of,
+)
 from service.runtime.metrics import Metrics
 from service.runtime.serving_table import ServingTable
 from service.runtime.settings import Settings
@@ -81,7 +89,8 @@ class Engine:
         self.watcher = watcher or MapWatcher(registry, settings.maps, warm=partial(warm_up, settings.false_accept_rate))
         self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
-        self.metrics = Metrics(self.admission, registry)
+        self.memory = budget_of(settings, threads=self.threads, maps_bytes=_files_bytes(registry))
+        self.metrics = Metrics(self.admission, registry, self.memory)
         self.last_answers = LastAnswers()
         self.tracing = Tracing.open(settings.traces_endpoint, share=settings.traces_share)
         self.is_draining = False
@@ -189,8 +198,19 @@ class Engine:
         self.admission.close()
 
     def _decode(self, encoded: EncodedQuery, grid: ViewGrid) -> Query:
+        """Both pictures; the memory that they take is reserved for as long as they live."""
+        converted = encoded.depth_kind == "range" or encoded.depth_encoding == "carla"
+        of_pixel = {"rgb": RGB_PEAK, "depth": DEPTH_PEAK_CONVERTED if converted else DEPTH_PEAK}
+        with self.memory.hold() as hold:
+            hold.grow(len(encoded.rgb) + len(encoded.depth))
+            query = self._decoded(encoded, grid, lambda field, pixels: hold.grow(pixels * of_pixel[field]))
+            hold.shrink_to(query.rgb.nbytes + query.depth_m.size * DEPTH_KEPT)
+            hold.leave_with(query.depth_m)
+        return query
+
+    def _decoded(self, encoded: EncodedQuery, grid: ViewGrid, reserve: Callable[[str, int], None]) -> Query:
         limits = self.settings.limits
-        image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels)
+        image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels, reserve=reserve)
         rgb = decode_rgb(encoded.rgb, limits=image_limits, camera=encoded.camera, finest_rad=finest_rad(grid))
         depth_m = decode_depth(
             encoded.depth,
@@ -240,6 +260,12 @@ def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
     rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
     depth_m = rng.uniform(2.0, 20.0, (48, 64)).astype(np.float32)
     localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera, false_accept_rate=false_accept_rate))
+
+
+def _files_bytes(registry: MapRegistry) -> int:
+    """Of the files of all open maps."""
+    paths = [path for localizer in registry for path in localizer.bundle.path.rglob("*")]
+    return sum(path.stat().st_size for path in paths if path.is_file())
 
 
 def _prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:

@@ -19,6 +19,7 @@ from service.localization.answer import Answer, Timings
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
 from service.runtime.map_registry import MOST_REFUSED, MapRegistry
+from service.runtime.memory import MemoryBudget
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512, 1.0, 2.0, 5.0, 10.0, 30.0)
@@ -35,9 +36,10 @@ class Metrics:
     Args:
         admission: whose queue is watched.
         maps: whose versions are named.
+        memory: whose reservations are watched.
     """
 
-    def __init__(self, admission: Admission, maps: MapRegistry) -> None:
+    def __init__(self, admission: Admission, maps: MapRegistry, memory: MemoryBudget) -> None:
         self._registry = CollectorRegistry()
         self._maps = _Maps(maps)
         self._is_one_of_several = _FOLDER in os.environ
@@ -49,6 +51,11 @@ class Metrics:
         waiting = self._gauge("streetfix_waiting", "Requests that wait for a thread.")
         self._gauge("streetfix_capacity", "Requests that may be worked on or wait at once.").set(admission.capacity)
         admission.watch(working.set, waiting.set)
+        held = self._gauge("streetfix_request_memory_bytes", "Memory that is reserved for requests now.")
+        memory.watch(held.set)
+        self._gauge("streetfix_request_memory_limit_bytes", "Memory that may be reserved for requests.").set(
+            memory.limit
+        )
         self._requests = Counter(
             "streetfix_requests",
             "Requests answered, by what became of them.",

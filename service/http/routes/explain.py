@@ -1,7 +1,5 @@
 """POST /v1/explain: an answer, and what the machine saw on the way to it."""
 
-import asyncio
-
 from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
@@ -11,7 +9,7 @@ from service.console.message import explanation_message
 from service.contract import schema
 from service.contract.convert import parsed, query_from
 from service.http.asking import Asking
-from service.http.body import split_multipart
+from service.http.body import Body
 from service.http.parts import MOST_PARTS, require_parts
 from service.http.routes.localize import LOCALIZE_BODY, problems
 
@@ -32,18 +30,18 @@ def router_for(asking: Asking) -> APIRouter:
     async def post_explain(request: Request) -> Response:
         """The answer that `/v1/localize` gives, with pictures for people. It costs more: robots ask there."""
 
-        async def answer(body: bytearray) -> Response:
+        async def answer(body: Body) -> Response:
             content_type = request.headers.get("content-type", "")
 
             def work() -> bytes:
-                parts = split_multipart(body, content_type, max_parts=MOST_PARTS)
+                parts = body.split(content_type, max_parts=MOST_PARTS)
                 require_parts(parts, ("rgb", "depth", "request"))
                 asked = parsed(parts["request"], schema.LocalizeRequest)
                 explanation = explain(engine, query_from(asked, rgb=parts["rgb"], depth=parts["depth"]))
                 request.state.span.stages(explanation.located.answer.timings)
                 return explanation_message(explanation).model_dump_json(by_alias=True).encode()
 
-            return Response(await asyncio.wrap_future(engine.admission.submit(work)), media_type="application/json")
+            return Response(await body.run(work), media_type="application/json")
 
         return await asking(request, answer)
 

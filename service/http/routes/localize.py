@@ -14,7 +14,7 @@ from service.contract import schema
 from service.contract.convert import answer_from, fields_under, parsed, query_from, sequence_from
 from service.errors import StreetfixError
 from service.http.asking import Asking
-from service.http.body import split_multipart
+from service.http.body import Body
 from service.http.geopose import GEOPOSE, sure_geopose, wants_geopose
 from service.http.outcome import BatchAnswer, Outcome
 from service.http.parts import MOST_PARTS, document_of, numbered_pictures, require_parts
@@ -123,7 +123,7 @@ def router_for(asking: Asking) -> APIRouter:
         return await ask(request, _batch)
 
     async def ask(request: Request, work: Work) -> Response:
-        async def answer(body: bytearray) -> Response:
+        async def answer(body: Body) -> Response:
             headers = request.headers
             given = Given(
                 body, headers.get("content-type", ""), request.state.request_id, request.state.span,
@@ -141,7 +141,7 @@ def router_for(asking: Asking) -> APIRouter:
 class Given:
     """A body that has come in whole."""
 
-    body: bytearray
+    body: Body
     content_type: str
     request_id: str
     span: RequestSpan
@@ -149,7 +149,7 @@ class Given:
 
     def parts(self) -> dict[str, bytes]:
         """Its parts."""
-        return split_multipart(self.body, self.content_type, max_parts=MOST_PARTS)
+        return self.body.split(self.content_type, max_parts=MOST_PARTS)
 
 
 Work = Callable[[Engine, Given], Awaitable[bytes]]
@@ -162,7 +162,7 @@ async def _single(engine: Engine, given: Given) -> bytes:
         request = parsed(parts["request"], schema.LocalizeRequest)
         return _written(engine.localize(query_from(request, rgb=parts["rgb"], depth=parts["depth"])), given)
 
-    return await asyncio.wrap_future(engine.admission.submit(work))
+    return await given.body.run(work)
 
 
 async def _sequence(engine: Engine, given: Given) -> bytes:
@@ -172,7 +172,7 @@ async def _sequence(engine: Engine, given: Given) -> bytes:
         queries, transforms = sequence_from(request, numbered_pictures(parts, len(request.frames)))
         return _written(engine.localize_sequence(queries, transforms), given)
 
-    return await asyncio.wrap_future(engine.admission.submit(work))
+    return await given.body.run(work)
 
 
 async def _batch(engine: Engine, given: Given) -> bytes:
@@ -192,11 +192,11 @@ async def _batch(engine: Engine, given: Given) -> bytes:
 
         try:
             with fields_under(f"requests.{number}"):
-                return Outcome(answer=await asyncio.wrap_future(engine.admission.submit(work)), problem=None)
+                return Outcome(answer=await given.body.run(work), problem=None)
         except StreetfixError as error:
             return Outcome(answer=None, problem=problem_of(error, given.request_id))
 
-    asked = await asyncio.wrap_future(engine.admission.submit(split))
+    asked = await given.body.run(split)
     engine.metrics.batched(len(asked))
     outcomes = await asyncio.gather(*(one(number, *each) for number, each in enumerate(asked)))
     return BatchAnswer(outcomes=list(outcomes)).model_dump_json(by_alias=True).encode()

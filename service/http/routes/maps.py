@@ -64,8 +64,10 @@ def router_for(engine: Engine) -> APIRouter:
         one out of the folder. It needs an operator's key (`streetfix keys --operator`), or a service on loopback without keys.
         """
         require_operator(request, engine.settings)
-        async with asyncio.timeout(engine.settings.request_timeout_s):
-            wanted = parsed(bytes(await read_body(request, max_bytes=_MOST_BYTES)), schema.ServeVersion)
+        with engine.memory.hold() as hold:
+            async with asyncio.timeout(engine.settings.request_timeout_s):
+                content = await read_body(request, max_bytes=_MOST_BYTES, hold=hold)
+            wanted = parsed(bytes(content), schema.ServeVersion)
         served = engine.serve_version(map, wanted.version)
         return map_entry_from(served.bundle, engine.registry.versions(map))
 

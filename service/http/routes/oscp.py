@@ -1,6 +1,5 @@
 """The OSCP GeoPose Protocol, version 2, so that its clients work unchanged."""
 
-import asyncio
 import re
 import time
 import uuid
@@ -14,9 +13,12 @@ from starlette.responses import Response
 from service.contract.convert import answer_from, parsed
 from service.contract.oscp import GeoPoseAnswer, GeoPoseRequest, accuracy_of, query_of
 from service.http.asking import Asking
+from service.http.body import Body
 from service.http.geopose import sure_geopose
 from service.http.routes.localize import problems
 
+#: Of a JSON body: itself as bytes, its strings, and the pictures that they spell.
+_COPIES = 3
 MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"
 _VERSION = re.compile(r"application/vnd\.oscp\+json\s*;\s*version\s*=\s*\"?([0-9.]+)", re.IGNORECASE)
 _BODY: dict[str, Any] = {
@@ -51,9 +53,9 @@ def router_for(asking: Asking) -> APIRouter:
         """
         _require_version(request.headers.get("accept", ""))
 
-        async def answer(body: bytearray) -> Response:
+        async def answer(body: Body) -> Response:
             def work() -> bytes:
-                asked = parsed(bytes(body), GeoPoseRequest)
+                asked = parsed(body.whole(copies=_COPIES), GeoPoseRequest)
                 located = answer_from(engine.localize(query_of(asked, map)))
                 geopose = sure_geopose(located)  # refuses an answer that is not LOCALIZED
                 told = GeoPoseAnswer(
@@ -62,7 +64,7 @@ def router_for(asking: Asking) -> APIRouter:
                 )  # fmt: skip
                 return told.model_dump_json().encode()
 
-            return Response(await asyncio.wrap_future(engine.admission.submit(work)), media_type=MEDIA_TYPE)
+            return Response(await body.run(work), media_type=MEDIA_TYPE)
 
         return await asking(request, answer)
 

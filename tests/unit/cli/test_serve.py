@@ -1,4 +1,5 @@
 import gc
+import signal
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -69,8 +70,8 @@ def test_check_refuses_a_rate_of_false_accepts_that_a_map_cannot_promise(
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     check_only(Settings(maps=(tmp_path / "m",), false_accept_rate=0.001))
     for act in (check_only, serve):
-        with pytest.raises(BundleError, match=r"false_accept_rate is 1e-09, less than the 0\.001"):
-            act(Settings(maps=(tmp_path / "m",), port=0, false_accept_rate=1e-9))
+        with pytest.raises(BundleError, match=r"false_accept_rate is 1e-05, less than the 0\.001"):
+            act(Settings(maps=(tmp_path / "m",), port=0, false_accept_rate=1e-5))
 
 
 def test_check_of_an_empty_maps_folder_says_that_the_service_would_wait(
@@ -82,3 +83,20 @@ def test_check_of_an_empty_maps_folder_says_that_the_service_would_wait(
     )
     with pytest.raises(BundleError, match="there is no map bundle in"):
         check_only(Settings(maps=(tmp_path,), strict=True))
+
+
+def test_a_hangup_during_the_start_waits_until_there_is_somebody_to_handle_it(
+    bundle_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By default it would end the process."""
+    blocked: list[bool] = []
+
+    def opening(*_: object, **__: object) -> None:
+        blocked.append(signal.SIGHUP in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+        raise RuntimeError("no further")
+
+    monkeypatch.setattr("service.runtime.engine.Engine.open", opening)
+    with pytest.raises(RuntimeError, match="no further"):
+        serve(Settings(maps=(bundle_path,), port=0))
+    assert blocked == [True]
+    assert signal.SIGHUP not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

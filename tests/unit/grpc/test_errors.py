@@ -174,7 +174,11 @@ def test_work_whose_deadline_has_passed_is_dropped(
 
 
 def test_work_whose_caller_has_gone_is_dropped(
-    stub: LocalizationServiceStub, request_of: Any, engine: Engine, held: threading.Event
+    stub: LocalizationServiceStub,
+    request_of: Any,
+    engine: Engine,
+    held: threading.Event,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The place in the queue comes back while the worker is still busy."""
     call = stub.Localize.future(request_of())
@@ -184,6 +188,9 @@ def test_work_whose_caller_has_gone_is_dropped(
     assert engine.admission.working == 1
     held.set()
     assert stub.Localize(request_of()).map.name == "tiny"
+    cancelled = 'streetfix_requests_total{code="CANCELLED"'
+    assert became(lambda: cancelled in engine.metrics.text().decode(), within_s=10)
+    assert not [record for record in caplog.records if record.exc_info]  # who leaves is no defect of ours
 
 
 def became(true: Callable[[], bool], *, within_s: float) -> bool:

@@ -98,7 +98,7 @@ class Service:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
         log = os.open(self.log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         ready()
-        told(self.answering / str(number), "")
+        told(self.answering / str(number), str(os.getpid()))
         while True:
             asked = time.monotonic()
             try:
@@ -200,11 +200,16 @@ class Driver:
                 raise TimeoutError(f"{self.table.read()} {sorted(each.name for each in self.service.maps.iterdir())}")
             time.sleep(0.001)
 
+    def _answers(self, number: int) -> bool:
+        """Whether a worker lives and has joined, and not only the one before it that had its number."""
+        pid, joined = ((folder / str(number)).read_text() for folder in (self.service.pids, self.service.answering))
+        return pid == joined and self.service.memory.lives(number)
+
     def _kill_now_and_then(self) -> None:
         """At least one worker goes on, so that a version whose folder is gone stays open somewhere."""
         while not self._stop.wait(self.chance.uniform(0, 0.15)):
             with self._killing:
-                answering = [number for number in self.table.read().offers if self.service.memory.lives(number)]
+                answering = [number for number in range(WORKERS) if self._answers(number)]
                 if len(answering) > 1:
                     number = self.chance.choice(answering)
                     os.kill(int((self.service.pids / str(number)).read_text()), signal.SIGKILL)

@@ -4,14 +4,13 @@ import mmap
 import random
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from service.errors import BundleError, UnknownMapError
-from service.runtime.serving_table import MapVersion, ServingTable, SharedMemory, SharedServingTable
+from service.runtime.serving_table import MapVersion, ServingTable, SharedServingTable
 
 ROOT = Path(__file__).parents[3]
 
@@ -23,27 +22,7 @@ def version(number: int, name: str = "m") -> MapVersion:
 V1, V2, V3, V4, V5 = map(version, range(1, 6))
 
 
-class Memory(SharedMemory):
-    """Shared by objects instead of processes, so it is told who lives."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.living: set[int] = set()
-
-    def live(self, number: int) -> None:
-        self.living.add(number)
-
-    def lives(self, number: int) -> bool:
-        return number in self.living
-
-
-@pytest.fixture
-def memory() -> Iterator[Memory]:
-    with closing(Memory()) as made:
-        yield made
-
-
-def joined(memory: Memory, number: int, *opened: MapVersion) -> SharedServingTable:
+def joined(memory: Any, number: int, *opened: MapVersion) -> SharedServingTable:
     table = SharedServingTable(memory, number)
     assert table.join(opened) == frozenset()
     return table
@@ -55,13 +34,13 @@ def mounted(table: ServingTable, name: str = "m") -> tuple[str, list[str]]:
     return known.serving, [each.version for each in known.versions]
 
 
-def test_the_first_worker_mounts_what_it_has_and_the_newest_serves(memory: Memory) -> None:
+def test_the_first_worker_mounts_what_it_has_and_the_newest_serves(memory: Any) -> None:
     table = joined(memory, 0, V1, V3, V2, version(1, "other"))
     assert mounted(table) == ("v3", ["v3", "v2", "v1"])
     assert mounted(table, "other") == ("v1", ["v1"])
 
 
-def test_a_version_is_mounted_when_every_worker_has_it(memory: Memory) -> None:
+def test_a_version_is_mounted_when_every_worker_has_it(memory: Any) -> None:
     tables = [joined(memory, number, V1) for number in range(3)]
     for table in tables[:2]:
         table.offer(V2)
@@ -73,7 +52,7 @@ def test_a_version_is_mounted_when_every_worker_has_it(memory: Memory) -> None:
     assert not any(tables[0].read().offers.values())
 
 
-def test_a_worker_that_has_ended_has_no_say(memory: Memory) -> None:
+def test_a_worker_that_has_ended_has_no_say(memory: Any) -> None:
     tables = [joined(memory, number, V1) for number in range(2)]
     tables[0].offer(V2)
     memory.living.remove(1)
@@ -81,7 +60,7 @@ def test_a_worker_that_has_ended_has_no_say(memory: Memory) -> None:
     assert mounted(tables[0]) == ("v2", ["v2", "v1"])
 
 
-def test_a_choice_holds_for_all_until_a_newer_version_comes(memory: Memory) -> None:
+def test_a_choice_holds_for_all_until_a_newer_version_comes(memory: Any) -> None:
     tables = [joined(memory, number, V1, V2) for number in range(2)]
     tables[0].choose("m", "v1")
     assert [mounted(each)[0] for each in tables] == ["v1", "v1"]
@@ -93,7 +72,7 @@ def test_a_choice_holds_for_all_until_a_newer_version_comes(memory: Memory) -> N
     assert [mounted(each)[0] for each in tables] == ["v3", "v3"]
 
 
-def test_a_worker_that_is_started_again_takes_the_newer_version_not_the_old_choice(memory: Memory) -> None:
+def test_a_worker_that_is_started_again_takes_the_newer_version_not_the_old_choice(memory: Any) -> None:
     tables = [joined(memory, number, V1, V2) for number in range(2)]
     tables[0].choose("m", "v1")
     for table in tables:
@@ -105,14 +84,14 @@ def test_a_worker_that_is_started_again_takes_the_newer_version_not_the_old_choi
     assert mounted(again) == mounted(tables[0]) == ("v3", ["v3", "v2", "v1"])
 
 
-def test_and_keeps_a_choice_that_still_holds(memory: Memory) -> None:
+def test_and_keeps_a_choice_that_still_holds(memory: Any) -> None:
     tables = [joined(memory, number, V1, V2) for number in range(2)]
     tables[0].choose("m", "v1")
     memory.living.remove(1)
     assert mounted(joined(memory, 1, V1, V2))[0] == "v1"
 
 
-def test_what_it_offered_before_it_ended_does_not_count(memory: Memory) -> None:
+def test_what_it_offered_before_it_ended_does_not_count(memory: Any) -> None:
     tables = [joined(memory, number, V1) for number in range(2)]
     tables[1].offer(V2)
     again = SharedServingTable(memory, 1)  # nobody noticed that it had ended
@@ -121,7 +100,7 @@ def test_what_it_offered_before_it_ended_does_not_count(memory: Memory) -> None:
     assert mounted(tables[0])[0] == "v1"
 
 
-def test_what_serves_and_cannot_be_opened_keeps_a_worker_out(memory: Memory) -> None:
+def test_what_serves_and_cannot_be_opened_keeps_a_worker_out(memory: Any) -> None:
     first = joined(memory, 0, V1, V2, V3)
     first.choose("m", "v1")
     late = SharedServingTable(memory, 1)
@@ -134,7 +113,7 @@ def test_what_serves_and_cannot_be_opened_keeps_a_worker_out(memory: Memory) -> 
     assert mounted(first) == mounted(late) == ("v2", ["v3", "v2"])
 
 
-def test_what_does_not_serve_and_cannot_be_opened_is_dropped_for_all(memory: Memory) -> None:
+def test_what_does_not_serve_and_cannot_be_opened_is_dropped_for_all(memory: Any) -> None:
     first = joined(memory, 0, V1, V2)
     late = SharedServingTable(memory, 1)
     assert late.join([V2]) == {V1}
@@ -142,7 +121,7 @@ def test_what_does_not_serve_and_cannot_be_opened_is_dropped_for_all(memory: Mem
     assert mounted(first) == ("v2", ["v2"])
 
 
-def test_the_next_worker_after_all_have_ended_takes_over_what_it_can_open(memory: Memory) -> None:
+def test_the_next_worker_after_all_have_ended_takes_over_what_it_can_open(memory: Any) -> None:
     joined(memory, 0, V1, V2, V3, version(1, "gone")).choose("m", "v2")
     memory.living.clear()
     table = SharedServingTable(memory, 1)
@@ -156,7 +135,7 @@ def test_the_next_worker_after_all_have_ended_takes_over_what_it_can_open(memory
     assert mounted(table) == ("v5", ["v5", "v3"])
 
 
-def test_several_versions_are_removed_in_one_change(memory: Memory) -> None:
+def test_several_versions_are_removed_in_one_change(memory: Any) -> None:
     table = joined(memory, 0, V1, V2, V3)
     before = memory.counter
     table.remove([V3.key, V2.key, ("x", "v1")])
@@ -166,7 +145,7 @@ def test_several_versions_are_removed_in_one_change(memory: Memory) -> None:
     assert table.read().maps == {}
 
 
-def test_at_most_three_stay_and_the_one_that_serves_is_among_them(memory: Memory) -> None:
+def test_at_most_three_stay_and_the_one_that_serves_is_among_them(memory: Any) -> None:
     table = joined(memory, 0, V2, V3, V4)
     assert [each for each in (V1, V2, V5) if table.read().wants(each)] == [V5]
     assert not table.read().wants(V4, others=[V5])
@@ -181,7 +160,7 @@ def test_at_most_three_stay_and_the_one_that_serves_is_among_them(memory: Memory
     assert mounted(table) == ("v5", ["v5", "v4", "v3"])
 
 
-def test_a_copy_that_was_made_later_is_news_and_an_earlier_one_is_none(memory: Memory) -> None:
+def test_a_copy_that_was_made_later_is_news_and_an_earlier_one_is_none(memory: Any) -> None:
     tables = [joined(memory, number, V1, V2) for number in range(2)]
     assert not tables[0].read().wants(MapVersion("m", "v1", 0.5))
     for table in tables:
@@ -189,22 +168,21 @@ def test_a_copy_that_was_made_later_is_news_and_an_earlier_one_is_none(memory: M
     assert mounted(tables[0]) == ("v1", ["v1", "v2"])
 
 
-def test_versions_of_one_moment_are_in_one_order_for_all(memory: Memory) -> None:
+def test_versions_of_one_moment_are_in_one_order_for_all(memory: Any, other_memory: Any) -> None:
     a, b = MapVersion("m", "aa", 1.0), MapVersion("m", "bb", 1.0)
     assert mounted(joined(memory, 0, a, b)) == ("bb", ["bb", "aa"])
-    with closing(Memory()) as other:
-        assert mounted(joined(other, 0, b, a)) == ("bb", ["bb", "aa"])
+    assert mounted(joined(other_memory, 0, b, a)) == ("bb", ["bb", "aa"])
 
 
 @pytest.mark.parametrize(("name", "number", "told"), [("x", "v1", "mounted: m"), ("m", "v9", "open: v2, v1")])
-def test_what_is_not_mounted_cannot_be_chosen(memory: Memory, name: str, number: str, told: str) -> None:
+def test_what_is_not_mounted_cannot_be_chosen(memory: Any, name: str, number: str, told: str) -> None:
     table = joined(memory, 0, V1, V2)
     with pytest.raises(UnknownMapError, match=told):
         table.choose(name, number)
     table.choose("m", "v1")  # the lock was given back
 
 
-def test_a_table_that_does_not_fit_is_refused_and_the_old_one_holds(memory: Memory) -> None:
+def test_a_table_that_does_not_fit_is_refused_and_the_old_one_holds(memory: Any) -> None:
     table = joined(memory, 0, V1)
     with pytest.raises(BundleError, match="too many"):
         table.offer(version(1, "x" * 5 * 2**20))
@@ -213,7 +191,7 @@ def test_a_table_that_does_not_fit_is_refused_and_the_old_one_holds(memory: Memo
     assert mounted(table)[0] == "v2"
 
 
-def test_a_worker_that_is_killed_while_it_writes_leaves_the_table_whole(memory: Memory) -> None:
+def test_a_worker_that_is_killed_while_it_writes_leaves_the_table_whole(memory: Any) -> None:
     table = joined(memory, 0, V1, V2)
     unused = memory._slot(memory.counter + 1)
     memory._memory[unused : unused + mmap.PAGESIZE] = b"{" * mmap.PAGESIZE
@@ -222,7 +200,7 @@ def test_a_worker_that_is_killed_while_it_writes_leaves_the_table_whole(memory: 
     assert mounted(table)[0] == "v1"
 
 
-def test_reading_costs_no_lock_and_gives_the_same_object_while_nothing_changes(memory: Memory) -> None:
+def test_reading_costs_no_lock_and_gives_the_same_object_while_nothing_changes(memory: Any) -> None:
     one, other = joined(memory, 0, V1, V2), joined(memory, 1, V1, V2)
     known = one.read()
     with memory.locked():

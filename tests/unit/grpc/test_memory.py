@@ -1,0 +1,216 @@
+"""Messages within the budget of memory, over gRPC."""
+
+import gc
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+from service.errors import BusyError
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+from service.grpc.memory import MessageMemory
+from service.grpc.reading import SERVICE
+from service.grpc.server import GrpcServer
+from service.runtime.engine import Engine
+from service.runtime.memory import MIB, MemoryBudget
+from service.runtime.settings import Limits, Settings
+
+Parts = Callable[..., dict[str, bytes]]
+CAMERA = pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
+
+
+@pytest.fixture
+def engine(bundle_path: Path) -> Iterator[Engine]:
+    engine = Engine.open(
+        Settings(maps=(bundle_path,), threads=1, request_timeout_s=5, limits=Limits(max_request_bytes=MIB))
+    )
+    engine.memory = MemoryBudget(8 * MIB, messages=2)
+    yield engine
+    engine.close()
+
+
+@pytest.fixture
+def channel(engine: Engine) -> Iterator[grpc.Channel]:
+    server = GrpcServer(engine, host="127.0.0.1", port=0)
+    server.start()
+    with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
+        yield channel
+    server.stop(grace_s=0)
+
+
+@pytest.fixture
+def stub(channel: grpc.Channel) -> LocalizationServiceStub:
+    return LocalizationServiceStub(channel)
+
+
+@pytest.fixture
+def message(parts_of: Parts) -> pb.LocalizeRequest:
+    parts = parts_of()
+    return pb.LocalizeRequest(rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA)
+
+
+def becomes(true: Callable[[], bool]) -> bool:
+    until = time.monotonic() + 5
+    while not true():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+@pytest.mark.parametrize("good", [True, False])
+@pytest.mark.parametrize("method", ["Localize", "LocalizeBatch", "LocalizeSequence", "LocalizeStream"])
+def test_all_is_given_back_after_an_answer_and_after_an_error(
+    engine: Engine, stub: LocalizationServiceStub, message: pb.LocalizeRequest, method: str, good: bool
+) -> None:
+    if not good:
+        message.depth_format.scale_m, message.depth_format.max_range_m = 0.001, 0.01
+    requests: dict[str, Any] = {
+        "Localize": message,
+        "LocalizeBatch": pb.LocalizeBatchRequest(requests=[message, message]),
+        "LocalizeSequence": pb.LocalizeSequenceRequest(
+            frames=[
+                pb.SequenceFrame(rgb=message.rgb, depth=message.depth, camera=CAMERA, depth_format=message.depth_format)
+            ]
+        ),
+    }
+    gc.collect()
+    gc.disable()  # what lives on now is held by somebody, not only by itself
+    try:
+        if method == "LocalizeStream":
+            (outcome,) = stub.LocalizeStream(iter([pb.LocalizeStreamRequest(frame=message)]))
+            assert outcome.outcome.HasField("answer") == good
+        elif method == "LocalizeBatch":
+            assert stub.LocalizeBatch(requests[method]).outcomes[1].HasField("answer") == good
+        elif good:
+            getattr(stub, method)(requests[method])
+        else:
+            with pytest.raises(grpc.RpcError) as caught:
+                getattr(stub, method)(requests[method])
+            assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+        assert becomes(lambda: engine.memory.held == 0)
+    finally:
+        gc.enable()
+
+
+def test_a_message_that_does_not_fit_is_refused_with_when_to_come_back(
+    engine: Engine, stub: LocalizationServiceStub, message: pb.LocalizeRequest
+) -> None:
+    with engine.memory.hold() as others:
+        others.grow(8 * MIB - len(message.SerializeToString()) + 1)
+        with pytest.raises(grpc.RpcError) as caught:
+            stub.Localize(message)
+        assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert "google.rpc.RetryInfo" in str(dict(caught.value.trailing_metadata())["grpc-status-details-bin"])
+    assert stub.Localize(message).HasField("pose")
+    assert 'streetfix_requests_total{code="busy",face="grpc",method="Localize"} 1.0' in engine.metrics.text().decode()
+
+
+def test_no_more_messages_are_read_at_once_than_there_is_memory_for(
+    engine: Engine, channel: grpc.Channel, stub: LocalizationServiceStub, message: pb.LocalizeRequest
+) -> None:
+    """Calls that never send their message keep their turn until the service has had enough of them."""
+    over = threading.Event()
+
+    def silent() -> Iterator[bytes]:
+        over.wait(30)
+        yield from ()
+
+    call = channel.stream_unary(f"/{SERVICE}/Localize")
+    slow = [call.future(silent()) for _ in range(2)]
+
+    def is_refused() -> bool:
+        try:
+            stub.Localize(message)
+        except grpc.RpcError as error:
+            return error.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+        return False
+
+    assert becomes(is_refused)
+    health = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest())
+    assert health.status == health_pb2.HealthCheckResponse.SERVING
+    reflected = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(
+        iter([reflection_pb2.ServerReflectionRequest(list_services="")])
+    )
+    assert next(reflected).HasField("list_services_response")
+    over.set()
+    for each in slow:
+        each.cancel()
+    assert becomes(lambda: not is_refused())
+
+
+@pytest.mark.parametrize(
+    ("path", "form"),
+    [
+        ("/grpc.health.v1.Health/Check", "stream_unary"),
+        ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", "stream_stream"),
+    ],
+)
+def test_other_services_read_one_message_at_a_time(channel: grpc.Channel, path: str, form: str) -> None:
+    """They need no key and are not weighed, so a hundred large messages to them must not be read side by side."""
+    over = threading.Event()
+
+    def silent() -> Iterator[bytes]:
+        over.wait(30)
+        yield from ()
+
+    ended: list[grpc.StatusCode] = []
+    calls = []
+    for _ in range(4):
+        call = getattr(channel, form)(path)
+        found = call.future(silent()) if form == "stream_unary" else call(silent())
+        found.add_callback(lambda: None)
+        calls.append(found)
+    for found in calls:
+        try:
+            if form == "stream_unary":
+                found.result(timeout=10)
+            else:
+                next(found)
+        except (grpc.RpcError, StopIteration):
+            ended.append(found.code())
+    over.set()
+    assert len(ended) == 4
+    assert ended.count(grpc.StatusCode.RESOURCE_EXHAUSTED) >= 2
+
+
+def test_open_streams_are_weighed_by_the_largest_message(
+    engine: Engine, stub: LocalizationServiceStub, message: pb.LocalizeRequest
+) -> None:
+    over, streams = threading.Event(), []
+
+    def one_frame() -> Iterator[pb.LocalizeStreamRequest]:
+        yield pb.LocalizeStreamRequest(frame=message)
+        over.wait(30)
+
+    for _ in range(4):  # half of eight
+        streams.append(stub.LocalizeStream(one_frame()))
+        assert next(streams[-1]).outcome.HasField("answer")
+    assert engine.memory.held >= 4 * MIB
+    with pytest.raises(grpc.RpcError) as caught:
+        next(stub.LocalizeStream(one_frame()))
+    assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+    over.set()
+    for stream in streams:
+        assert list(stream) == []
+    assert becomes(lambda: engine.memory.held == 0)
+
+
+def test_a_stream_needs_room_in_the_budget() -> None:
+    budget = MemoryBudget(8 * MIB, messages=1)
+    memory = MessageMemory(budget, most_bytes=MIB, most_streams=2)
+    assert memory.streams == 2
+    with budget.hold() as others:
+        others.grow(8 * MIB)
+        with pytest.raises(BusyError), memory.stream():
+            pass
+    with memory.stream():
+        assert budget.held == MIB
+    assert budget.held == 0
