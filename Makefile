@@ -34,7 +34,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -47,6 +47,11 @@ demo-real: .venv/.mapping ## the same with real stereo frames: make demo-real DA
 
 test: .venv/.torch ## all tests
 	$(BIN)/python -m pytest $(ARGS)
+
+# Without torch and the simulator: what can be tested where the latter's ray caster has no wheel (Linux on ARM).
+test-service: .venv/.dev ## the tests of the service alone
+	$(BIN)/python -m pytest tests/unit/test_*.py \
+		$(addprefix tests/unit/,bridge client contract geometry grpc http imaging localization maps registration runtime) $(ARGS)
 
 check: .venv/.torch ## lint, types, layers, and the contracts as the code says them
 	$(BIN)/ruff check
@@ -136,7 +141,7 @@ sbom: .venv/.uv ## software bill of materials of the service's lock file -> out/
 	$(UV) tool run --from 'cyclonedx-bom==7.3.1' cyclonedx-py requirements locks/service.txt --output-reproducible -o out/sbom.json
 
 audit: .venv/.uv ## known vulnerabilities of the locked packages; what cannot be looked up fails too
-	$(UV) tool run --from 'pip-audit==2.10.1' pip-audit --strict --disable-pip --require-hashes --requirement locks/service.txt
+	$(UV) tool run --from 'pip-audit==2.10.1' pip-audit --strict --disable-pip --require-hashes --requirement locks/service.txt --requirement locks/build.txt
 
 reports: .venv/.torch ## all reports as one page with plots
 	$(BIN)/python -m benchmarks.render $(ARGS)

@@ -84,7 +84,10 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "paper": {"": (*_CORE, *_DATA, "model_training/baselines", "model_training/training")},
     "real_data": {"": (*_CORE, *_DATA, "model_training/importing", "model_training/odometry", "model_training/exporting"),
                   "ros2.": (*_CORE, "service/bridge")},
-    "serving": {"": ("service", "native"), "fuzz.": _ALL},
+    "serving": {"": ("service", "native"), "fuzz.": _ALL,
+                "native.": (*_CORE, "service/compiled.py", "service/layout.h", "native"),
+                "sanitizers.": ("service/imaging", "service/registration", "service/layout.h", "native",
+                                "tests/unit/imaging", "tests/unit/registration")},
     "training": {"": ("model_training/training", "model_training/simulation", "service/imaging", "service/geometry"),
                  "demo.": _ALL, "test.": (*_ALL, "tests")},
 }  # fmt: skip

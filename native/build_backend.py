@@ -29,16 +29,16 @@ Settings = dict[str, list[str] | str] | None
 COMPILERS = ("cc", "gcc", "clang")
 COMPILER_PACKAGE = "ziglang>=0.13,<0.18"
 #: The same as in ``service/platforms.py``, which cannot be imported before the package is built.
-SYSTEMS, MACHINES = ("linux", "darwin"), ("x86_64", "aarch64", "arm64")
+SUPPORTED = (("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64"))
 
 
 def require_supported() -> None:
     """Refuse to build where the service cannot run: a build that succeeds there would only fail later, and less clearly."""
     machine = platform.machine()
-    if sys.platform not in SYSTEMS or machine not in MACHINES:
+    if (sys.platform, machine) not in SUPPORTED:
         raise SystemExit(
-            f"Streetfix cannot be built for {sys.platform} ({machine}): it runs on Linux and macOS, on x86-64 and 64-bit ARM; "
-            "on Windows use WSL 2 or the container"
+            f"Streetfix cannot be built for {sys.platform} ({machine}): it runs on Linux (x86-64, 64-bit ARM) and on macOS "
+            "(Apple silicon); on Windows use WSL 2 or the container"
         )
 
 

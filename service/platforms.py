@@ -5,9 +5,8 @@ import sys
 
 from service.errors import UnsupportedPlatformError
 
-#: ``sys.platform`` and ``platform.machine()``; the packages that the service needs have wheels for the same.
-SYSTEMS = {"linux": "Linux", "darwin": "macOS"}
-MACHINES = ("x86_64", "aarch64", "arm64")
+#: ``sys.platform`` and ``platform.machine()`` for which the packages that the service needs have wheels.
+SUPPORTED = (("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64"))
 
 
 def require_supported() -> None:
@@ -17,8 +16,8 @@ def require_supported() -> None:
         UnsupportedPlatformError: it does not; the message says where it does.
     """
     machine = platform.machine()
-    if sys.platform not in SYSTEMS or machine not in MACHINES:
+    if (sys.platform, machine) not in SUPPORTED:
         raise UnsupportedPlatformError(
-            f"Streetfix does not run on {sys.platform} ({machine}): it runs on Linux and macOS, on x86-64 and 64-bit ARM; "
-            "on Windows use WSL 2 or the container"
+            f"Streetfix does not run on {sys.platform} ({machine}): it runs on Linux (x86-64, 64-bit ARM) and on macOS "
+            "(Apple silicon); on Windows use WSL 2 or the container"
         )

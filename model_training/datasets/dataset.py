@@ -19,6 +19,9 @@ from service.errors import DatasetError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_from
 from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
+from service.imaging.view_grid import ViewGrid
+from service.localization.decoding import DepthFormat, decoded_query
+from service.localization.query import Query
 
 FORMAT = 1
 Transforms = NDArray[np.float64]  # (n, 4, 4)
@@ -119,6 +122,23 @@ class QueryFrame:
                 data, encoding=None, scale_m=spec.scale_m, kind=spec.kind, camera=self.camera.pinhole(),
                 baseline_m=spec.baseline_m, max_range_m=spec.max_range_m, limits=ImageLimits(),
             )  # fmt: skip
+
+    def query(self, grid: ViewGrid) -> Query:
+        """The query that a service makes of these pictures for a map with this view grid, all options at their defaults."""
+        spec = self.camera.depth
+        how = DepthFormat(
+            kind=spec.kind, scale_m=spec.scale_m, baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
+        )
+        return decoded_query(
+            self.rgb_path.read_bytes(), self.depth_path.read_bytes(), self.camera.pinhole(), how, grid=grid
+        )
+
+    def request(self) -> dict[str, Any]:
+        """The parts of a request to the service that follow from the camera, as ``streetfix localize --camera`` takes them."""
+        return {
+            "camera": self.camera.model_dump(include={"width", "height", "fx", "fy", "cx", "cy"}),
+            "depth": self.camera.depth.model_dump(exclude_none=True),
+        }
 
 
 class Dataset:

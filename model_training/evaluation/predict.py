@@ -149,7 +149,9 @@ def _ask(
     localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool, prior_of: PriorOf | None
 ) -> tuple[Answer | None, float]:
     began = time.perf_counter()
-    queries, poses = as_query(frames, np.random.default_rng([77, number]), ranked=RANKED, refine=refine)
+    queries, poses = as_query(
+        frames, np.random.default_rng([77, number]), grid=localizer.bundle.grid, ranked=RANKED, refine=refine
+    )
     T_map_camera = frames[-1].T_map_camera
     if prior_of is not None and T_map_camera is not None:
         prior = prior_of(T_map_camera, np.random.default_rng([78, number]))

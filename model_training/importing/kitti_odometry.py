@@ -7,17 +7,19 @@ import numpy as np
 from model_training.datasets.files import read_bytes
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
+from model_training.importing.spinning import KITTI_VERTICAL_DEG
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 from service.geometry.rigid import inverse, transform_from
 
 
-def open_kitti_odometry(source: Path, *, depth: KittiDepth) -> KittiSequence:
-    """Open a sequence.
+def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float = KITTI_VERTICAL_DEG) -> KittiSequence:
+    """Open a sequence. Its scans are compensated for the vehicle's motion already, so points get no times.
 
     Args:
         source: its folder, ``.../sequences/NN``.
         depth: what a picture's depth comes from.
+        vertical_deg: how much every point is turned up.
 
     Raises:
         DatasetError: a scan, calibration or time is missing or broken.
@@ -34,7 +36,7 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth) -> KittiSequence:
     stamps = _times(source / "times.txt", numbers[-1])
     frames = tuple(KittiFrame(f"{n:06d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers)  # fmt: skip
     poses = _poses(source.parent.parent / "poses" / f"{source.name}.txt", stamps, T_lidar_cam0)
-    return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses)
+    return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses, vertical_deg=vertical_deg)
 
 
 def _calibration(path: Path) -> tuple[KittiCalibration, np.ndarray]:

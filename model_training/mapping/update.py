@@ -86,6 +86,9 @@ def update_map(
         cloud = voxels_of(bundle)
         fresh = VoxelMap(cloud.voxel_m, cloud.origin)
         places = drive.places(fresh, work, report=report)
+        if settings.traffic_vote:
+            gone = moved(fresh, dataset, poses, kept, settings, work, each_scan=True, report=report)
+            fresh.keep(~np.isin(fresh.sums()[0], gone))
         content = content_of(bundle)
         if replace_covered or area is not None:
             area = area or covered_by(fresh.means(), places.T_map_level[:, :3, 3])

@@ -55,6 +55,13 @@ _EXTRA_OF_PACKAGE = {
     "rerun": "view",
     "foxglove": "view",
 }
+#: Packages without a wheel for every supported platform, as the markers in ``pyproject.toml`` have it.
+_NOT_EVERYWHERE = {
+    "embreex": "for x86-64 and macOS",
+    "carla": "for Python before 3.13 on x86-64",
+    "cyclonedds": "for Python before 3.14 on x86-64 and macOS",
+    "kiss_icp": "for Python before 3.14",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -190,4 +197,6 @@ def _package(error: ModuleNotFoundError) -> str:
 def _extra_missing(command: str, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
     extra = _EXTRA_OF_PACKAGE.get(_package(error), extra)
     remedy = f'pip install "streetfix[{extra}]"' if extra else "install the packages it needs"
+    if _package(error) in _NOT_EVERYWHERE:
+        remedy = f"it is to be had {_NOT_EVERYWHERE[_package(error)]} alone ({remedy})"
     return ExtraMissingError(f"the command {command!r} needs the package {error.name!r}: {remedy}", field=command)

@@ -141,7 +141,11 @@ def serve(settings: "Settings") -> None:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
     keep_little(settings.threads or usable_cores())
     if settings.workers == 1:
-        with _listen(settings.host, settings.port) as listener, _listen_for_health(settings) as health:
+        with (
+            _hangup_held_back(),
+            _listen(settings.host, settings.port) as listener,
+            _listen_for_health(settings) as health,
+        ):
             _answer(settings, listener, health)
     else:
         _answer_by_workers(settings)
@@ -236,7 +240,7 @@ def _answer(
     tls = None if settings.tls_certificate is None else Certificates.read(settings)
     if settings.grpc_port is not None:
         import service.grpc.server  # noqa: F401  # so that it is among what stays
-    with _settled(), _hangup_held_back():
+    with _settled():
         engine = Engine.open(settings, table)
         try:
             config = uvicorn.Config(
@@ -309,7 +313,10 @@ def _grpc(
 
 @contextmanager
 def _hangup_held_back() -> Iterator[None]:
-    """SIGHUP waits inside until ``_reloading`` has a handler for it; without one it would end the process."""
+    """SIGHUP waits inside until ``_reloading`` has a handler for it; without one it would end the process.
+
+    The supervisor does the same for workers.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
         yield

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from service.errors import BundleError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
-from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
-from service.imaging.gather import finest_rad
+from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits
 from service.imaging.view_grid import ViewGrid
 from service.localization.answer import Answer
+from service.localization.decoding import DepthFormat, decoded_query
 from service.localization.frames import Frame
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
@@ -211,27 +211,16 @@ class Engine:
     def _decoded(self, encoded: EncodedQuery, grid: ViewGrid, reserve: Callable[[str, int], None]) -> Query:
         limits = self.settings.limits
         image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels, reserve=reserve)
-        rgb = decode_rgb(encoded.rgb, limits=image_limits, camera=encoded.camera, finest_rad=finest_rad(grid))
-        depth_m = decode_depth(
-            encoded.depth,
-            camera=encoded.camera,
-            encoding=encoded.depth_encoding,
-            scale_m=encoded.scale_m,
-            kind=encoded.depth_kind,
-            baseline_m=encoded.baseline_m,
+        depth_format = DepthFormat(
+            encoding=encoded.depth_encoding, kind=encoded.depth_kind, scale_m=encoded.scale_m, baseline_m=encoded.baseline_m,
             max_range_m=encoded.max_range_m,
-            limits=image_limits,
-        )
-        require_sizes(rgb, depth_m, encoded.camera)
-        return Query(
-            rgb=rgb,
-            depth_m=depth_m,
-            camera=encoded.camera,
+        )  # fmt: skip
+        return replace(
+            decoded_query(encoded.rgb, encoded.depth, encoded.camera, depth_format, grid=grid, limits=image_limits),
             down_camera=encoded.down_camera,
             T_vehicle_camera=encoded.T_vehicle_camera,
             neighbours=encoded.neighbours,
             refine=encoded.refine,
-            baseline_m=encoded.baseline_m,
             false_accept_rate=encoded.false_accept_rate or self.settings.false_accept_rate,
         )
 

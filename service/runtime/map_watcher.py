@@ -57,7 +57,7 @@ class MapWatcher:
         self._thread: threading.Thread | None = None
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
         self._failed: dict[Path, tuple[Stamp, StreetfixError]] = {}
-        self._is_drop_due = False
+        self._due: set[Key] = set()  # versions that are to be taken out
 
     def open_first(self, *, strict: bool = False, wait: Callable[[float], object] = time.sleep) -> None:
         """Mount what the folders hold when the service starts; what cannot be opened is in ``MapRegistry.refused``.
@@ -101,10 +101,11 @@ class MapWatcher:
         """
         if drop_missing:
             self._failed.clear()
-            self._is_drop_due = True
         bundles = self._bundles()
+        if drop_missing:
+            self._due = self._missing()
         told = self._mount_new(bundles)
-        if self._is_drop_due and (dropped := self._drop()):
+        if dropped := self._drop():
             told += dropped + self._mount_new(bundles)  # older versions may have found room
         self._tell_refused()
         return told
@@ -138,7 +139,7 @@ class MapWatcher:
                 self._told.clear()
             try:
                 before, seen = seen, table.read()
-                is_news = seen is not before and (self._is_drop_due or bool(table.others_offer()))
+                is_news = seen is not before and bool(self._due or table.others_offer())
                 if told or is_news or time.monotonic() >= next_look:
                     self.scan(drop_missing=told)
                     next_look = time.monotonic() + interval_s
@@ -221,32 +222,34 @@ class MapWatcher:
             del self._failed[gone]
         return found
 
-    def _drop(self) -> list[str]:
-        """Take out versions whose folder is gone, unless one is about to take over from them.
-
-        A version that was replaced in its folder stays: it can be rolled back to.
-        """
+    def _missing(self) -> set[Key]:
+        """Mounted versions whose folder is gone. One that was replaced in its folder is not: it can be rolled back to."""
         present = set(self._present())
         held = {manifest_key(manifest) for path, (_, manifest) in self._manifests.items() if path in present}
         unread = [path for path, (_, error) in self._failed.items() if _is_unreadable(error)]
-        gone: list[Key] = []
-        self._is_drop_due = False
-        for localizer in [v for each in self._registry for v in self._registry.versions(each.bundle.name)]:
-            bundle = localizer.bundle
-            name, version = manifest_key(bundle.manifest)
-            if bundle.path in present or (name, version) in held or any(map(bundle.path.is_relative_to, unread)):
-                continue
-            table, number = self._registry.table.read(), self._registry.table.number
-            serves = name in table.maps and table.maps[name].serving == version
-            if serves and any(each.name == name for each in table.offers.get(number, ())):
-                self._is_drop_due = True  # other workers are still opening what is to serve instead
-                continue
-            gone.append((name, version))
+        open_here = [v.bundle for each in self._registry for v in self._registry.versions(each.bundle.name)]
+        return {
+            manifest_key(bundle.manifest) for bundle in open_here
+            if not (bundle.path in present or manifest_key(bundle.manifest) in held or any(map(bundle.path.is_relative_to, unread)))
+        }  # fmt: skip
+
+    def _drop(self) -> list[str]:
+        """Take out what is due and still missing. What serves stays until other workers have what is to serve instead."""
+        if not self._due:
+            return []
+        self._due &= self._missing()
+        table, waits = self._registry.table.read(), set[Key]()
+        for name, known in table.maps.items():
+            left = [each.made_at for each in known.versions if each.key not in self._due]
+            offers = [each.made_at for each in table.offers.get(self._registry.table.number, ()) if each.name == name]
+            if offers and (not left or max(offers) > max(left)):
+                waits.add((name, known.serving))
+        gone, self._due = self._due - waits, self._due & waits
         # In one change: the next one to serve must not be one that is gone as well.
         self._registry.table.remove(gone)
-        for name, version in gone:
+        for name, version in sorted(gone):
             _log.warning("map_unmounted name=%s version=%s", name, version)
-        return [f"unmounted {name} {version}" for name, version in gone]
+        return [f"unmounted {name} {version}" for name, version in sorted(gone)]
 
     def _require(self, *, strict: bool) -> None:
         """Raise what keeps the service from its first start."""

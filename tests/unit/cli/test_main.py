@@ -1,4 +1,6 @@
+import re
 import sys
+import tomllib
 import types
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
@@ -212,3 +214,27 @@ def test_the_service_alone_lists_what_it_has(service_alone: None, capsys: pytest
     out = capsys.readouterr().out
     assert all(f"\n  {name} " in out for name in ("serve", "localize", "keys", "health", "bridge"))
     assert not any(f"\n  {name} " in out for name in ("simulate", "train", "map", "demo", "evaluate"))
+
+
+@pytest.mark.parametrize("package", sorted(command_line._NOT_EVERYWHERE))
+def test_a_package_that_is_not_to_be_had_everywhere_is_said_to_be_so(
+    mount: Callable[..., None], capsys: pytest.CaptureFixture[str], package: str
+) -> None:
+    def simulate() -> None:
+        raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+
+    mount(simulate=simulate)
+    assert run("simulate") == 1
+    told = capsys.readouterr().err
+    assert f"needs the package {package!r}: it is to be had for" in told
+    assert "pip install" in told
+
+
+def test_what_is_not_to_be_had_everywhere_is_what_has_a_marker() -> None:
+    extras = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    marked = {
+        re.split(r"[><=;]", each)[0].replace("-", "_") for extra in extras.values() for each in extra if ";" in each
+    }
+    assert marked == set(command_line._NOT_EVERYWHERE)

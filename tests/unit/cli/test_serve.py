@@ -1,4 +1,5 @@
 import gc
+import signal
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -82,3 +83,20 @@ def test_check_of_an_empty_maps_folder_says_that_the_service_would_wait(
     )
     with pytest.raises(BundleError, match="there is no map bundle in"):
         check_only(Settings(maps=(tmp_path,), strict=True))
+
+
+def test_a_hangup_during_the_start_waits_until_there_is_somebody_to_handle_it(
+    bundle_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By default it would end the process."""
+    blocked: list[bool] = []
+
+    def opening(*_: object, **__: object) -> None:
+        blocked.append(signal.SIGHUP in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+        raise RuntimeError("no further")
+
+    monkeypatch.setattr("service.runtime.engine.Engine.open", opening)
+    with pytest.raises(RuntimeError, match="no further"):
+        serve(Settings(maps=(bundle_path,), port=0))
+    assert blocked == [True]
+    assert signal.SIGHUP not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

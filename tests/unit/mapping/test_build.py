@@ -123,7 +123,11 @@ def test_progress_is_told_for_every_place(small_dataset, encoder_file, bundle, t
         small_dataset, encoder_file, tmp_path / "told", SETTINGS, threads=1, report=lambda *event: told.append(event)
     )
     count = bundle.manifest.counts.places
-    assert told == [*(("places", k, count) for k in range(1, count + 1)), *(("writing", k, 2) for k in range(3))]
+    assert told == [
+        *(("places", k, count) for k in range(1, count + 1)),
+        *(("traffic", k, count) for k in range(1, count + 1)), ("traffic", count, count),
+        *(("writing", k, 2) for k in range(3)),
+    ]  # fmt: skip
 
 
 def test_pictures_of_another_drive_are_answered(small_dataset, bundle):
@@ -284,3 +288,11 @@ def test_a_survey_with_poses_of_two_frames_is_refused_before_the_work(small_data
         )
     assert told == []
     assert not (tmp_path / "m").exists()
+
+
+def test_traffic_is_voted_about_unless_told_otherwise(small_dataset, encoder_file, bundle, tmp_path):
+    assert bundle.manifest.parameters["traffic_vote"] == 1.0
+    settings = replace(SETTINGS, traffic_vote=False)
+    made = build_map(small_dataset, encoder_file, tmp_path / "with traffic", settings, threads=1)
+    assert "traffic_vote" not in made.parameters
+    assert made.counts.cloud_points >= bundle.manifest.counts.cloud_points

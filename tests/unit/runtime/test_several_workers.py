@@ -170,6 +170,24 @@ def test_what_is_gone_serves_until_all_have_what_comes_instead(start: Start, wri
     assert [len(each.registry.versions("tiny")) for each in workers] == [1, 1]
 
 
+def test_what_waited_to_be_taken_out_does_not_take_out_something_else_later(
+    start: Start, write: Write, folder: Path
+) -> None:
+    workers = [start(number) for number in range(2)]
+    write(1)
+    shutil.rmtree(folder / "v0")
+    for worker in workers:
+        worker.watcher.scan(drop_missing=True)  # the first one waits for the second, which takes it out
+    write(2)
+    for worker in workers:
+        worker.watcher.scan()
+    workers[0].choose("v1")
+    shutil.rmtree(folder / "v1")
+    for worker in workers:
+        worker.watcher.scan()
+    assert [each.serving for each in workers] == ["v1", "v1"]
+
+
 def test_maps_that_are_let_go_of_are_let_go_of_in_all_workers(start: Start, write: Write) -> None:
     workers = [start(number) for number in range(2)]
     for seed in range(1, 5):
