@@ -616,12 +616,18 @@ class Chaos:
         """Start, and keep what it logs.
 
         Raises:
-            RuntimeError: it ended before it was ready.
+            RuntimeError: it ended before it was ready, or not all workers answer.
         """
         self._server = Server(
             self._shelf.folder, core=None, port=self._caller.port, grpc_port=self._caller.grpc_port,
             log=self._take_line, temporary=self._temporary, **self._settings(),
         )  # fmt: skip
+        # Until each worker has answered once the service starts: what goes wrong then ends it.
+        until = time.monotonic() + SETTLED_S
+        while len(_listeners(self._caller.port, self._pids())) < self._workers:
+            if time.monotonic() > until:
+                raise RuntimeError(f"not all workers listen {SETTLED_S:g} s after the first one")
+            time.sleep(0.02)
 
     def _take_line(self, line: str) -> None:
         self._log.append(line.rstrip())
