@@ -20,6 +20,7 @@ from model_training.evaluation.measures import recall_at
 from model_training.evaluation.predict import Predictions
 from model_training.evaluation.saved_run import save_run
 from model_training.evaluation.stages import stages_of
+from model_training.evaluation.why_refused import FEW, causes
 from model_training.reporting.run_page import write_run_page
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
@@ -115,6 +116,7 @@ def command(
         part.write_text(json.dumps(figures, indent=1) + "\n")
         part.rename(json_file)
     Console().print(_table(figures))
+    _say_why(opened, data, result.predictions)
     for name, answers in result.predictions.items():
         print_queries(name, answers, Console(), most=most)
     for name, found in traced.items():
@@ -145,6 +147,24 @@ def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[st
     recalls = {setting: float(flags[queries].mean()) for setting, flags in right.items()}
     best = max(recalls, key=lambda setting: recalls[setting])
     return {"raw_recall_at_1_5m": recalls[best], "raw": {"best_setting": best, "recall_at_1_5m": recalls}}
+
+
+def _say_why(bundle: MapBundle, data: Dataset, predictions: dict[str, Predictions]) -> None:
+    """Where nearly nothing was accepted, say what to check, the likeliest cause first."""
+    console = Console(soft_wrap=True, highlight=False)
+    for name, answers in predictions.items():
+        if bundle.calibration is None or answers.localized.mean() >= FEW:
+            continue
+        console.print(
+            f"{name}: {answers.localized.mean():.0%} of the answers are accepted. What to check, the likeliest first:"
+        )
+        found = causes(Localizer.open(bundle), list(data.queries(name)), answers)
+        for number, cause in enumerate(found, 1):
+            console.print(f"  {number}. {cause}")
+        if not found:
+            console.print(
+                "  all evidence lies in the range that calibration saw: these places are probably not in the map"
+            )
 
 
 def _table(figures: dict[str, Any]) -> Table:

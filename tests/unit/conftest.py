@@ -195,7 +195,9 @@ def small_map(small_dataset: Any, encoder_file: Path, tmp_path_factory: pytest.T
     from model_training.mapping.build import BuildSettings, build_map
 
     out: Path = tmp_path_factory.mktemp("maps") / "small"
-    settings = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False)
+    settings = BuildSettings(
+        name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False, traffic_vote=False
+    )
     build_map(small_dataset, encoder_file, out, settings, threads=1)
     return out
 
