@@ -47,7 +47,11 @@ class Cause:
 #: What out-of-range evidence speaks of, by the order of likelihood: intrinsics and depth unit are tried, the rest is read off.
 _OF_EVIDENCE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("intrinsics", ("similarity", "facings"), "compare fx, fy, cx, cy and the picture's size with the camera's own calibration"),
-    ("depth unit", ("far", "measured", "scale"), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
+    ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
+    (
+        "field of view or depth range", ("measured", "far"),
+        "the pictures measure another share of the view grid than those that confidence was fitted on; check the range of the depth",
+    ),
     ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m), and how noisy the depth is"),
     (
         "traffic in the map", ("through", "front", "inliers", "unmapped", "likelihood"),
