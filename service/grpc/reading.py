@@ -56,7 +56,7 @@ class ReadingInterceptor(_Interceptor):
         if ours or handler.stream_stream is None:
             return handler
         return grpc.stream_stream_rpc_method_handler(
-            self._stream_of_others(handler), handler.request_deserializer, handler.response_serializer
+            self._stream_of_others(handler), response_serializer=handler.response_serializer
         )
 
     def _answer(self, handler: Any, method: str) -> Callable[[Iterator[bytes], grpc.ServicerContext], Any]:
@@ -92,19 +92,22 @@ class ReadingInterceptor(_Interceptor):
 
         return answer
 
-    def _stream_of_others(self, handler: Any) -> Callable[[Iterator[Any], grpc.ServicerContext], Iterator[Any]]:
-        def in_turn(messages: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
+    def _stream_of_others(self, handler: Any) -> Callable[[Iterator[bytes], grpc.ServicerContext], Iterator[Any]]:
+        def in_turn(messages: Iterator[bytes], context: grpc.ServicerContext) -> Iterator[Any]:
             while True:
                 try:
                     with self._memory.turn_of_others(streams=True), self._patience.at_most(OTHERS_S, context.cancel):
-                        message = next(messages, None)
+                        raw = next(messages, None)
+                    if raw is None:
+                        return
+                    message = handler.request_deserializer(raw)
                 except StreetfixError as error:
                     refuse(context, error)
-                if message is None:
-                    return
+                except DecodeError:
+                    refuse(context, _no_message())
                 yield message
 
-        def answers(messages: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
+        def answers(messages: Iterator[bytes], context: grpc.ServicerContext) -> Iterator[Any]:
             yield from handler.stream_stream(in_turn(messages, context), context)
 
         return answers
