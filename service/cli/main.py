@@ -15,8 +15,6 @@ from service.cli import bridge, health, keys, localize, serve
 from service.errors import ExtraMissingError, StreetfixError
 
 GROUP = "streetfix.commands"
-#: The package of our other commands.
-_BESIDE_THE_SERVICE = "model_training"
 #: One line for ``--help``, which must not import what it lists, and the extra that brings a command's packages.
 _KNOWN = {
     "simulate": ("Make a city by seed and drive through it: survey and queries.", "mapping"),
@@ -152,7 +150,7 @@ def _not_called() -> None:
 
 def _is_installed(point: EntryPoint) -> bool:
     """Whether a command is there: the container image leaves out the package that builds maps and encoders."""
-    return point.module.partition(".")[0] != _BESIDE_THE_SERVICE or find_spec(_BESIDE_THE_SERVICE) is not None
+    return find_spec(point.module.partition(".")[0]) is not None
 
 
 def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any] | typer.Typer:

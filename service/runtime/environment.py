@@ -15,9 +15,16 @@ CONFIG = "STREETFIX_CONFIG"
 CLIENT_PREFIX = "STREETFIX_CLIENT_"
 #: What the clients read as their key. It is one letter away from the setting that asks for keys.
 CLIENT_KEY = "STREETFIX_API_KEY"
-#: Read by ``docker compose`` on the host, see deploy/compose.yaml.
+#: Read by ``docker compose`` on the host, see deploy/compose.yaml and deploy/compose.tls.yaml.
 COMPOSE = frozenset(
-    {"STREETFIX_MAPS_FOLDER", "STREETFIX_KEYS_FILE", "STREETFIX_SCRAPE_KEY_FILE", "STREETFIX_PUBLISH_ADDRESS"}
+    {
+        "STREETFIX_MAPS_FOLDER",
+        "STREETFIX_KEYS_FILE",
+        "STREETFIX_SCRAPE_KEY_FILE",
+        "STREETFIX_PUBLISH_ADDRESS",
+        "STREETFIX_CERTIFICATE_FILE",
+        "STREETFIX_CERTIFICATE_KEY_FILE",
+    }
 )
 
 #: What Kubernetes and Docker inject for a service whose name begins with ``streetfix``.

@@ -12,6 +12,7 @@ import yaml
 from service.contract.convert import parsed, query_from
 from service.contract.schema import LocalizeRequest
 from service.runtime.engine import Engine
+from service.runtime.environment import require_known
 from service.runtime.settings import Settings
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
@@ -35,6 +36,32 @@ def test_its_service_cannot_write_and_has_time_to_drain(compose: dict[str, Any])
     assert all(volume.endswith(":ro") for volume in service["volumes"])
     grace: float = Settings.model_fields["grace_s"].default
     assert float(service["stop_grace_period"].removesuffix("s")) > grace
+
+
+def test_its_ports_are_published_to_this_machine_alone_unless_the_operator_says_otherwise(
+    compose: dict[str, Any],
+) -> None:
+    for service in compose["services"].values():
+        for port in service.get("ports", []):
+            assert port.startswith(("127.0.0.1:", "${STREETFIX_PUBLISH_ADDRESS:-127.0.0.1}:")), port
+
+
+def test_with_tls_the_service_finds_what_is_mounted() -> None:
+    overlay = yaml.safe_load((DEPLOY / "compose.tls.yaml").read_text())
+    service = overlay["services"]["streetfix"]
+    names = {name.removeprefix("STREETFIX_").lower() for name in service["environment"]}
+    assert names == {"tls_certificate", "tls_key"}
+    mounted = {f"/run/secrets/{name}" for name in service["secrets"]}
+    assert set(service["environment"].values()) <= mounted
+    assert set(service["secrets"]) == set(overlay["secrets"]) | {"api_keys"}
+
+
+@pytest.mark.parametrize("name", ["compose.yaml", "compose.tls.yaml"])
+def test_variables_of_the_compose_files_do_not_keep_a_service_from_starting(name: str) -> None:
+    """Whoever exports them for Compose may start a service in the same shell."""
+    used = set(re.findall(r"\$\{(STREETFIX_\w+)", (DEPLOY / name).read_text()))
+    assert used
+    require_known(dict.fromkeys(used, "x"), Settings)
 
 
 def test_its_ports_are_those_of_the_image(compose: dict[str, Any]) -> None:

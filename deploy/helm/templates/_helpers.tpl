@@ -12,3 +12,21 @@ app.kubernetes.io/instance: {{ .Release.Name }}
 app.kubernetes.io/version: {{ .Chart.AppVersion | quote }}
 app.kubernetes.io/managed-by: {{ .Release.Service }}
 {{- end -}}
+
+{{- define "streetfix.serviceAccount" -}}
+{{- if .Values.serviceAccount.create -}}
+{{- .Values.serviceAccount.name | default (include "streetfix.name" .) -}}
+{{- else -}}
+{{- .Values.serviceAccount.name | default "default" -}}
+{{- end -}}
+{{- end -}}
+
+{{/* What the named secrets hold, where the cluster may be asked: `helm template` sees nothing of it. */}}
+{{- define "streetfix.secrets" -}}
+{{- $namespace := .Release.Namespace -}}
+{{- range list .Values.keys.secret .Values.tls.secret .Values.tls.clientCa -}}
+{{- if . -}}
+{{- with (lookup "v1" "Secret" $namespace .) -}}{{ .data | toJson }}{{- end -}}
+{{- end -}}
+{{- end -}}
+{{- end -}}
