@@ -3,6 +3,7 @@ import sys
 import tomllib
 import types
 from collections.abc import Callable
+from importlib.machinery import ModuleSpec
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated
@@ -27,6 +28,7 @@ def mount(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def put(**functions: Callable[..., None] | None) -> None:
         module = types.ModuleType("fake_commands")
+        module.__spec__ = ModuleSpec("fake_commands", None)
         for name, function in functions.items():
             if function is not None:
                 setattr(module, name, function)
@@ -149,10 +151,10 @@ def test_a_missing_package_names_the_extra(
 def test_a_package_missing_at_import_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    points = [EntryPoint("train", "a_package_that_is_not_there:command", "streetfix.commands")]
+    points = [EntryPoint("train", "service.a_module_that_is_not_there:command", "streetfix.commands")]
     monkeypatch.setattr(command_line, "entry_points", lambda **_: points)
     assert run("train", "anything", "--at", "all") == 1
-    assert "'a_package_that_is_not_there'" in capsys.readouterr().err
+    assert "a_module_that_is_not_there" in capsys.readouterr().err
 
 
 def test_an_error_of_ours_is_a_message_without_a_traceback(
