@@ -17,6 +17,9 @@ HEAD_BYTES = 16 * 1024
 _FRAMES_SHARE = 8
 #: Requests that a caller may send ahead on one connection before the first is answered.
 PIPELINED = 16
+#: Of a body that was answered before it was here, as refused ones are, so much is still read, for clients that read when they have
+#: sent all. Then nothing is read any more, and a moment later, in which others can read the answer, the connection is closed.
+UNWANTED_BYTES, LINGER_SECONDS = 2**20, 2.0
 #: A connection that has not sent a whole head by then is closed, be it new or kept.
 HEAD_SECONDS = 30.0
 
@@ -30,6 +33,7 @@ class BoundedHttp(HttpToolsProtocol):
         self._bodies_bytes = self._body_bytes = self._other_bytes = 0  # of all requests, and of this one
         self._head_timer: asyncio.TimerHandle | None = None
         self._unanswered: list[RequestResponseCycle] = []
+        self._unwanted_bytes = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn's own
         """A caller has come and must say something."""
@@ -60,7 +64,7 @@ class BoundedHttp(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         """A request begins."""
         super().on_message_begin()
-        self._in_head, self._body_bytes, self._other_bytes = True, 0, 0
+        self._in_head, self._body_bytes, self._other_bytes, self._unwanted_bytes = True, 0, 0, 0
 
     def on_headers_complete(self) -> None:
         """Its head is here."""
@@ -76,7 +80,15 @@ class BoundedHttp(HttpToolsProtocol):
         """A piece of its body."""
         self._bodies_bytes += len(body)
         self._body_bytes += len(body)
+        if self.cycle is not None and self.cycle.response_complete:
+            self._discard(len(body))
         super().on_body(body)
+
+    def _discard(self, count: int) -> None:
+        before, self._unwanted_bytes = self._unwanted_bytes, self._unwanted_bytes + count
+        if before <= UNWANTED_BYTES < self._unwanted_bytes:
+            self.flow.pause_reading()
+            asyncio.get_running_loop().call_later(LINGER_SECONDS, self.transport.close)
 
     def _refuse(self) -> None:
         _log.info("head_too_large")

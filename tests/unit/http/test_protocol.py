@@ -17,7 +17,7 @@ Connect = Callable[[], socket.socket]
 
 
 async def length_of_body(scope: Any, receive: Any, send: Any) -> None:
-    length, more = 0, True
+    length, more = 0, scope["path"] != "/refused"
     while more:
         message = await receive()
         length, more = length + len(message.get("body", b"")), message.get("more_body", False)
@@ -30,6 +30,7 @@ async def length_of_body(scope: Any, receive: Any, send: Any) -> None:
 @pytest.fixture
 def connect(monkeypatch: pytest.MonkeyPatch) -> Iterator[Connect]:
     monkeypatch.setattr(protocol, "HEAD_SECONDS", 0.5)
+    monkeypatch.setattr(protocol, "LINGER_SECONDS", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         server = uvicorn.Server(uvicorn.Config(length_of_body, http=BoundedHttp, lifespan="off", log_config=None))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
@@ -163,3 +164,29 @@ def test_a_slow_answer_is_not_cut_off_by_the_heads_timer(connect: Connect) -> No
         assert first(connection) == b"200 0"
         connection.sendall(b"TP/1.1\r\nHost: x\r\n\r\n")
         assert first(connection) == b"200 0"
+
+
+def test_the_rest_of_a_small_body_that_was_answered_early_is_read_and_the_connection_goes_on(connect: Connect) -> None:
+    connection, size = connect(), 2**19
+    connection.sendall(b"POST /refused HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % size)
+    assert first(connection) == b"200 0"
+    connection.sendall(bytes(size))
+    connection.sendall(b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc")
+    assert first(connection) == b"200 3"
+
+
+def test_a_large_body_that_was_answered_early_is_not_read_and_its_sender_still_gets_the_answer(
+    connect: Connect,
+) -> None:
+    connection, size = connect(), 2**28
+    connection.settimeout(30)
+    connection.sendall(b"POST /refused HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % size)
+    sent = 0
+    try:
+        for _ in range(2**8):
+            connection.sendall(bytes(2**20))
+            sent += 2**20
+    except OSError:
+        pass
+    assert sent < size / 4
+    assert b"HTTP/1.1 200 OK" in told(connection)

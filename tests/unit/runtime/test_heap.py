@@ -1,0 +1,42 @@
+"""Freed memory goes back to the system, in a process of its own since the C library's settings are the process'."""
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+_PROGRAM = """
+import re, sys, threading
+from pathlib import Path
+from service.runtime.heap import Trimmer, keep_little
+
+if sys.argv[1] == "kept little":
+    keep_little(1)
+
+def anonymous_mib():
+    return int(re.search(r"^RssAnon:\\s+(\\d+)", Path("/proc/self/status").read_text(), re.MULTILINE)[1]) / 1024
+
+def fill():
+    block = bytes(range(256)) * (30 * 4096)
+    barrier.wait()
+    del block
+
+bytes(bytearray(b"1") * (30 * 2**20))  # glibc learns from the first such block that is freed
+before = anonymous_mib()
+barrier = threading.Barrier(4)
+threads = [threading.Thread(target=fill) for _ in range(4)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(anonymous_mib() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
+def test_blocks_of_threads_that_have_ended_are_the_systems_again() -> None:
+    left = {}
+    for how in ("as it comes", "kept little"):
+        done = subprocess.run([sys.executable, "-c", _PROGRAM, how], capture_output=True, text=True, check=True)
+        left[how] = float(done.stdout)
+    assert left["kept little"] < 20
+    assert left["as it comes"] > 80  # else the setting is no longer needed

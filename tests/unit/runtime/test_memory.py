@@ -1,0 +1,187 @@
+"""The budget of memory: what it is, and how it is held and given back."""
+
+import gc
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.errors import BusyError, RequestError, TooLargeError
+from service.imaging.picture_headers import ImageLimits, require_pixels
+from service.runtime import memory
+from service.runtime.admission import Admission
+from service.runtime.memory import MIB, MemoryBudget, budget_of, memory_limit
+from service.runtime.settings import Settings
+
+GIB = 2**30
+UNLIMITED = "9223372036854771712\n"
+
+
+def groups(tmp_path: Path, own: str, files: dict[str, str]) -> tuple[Path, Path]:
+    for name, text in files.items():
+        path = tmp_path / "cgroup" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (tmp_path / "own").write_text(own)
+    return tmp_path / "cgroup", tmp_path / "own"
+
+
+@pytest.mark.parametrize(
+    ("own", "files", "expected"),
+    [
+        ("0::/\n", {"memory.max": "2097152\n"}, 2 * MIB),
+        ("0::/\n", {"memory.max": "max\n"}, None),
+        ("0::/a/b\n", {"a/b/memory.max": "max\n", "a/memory.max": "3145728\n", "memory.max": "max\n"}, 3 * MIB),
+        ("0::/a/b\n", {"a/b/memory.max": "1048576\n", "a/memory.max": "3145728\n"}, MIB),
+        ("0::/../../pod\n", {"memory.max": "2097152\n"}, 2 * MIB),
+        ("4:memory:/docker/x\n0::/\n", {"memory/memory.limit_in_bytes": "2097152\n"}, 2 * MIB),
+        ("4:cpu,memory:/x\n", {"memory/x/memory.limit_in_bytes": "1048576\n", "memory/memory.limit_in_bytes": UNLIMITED}, MIB),
+        ("4:memory:/x\n", {"memory/memory.limit_in_bytes": UNLIMITED}, None),
+        ("0::/x\n", {"unified/x/memory.max": "1048576\n"}, MIB),
+        ("nonsense", {"memory.max": "nonsense"}, None),
+        ("", {}, None),
+    ],
+)  # fmt: skip
+def test_the_least_limit_of_all_control_groups_counts(
+    tmp_path: Path, own: str, files: dict[str, str], expected: int | None
+) -> None:
+    found = memory_limit(*groups(tmp_path, own, files))
+    machine = memory_limit(tmp_path / "none", tmp_path / "none")
+    assert found == (machine if expected is None else expected)
+    assert machine > 64 * MIB
+
+
+@pytest.fixture
+def limited(monkeypatch: pytest.MonkeyPatch) -> Any:
+    def to(limit: int, anonymous: int = 0) -> None:
+        monkeypatch.setattr(memory, "memory_limit", lambda: limit)
+        monkeypatch.setattr(memory, "anonymous_bytes", lambda: anonymous)
+
+    return to
+
+
+def test_what_the_process_and_its_maps_need_is_taken_off(limited: Any) -> None:
+    limited(2 * GIB)
+    settings = Settings()
+    plain = budget_of(settings, threads=2, maps_bytes=0).limit
+    assert GIB < plain < 2 * GIB
+    assert budget_of(settings, threads=2, maps_bytes=100 * MIB).limit == plain - 100 * MIB
+    assert budget_of(settings, threads=2, maps_bytes=20 * GIB).limit == plain - GIB // 2  # the rest is read again
+    assert budget_of(settings, threads=6, maps_bytes=0).limit == plain - 4 * memory.THREAD_BYTES
+    limited(2 * GIB, anonymous=300 * MIB)
+    assert budget_of(settings, threads=2, maps_bytes=0).limit == plain - (300 * MIB - memory.PROCESS_BYTES)
+
+
+def test_workers_share_it(limited: Any) -> None:
+    limited(8 * GIB)
+    one = budget_of(Settings(workers=1), threads=2, maps_bytes=GIB)
+    four = budget_of(Settings(workers=4), threads=2, maps_bytes=GIB)
+    fixed = memory.PROCESS_BYTES + 2 * memory.THREAD_BYTES
+    assert 4 * (four.limit + fixed) == pytest.approx(one.limit + fixed, abs=4)
+    assert budget_of(Settings(workers=4, request_memory_mib=800), threads=2, maps_bytes=0).limit == 200 * MIB
+
+
+def test_messages_that_grpc_reads_are_taken_off(limited: Any) -> None:
+    limited(2 * GIB)
+    without, with_ = (budget_of(Settings(grpc_port=port), threads=2, maps_bytes=0) for port in (None, 50051))
+    assert without.messages == 0
+    assert with_.messages >= 4
+    assert with_.limit + with_.messages * 40 * MIB < without.limit
+
+
+@pytest.mark.parametrize("settings", [{}, {"request_memory_mib": 100}, {"workers": 8, "request_memory_mib": 800}])
+def test_too_little_is_told_with_the_remedy(limited: Any, settings: dict[str, Any]) -> None:
+    limited(300 * MIB)
+    with pytest.raises(RequestError, match=r"request_memory_mib|memory limit") as refused:
+        budget_of(Settings(**settings), threads=2, maps_bytes=0)
+    assert refused.value.field == "request_memory_mib"
+    assert "max_request_bytes" in refused.value.message
+
+
+def test_what_does_not_fit_beside_others_is_busy_and_what_never_fits_is_too_large() -> None:
+    budget = MemoryBudget(10)
+    with budget.hold() as one, budget.hold() as other:
+        one.grow(6)
+        with pytest.raises(BusyError):
+            other.grow(5)
+        other.grow(4)
+        with pytest.raises(TooLargeError):
+            one.grow(5)
+        assert (one.bytes, other.bytes, budget.held) == (6, 4, 10)
+        one.shrink_to(1)
+        other.grow(5)
+    assert budget.held == 0
+
+
+def test_work_that_goes_on_after_its_caller_keeps_its_memory() -> None:
+    budget, first, second = MemoryBudget(10), Future[None](), Future[None]()
+    with budget.hold() as hold:
+        hold.grow(6)
+        hold.until(first)
+        hold.until(second)
+    assert budget.held == 6
+    second.cancel()
+    assert budget.held == 6
+    first.set_result(None)
+    assert budget.held == 0
+
+
+def test_what_is_left_to_a_picture_goes_with_it() -> None:
+    budget, picture = MemoryBudget(10), np.zeros(3)
+    with budget.hold() as hold:
+        hold.grow(6)
+        hold.leave_with(picture)
+    assert budget.held == 6
+    view = picture
+    del picture
+    assert budget.held == 6
+    del view
+    assert budget.held == 0
+
+
+def test_watchers_are_told_of_every_change() -> None:
+    budget, told = MemoryBudget(10), list[float]()
+    budget.watch(told.append)
+    with budget.hold() as hold:
+        hold.grow(6)
+        hold.shrink_to(2)
+    assert told == [0, 6, 2, 0]
+
+
+def test_a_picture_is_reserved_when_its_header_is_read() -> None:
+    told = list[tuple[str, int]]()
+    limits = ImageLimits(max_pixels=100, reserve=lambda field, pixels: told.append((field, pixels)))
+    require_pixels(10, 10, limits, field="rgb")
+    with pytest.raises(TooLargeError):
+        require_pixels(10, 11, limits, field="depth")
+    assert told == [("rgb", 100)]
+
+
+def test_an_error_keeps_nothing_of_the_work_that_raised_it() -> None:
+    class Picture:
+        pass
+
+    gone = list[bool]()
+
+    def work() -> None:
+        import weakref
+
+        picture = Picture()
+        weakref.finalize(picture, gone.append, True)
+        try:
+            raise ValueError("inner")
+        except ValueError as error:
+            raise RequestError("outer") from error
+
+    admission = Admission(threads=1, queue=1)
+    gc.disable()
+    try:
+        future = admission.submit(work)
+        with pytest.raises(RequestError):
+            future.result()
+        assert gone == [True]
+    finally:
+        gc.enable()
+        admission.close()
