@@ -34,7 +34,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -135,6 +135,9 @@ bench-serving: .venv/.torch ## measure the service under load -> reports/serving
 fuzz: .venv/.torch ## a million inputs over all that takes bytes from outside -> reports/serving.json
 	$(INSTALL) 'atheris>=3,<4'
 	$(BIN)/python -m benchmarks.fuzz $(ARGS)
+
+chaos: .venv/.torch ## 1,000 random steps of operators, disks, clients and deaths against a running service -> reports/serving.json
+	$(BIN)/python -m benchmarks.chaos $(ARGS)
 
 sbom: .venv/.uv ## software bill of materials of the service's lock file -> out/sbom.json (CycloneDX)
 	mkdir -p out

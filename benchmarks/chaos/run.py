@@ -16,7 +16,7 @@ from random import Random
 import grpc
 import numpy as np
 
-from benchmarks.chaos.asking import FACES, Asking, Caller, Face, Outcome, Pair, What
+from benchmarks.chaos.asking import FACES, TIMEOUT_S, Asking, Caller, Face, Outcome, Pair, What
 from benchmarks.chaos.disk import Disk
 from benchmarks.chaos.oracle import Expected, Oracle, Version
 from benchmarks.chaos.shelf import Shelf
@@ -28,7 +28,7 @@ from service.grpc.generated.streetfix.v1.localization_pb2_grpc import Localizati
 from service.runtime.keys import hash_of, new_key
 
 #: Until all workers must agree, and until a service must have ended.
-SETTLED_S, ENDED_S = 30.0, 40.0
+SETTLED_S, ENDED_S = 60.0, 60.0
 #: Until every worker has looked at the folder after SIGHUP.
 _LOOKED_S = 3.0
 _SAME_M = 0.01
@@ -112,7 +112,7 @@ class Chaos:
         self._keys_are_broken = False
         self._sockets: list[socket.socket] = []
         self._number = self._full_since = 0
-        self._started_again_s = self._sighup_s = 0.0
+        self._killed_s = self._sighup_s = 0.0
         self._valid = [new_key()]
         self._caller = Caller(_free_port(), _free_port(), pair, self._valid[0])
         self._reference: dict[tuple[Face, What], tuple[float, float, float]] = {}
@@ -167,7 +167,7 @@ class Chaos:
             heard()
             return
         step.expected = self._oracle.unsure(step.expected)
-        if time.monotonic() > self._started_again_s:
+        if time.monotonic() > self._killed_s + SETTLED_S:
             self._oracle.is_unsure = False
         self._done[-1] += f"; {' or '.join(sorted(step.expected.finals))} serves"
         if self._server is not None and self._server.process.poll() is not None:
@@ -255,27 +255,29 @@ class Chaos:
         return self._maybe_sighup(name)
 
     def _stash(self) -> Step:
-        self._let_sighup_pass()
         name = self._random.choice(sorted(self._oracle.on_disk))
-        self._shelf.stash(name, self._oracle.on_disk[name])
-        return self._removed(name)
+        return self._removed(name, lambda: self._shelf.stash(name, self._oracle.on_disk[name]))
 
     def _delete(self) -> Step:
-        self._let_sighup_pass()
         name = self._random.choice(sorted(self._oracle.on_disk))
-        self._shelf.delete(name)
-        return self._removed(name)
+        return self._removed(name, lambda: self._shelf.delete(name))
 
-    def _let_sighup_pass(self) -> None:
-        """An earlier SIGHUP must not find that a folder has gone, which only the next one is to find."""
-        time.sleep(max(0.0, self._sighup_s + _LOOKED_S - time.monotonic()))
-
-    def _removed(self, name: str) -> Step:
+    def _removed(self, name: str, remove: Callable[[], None]) -> Step:
+        """A bundle goes away; SIGHUP says so to the service, or nothing does."""
+        told = self._random.random() < 0.5 or not self._is_whole()
+        if not told:  # no worker may find out because of an earlier SIGHUP
+            time.sleep(max(0.0, self._sighup_s + _LOOKED_S - time.monotonic()))
+        remove()
         self._oracle.removed(name)
-        if self._random.random() < 0.5:
-            self._note(name)
-            return self._sighup()
-        return self._same(name)
+        self._note(name)
+        return self._sighup() if told else self._same()
+
+    def _is_whole(self) -> bool:
+        """Whether all workers have answered for some time: one that starts handles an earlier SIGHUP when it is ready."""
+        whole = len(_listeners(self._caller.port, self._pids())) == self._workers
+        if whole and self._killed_s > self._sighup_s - 2 * SETTLED_S:
+            time.sleep(_LOOKED_S)
+        return whole
 
     def _maybe_sighup(self, told: str) -> Step:
         self._note(told)
@@ -346,7 +348,7 @@ class Chaos:
             time.sleep(0.005)
         cut = [(killed, time.monotonic())]
         self._note(f"{len(victims)} of {len(there)}")
-        self._started_again_s = time.monotonic() + SETTLED_S
+        self._killed_s = time.monotonic()
         return Step(self._oracle.worker_started_again(), cut=cut)
 
     def _restart(self) -> Step:
@@ -456,7 +458,7 @@ class Chaos:
         with grpc.insecure_channel(f"127.0.0.1:{self._caller.grpc_port}") as channel:
             stub = LocalizationServiceStub(channel)  # type: ignore[no-untyped-call]  # generated code
             try:
-                found = list(stub.LocalizeStream(iter(frames), timeout=20, metadata=metadata))
+                found = list(stub.LocalizeStream(iter(frames), timeout=TIMEOUT_S, metadata=metadata))
             except grpc.RpcError as error:
                 raise _ServiceError(f"a stream of three frames ended with {error}") from error
         step = self._same()
@@ -602,7 +604,7 @@ class Chaos:
 
     def _settings(self) -> dict[str, object]:
         return {
-            "workers": self._workers, "threads": 1, "watch_s": 0.5, "drain_s": 0.5, "grace_s": 10, "request_timeout_s": 5,
+            "workers": self._workers, "threads": 1, "watch_s": 0.5, "drain_s": 0.5, "grace_s": 10, "request_timeout_s": 20,
             "api_keys": self._keys_file,
         }  # fmt: skip
 
