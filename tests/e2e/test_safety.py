@@ -181,6 +181,7 @@ def test_check_says_what_would_be_served_and_leaves(bundle_path: Path, tmp_path:
     assert '"threads": 3' in done.stdout
     assert re.search(r"map tiny \w+: opens and answers\nkeys of 1 callers\n$", done.stdout)
     (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "manifest.json").write_text("{")
     refused_ = subprocess.run(
         [*COMMAND, "serve", str(tmp_path / "broken"), "--check"],
         capture_output=True,
