@@ -13,7 +13,7 @@ PAPER_STEPS ?= 400
 DATA ?= ../shared/data/kitti_stereo
 
 # Compiled when the package is installed.
-KERNEL := hatch_build.py $(wildcard service/*/*.c service/*/*.h)
+KERNEL := native/CMakeLists.txt native/build_backend.py $(wildcard service/*.h service/*/*.c service/*/*.h)
 
 # The console's page, and the browser's driver in its tests.
 WEB := service/console/web
@@ -23,8 +23,10 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 UV := $(BIN)/uv
 INSTALL = $(UV) pip install --quiet --python $(BIN)/python
-COMPILE = $(UV) pip compile pyproject.toml --quiet --universal --fork-strategy fewest --python-version 3.11 \
-	--generate-hashes --no-annotate --no-header
+LOCK = --quiet --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --no-annotate --no-header
+COMPILE = $(UV) pip compile pyproject.toml $(LOCK)
+# what builds the image's wheel: not of this package, so without it
+COMPILE_BUILD = $(UV) pip compile --group build $(LOCK)
 
 # ONNX Runtime reports its use to its maker unless told not to.
 export ORT_DISABLE_TELEMETRY := 1
@@ -32,7 +34,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test check console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -46,6 +48,11 @@ demo-real: .venv/.mapping ## the same with real stereo frames: make demo-real DA
 test: .venv/.torch ## all tests
 	$(BIN)/python -m pytest $(ARGS)
 
+# Without torch and the simulator: what can be tested where the latter's ray caster has no wheel (Linux on ARM).
+test-service: .venv/.dev ## the tests of the service alone
+	$(BIN)/python -m pytest tests/unit/test_*.py \
+		$(addprefix tests/unit/,bridge client contract geometry grpc http imaging localization maps registration runtime) $(ARGS)
+
 check: .venv/.torch ## lint, types, layers, and the contracts as the code says them
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -53,9 +60,19 @@ check: .venv/.torch ## lint, types, layers, and the contracts as the code says t
 	$(BIN)/lint-imports
 	$(BIN)/python -m service.http.openapi --check
 	$(BIN)/python -m service.console.built --check
+	$(MAKE) --no-print-directory check-native
 	$(MAKE) --no-print-directory check-console
 	cd proto && ../$(BIN)/buf lint
 	cd proto && ../$(BIN)/buf breaking --against released.binpb
+
+# A user's build stops at no warning; ours does.
+check-native: .venv/.torch ## compile the C code with every warning an error
+	$(BIN)/cmake -S native -B build/check -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja -DCMAKE_BUILD_TYPE=Release \
+		-DCMAKE_COMPILE_WARNING_AS_ERROR=ON > /dev/null
+	$(BIN)/cmake --build build/check --clean-first > /dev/null
+
+sanitize: .venv/.torch ## run the C code's tests and random inputs under AddressSanitizer and UndefinedBehaviorSanitizer
+	$(BIN)/python -m benchmarks.native.sanitizers
 
 # The page's sources change with Node alone; who has none takes the build that lies in the repository, whose hashes `check` compares.
 check-console: ## lint and types of the console's page, where there is Node
@@ -95,6 +112,7 @@ lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
 	$(COMPILE) --extra dev --group oracle $(ARGS) --output-file locks/dev.txt
 	$(COMPILE) --extra mapping --constraint locks/dev.txt --output-file locks/mapping.txt
 	$(COMPILE) --constraint locks/dev.txt --output-file locks/service.txt
+	$(COMPILE_BUILD) --constraint locks/dev.txt $(ARGS) --output-file locks/build.txt
 
 evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json
 	$(BIN)/python -m benchmarks.accuracy $(ARGS)
@@ -118,12 +136,15 @@ fuzz: .venv/.torch ## a million inputs over all that takes bytes from outside ->
 	$(INSTALL) 'atheris>=3,<4'
 	$(BIN)/python -m benchmarks.fuzz $(ARGS)
 
+chaos: .venv/.torch ## 1,000 random steps of operators, disks, clients and deaths against a running service -> reports/serving.json
+	$(BIN)/python -m benchmarks.chaos $(ARGS)
+
 sbom: .venv/.uv ## software bill of materials of the service's lock file -> out/sbom.json (CycloneDX)
 	mkdir -p out
 	$(UV) tool run --from 'cyclonedx-bom==7.3.1' cyclonedx-py requirements locks/service.txt --output-reproducible -o out/sbom.json
 
 audit: .venv/.uv ## known vulnerabilities of the locked packages; what cannot be looked up fails too
-	$(UV) tool run --from 'pip-audit==2.10.1' pip-audit --strict --disable-pip --require-hashes --requirement locks/service.txt
+	$(UV) tool run --from 'pip-audit==2.10.1' pip-audit --strict --disable-pip --require-hashes --requirement locks/service.txt --requirement locks/build.txt
 
 reports: .venv/.torch ## all reports as one page with plots
 	$(BIN)/python -m benchmarks.render $(ARGS)
@@ -156,6 +177,7 @@ install-test: .venv/.torch ## what tests and checks need
 
 clean: ## remove what demos and tools left; .venv, data and runs stay
 	rm -rf out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	cd native && rm -rf .cmake CMakeCache.txt CMakeFiles CMakeInit.txt build.ninja cmake_install.cmake .ninja_deps .ninja_log .skbuild-info.json
 	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
 
 # What is installed. A newer lock file or pyproject.toml installs again; nothing is ever removed.

@@ -129,10 +129,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="real recordings")
     parser.add_argument("--note", help="what a reader of the report must know about this run")
     parser.add_argument(
-        "--only", help="these parts alone, by commas; the rows of the others stay, each with its commit"
+        "--only", help="these parts alone, by commas; the rows of the others stay, each with the run that made it"
     )
     arguments = parser.parse_args()
-    report, runs = Report("accuracy", "make evaluate"), Runs(arguments.work, arguments.encoder)
+    told = "" if arguments.only is None else f' ARGS="--only {arguments.only}"'
+    report, runs = Report("accuracy", f"make evaluate{told}"), Runs(arguments.work, arguments.encoder)
     parts: dict[str, Callable[[], None]] = {
         "kitti": lambda: kitti_rows(report, runs, arguments.data),
         "kitti_registration": lambda: kitti_registration_rows(report, runs, arguments.data),

@@ -1,62 +1,98 @@
-"""``make reports``: every ``reports/*.json`` as one Markdown page with a plot each."""
+"""``make reports``: every ``reports/*.json`` as one Markdown page with a plot each, and the figures that documents take from them."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 
-from benchmarks.report import REPORTS
-from benchmarks.why_missed import WHY_MISSED
+from benchmarks.figures import write_figures
+from benchmarks.report import REPORTS, ROOT, write_report
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+#: How the page begins.
+HEAD = """# Reports
+
+`make reports` writes this page from the JSON files beside it. The figures in the tables come from runs; the column *run* names the run
+that measured the row. The reasons below a table are written by people (`benchmarks/why_missed.py`), each for the one value that it names;
+when that value has changed, the page says so instead of the reason. **Stale** means that code that the row measures has changed since the
+row's commit; any change of these files counts, a comment too. *Age unknown* means that Git could not tell.
+"""
+
 
 def main() -> None:
-    """Write ``reports/README.md`` and ``reports/NAME.png``."""
-    lines = [
-        "# Reports",
-        "",
-        "Made by `make reports` from the JSON files beside this page; none of it is typed by hand.",
-        "",
-    ]
+    """Bring figures in documents up to date; write ``reports/README.md`` and ``reports/NAME.png``."""
+    lines = [HEAD]
     for path in sorted(REPORTS.glob("*.json")):
-        report = json.loads(path.read_text())
-        if explain(report["rows"]):
-            path.write_text(json.dumps(report, indent=1) + "\n")
-        made = report["made"]
-        lines += [
-            f"## {path.stem}", "",
-            f"`{made['command']}` on {made['date'][:10]} at commit `{made['commit'][:10]}`,",
-            f"{made['minutes']:g} minutes, {made['machine']}.", "",
-            *_other_commits(report["rows"]),
-            *(f"{text}\n" for text in report.get("notes", {}).values() if isinstance(text, str)),
-            "| row | value | 95 % interval | n | bar | |", "|---|---|---|---|---|---|",
-        ]  # fmt: skip
-        lines += [_line(row) for row in report["rows"]]
-        lines += _conditions({row["id"]: row["value"] for row in report["rows"]})
-        whys = [f"- `{row['id']}`: {row['why']}" for row in report["rows"] if row.get("why")]
-        lines += ["", *whys, ""] if whys else [""]
-        picture = _plot(path.stem, report["rows"])
-        if picture is not None:
-            lines += [f"![{path.stem}]({picture.name})", ""]
-        if "reliability" in report.get("notes", {}):
-            lines += [f"![reliability]({_reliability(path.stem, report['notes']['reliability']).name})", ""]
-        if "accepts" in report.get("notes", {}):
-            picture = _accepts(path.stem, report["notes"]["accepts"])
-            lines += [f"![false accepts against true accepts, for each kind of stranger]({picture.name})", ""]
+        write_report(path, json.loads(path.read_text()))
+        lines += _section(path.stem, json.loads(path.read_text()))
     (REPORTS / "README.md").write_text("\n".join(lines))
+    for page in write_figures():
+        print(f"figures written anew: {page.relative_to(ROOT)}")
 
 
-def explain(rows: list[dict[str, Any]]) -> bool:
-    """Give missed rows what is known now of why they miss; values stay. Whether anything changed."""
-    changed = False
-    for row in rows:
-        why = WHY_MISSED.get(row["id"])
-        if why is not None and not row.get("holds", True) and row.get("why") != why:
-            row["why"], changed = why, True
-    return changed
+def _section(name: str, report: dict[str, Any]) -> list[str]:
+    """One report: its runs, its rows, reasons and pictures."""
+    rows, notes = report["rows"], report.get("notes", {})
+    numbers = {key: number for number, key in enumerate(report["runs"], 1)}
+    stale, unknown = (sum(row.get("stale") is state for row in rows) for state in (True, "unknown"))
+    lines = [
+        f"## {name}",
+        "",
+        "| run | rows | command | date | commit | machine | minutes |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        _run_line(number, report["runs"][key], [row for row in rows if row["run"] == key])
+        for key, number in numbers.items()
+    ]
+    lines += [""]
+    if stale or unknown:
+        as_of = f"commit `{report['stale_as_of'][:10]}`" if report["stale_as_of"] else "no commit: there is no Git"
+        lines += [f"Of {len(rows)} rows {stale} are stale and {unknown} of unknown age, as of {as_of}.", ""]
+    lines += [f"{text}\n" for text in notes.values() if isinstance(text, str)]
+    lines += ["| row | value | 95 % interval | n | bar | | run | |", "|---|---|---|---|---|---|---|---|"]
+    lines += [_line(row, numbers[row["run"]]) for row in rows]
+    lines += _conditions({row["id"]: row["value"] for row in rows})
+    remarks = [f"- `{row['id']}`: {text}" for row in rows for text in _remarks(row)]
+    lines += ["", *remarks, ""] if remarks else [""]
+    picture = _plot(name, rows)
+    if picture is not None:
+        lines += [f"![{name}]({picture.name})", ""]
+    if "reliability" in notes:
+        lines += [f"![reliability]({_reliability(name, notes['reliability']).name})", ""]
+    if "accepts" in notes:
+        picture = _accepts(name, notes["accepts"])
+        lines += [f"![false accepts against true accepts, for each kind of stranger]({picture.name})", ""]
+    return lines
+
+
+def _run_line(number: int, run: dict[str, Any], rows: list[dict[str, Any]]) -> str:
+    groups = ", ".join(
+        f"{group} {count}" for group, count in sorted(Counter(row["id"].split(".")[0] for row in rows).items())
+    )
+    date = run["date"][:10] if run["date"] else f"before {run['before'][:10]}" if "before" in run else "not kept"
+    dirty = {True: ", with changes that were not committed", False: "", None: ", not kept whether with other changes"}[
+        run["dirty"]
+    ]
+    command = "not kept" if run["command"] is None else f"`{run['command']}`"
+    minutes = "" if run["minutes"] is None else f"{run['minutes']:g}"
+    return f"| {number} | {groups} | {command} | {date} | `{run['commit'][:10]}`{dirty} | {run['machine'] or 'not kept'} | {minutes} |"
+
+
+def _remarks(row: dict[str, Any]) -> list[str]:
+    """What the run says of a row, and why it misses its bar; that only of the value that it was written for."""
+    told = [row["why"]] if "why" in row else []
+    reason = row.get("reason")
+    if reason is not None and reason.get("outdated"):
+        explained = "no value" if reason["explains"] is None else f"{reason['explains']:.5g}"
+        told.append(f"reason outdated, value changed (it explained {explained})")
+    elif reason is not None:
+        told.append(reason["text"])
+    return ["; ".join(told)] if told else []
 
 
 def _conditions(values: dict[str, float | None]) -> list[str]:
@@ -95,16 +131,6 @@ def _told(value: float | None) -> str:
     return "" if value is None else f"{value:.3f}"
 
 
-def _other_commits(rows: list[dict[str, Any]]) -> list[str]:
-    """Which rows an earlier run measured, where a run made parts of the report alone."""
-    found: dict[str, list[str]] = {}
-    for row in rows:
-        if "commit" in row:
-            part = row["id"].split(".")[0]
-            found.setdefault(row["commit"][:10], []).append(part)
-    return [f"Measured at commit `{commit}`: {', '.join(sorted(set(parts)))}.\n" for commit, parts in found.items()]
-
-
 def _reliability(name: str, points: list[dict[str, float]]) -> Path:
     """How often answers of a confidence are right; on the line it is what it says."""
     figure, axes = plt.subplots(figsize=(4.5, 4.5))
@@ -121,12 +147,13 @@ def _reliability(name: str, points: list[dict[str, float]]) -> Path:
     return path
 
 
-def _line(row: dict[str, Any]) -> str:
+def _line(row: dict[str, Any], run: int) -> str:
     value = "-" if row["value"] is None else f"{row['value']:.4g} {row['unit']}"
     interval = "{:.4f} - {:.4f}".format(*row["ci95"]) if "ci95" in row else ""
     bar = _bar(row) if "bar" in row else ""
     mark = "" if "bar" not in row else ("holds" if row["holds"] else "**missed**")
-    return f"| `{row['id']}` | {value} | {interval} | {row.get('n', '')} | {bar} | {mark} |"
+    age = {True: "**stale**", "unknown": "age unknown", None: ""}[row.get("stale")]
+    return f"| `{row['id']}` | {value} | {interval} | {row.get('n', '')} | {bar} | {mark} | {run} | {age} |"
 
 
 def _bar(row: dict[str, Any]) -> str:

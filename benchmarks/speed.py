@@ -27,7 +27,7 @@ def speed_rows(report: Report, runs: Runs) -> None:
         frames = list(dataset.queries(f"drive1_{preset}"))[:QUERIES]
         with threadpool_limits(1):  # as a service has them: threads that wait for work spin, and their time would count
             for frame in frames:
-                query = Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole())
+                query = frame.query(bundle.grid)
                 times.append(_spent_ms(localizer, query) - _spent_ms(localizer, replace(query, refine=False)))
         row = f"registration.cpu_ms_per_query.{preset}"
         report.row(row, float(np.median(times)), "ms", bar=BARS_MS[preset], better="lower", n=len(times))

@@ -11,6 +11,7 @@ StreetfixError                     code            kind
 ├── UnknownMapError                unknown-map     not_found    no map of that name is mounted
 ├── UnknownSampleError              unknown-sample  not_found    no sample pair of that name lies beside the maps
 ├── NoPoseError                    no-pose         not_found    no sure pose, asked for in a format that has no word for doubt
+├── NotLocalizedError              not-localized   not_found    a pose is wanted of an answer that is not LOCALIZED
 ├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
 ├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
 ├── ForbiddenError                 forbidden       forbidden    the caller may ask, but not change what the service does
@@ -24,17 +25,22 @@ StreetfixError                     code            kind
 ├── EncoderError                   encoder         not_ready    an encoder file is missing or is not an encoder of ours
 ├── UnreachableError               unreachable     not_ready    a service does not answer
 │   ├── NoAnswerInTimeError        no-answer       not_ready    a service was asked, and the caller's time ended
-│   └── ForeignServiceError        foreign         not_ready    what answers speaks another language
+│   ├── ForeignServiceError        foreign         not_ready    what answers speaks another language
+│   └── HandshakeError             handshake       not_ready    a service and its client do not agree on TLS
 ├── RefusedError                   refused         invalid      a service refused a request (seen by its client)
 │   └── UnavailableError           unavailable     not_ready    it refused for now, and still did when patience ended
 ├── AddressError                   address         not_ready    the service cannot listen where it was told to
 ├── KeysError                      keys            not_ready    the file of API keys, or a certificate, cannot be used
-└── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
+├── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
+└── UnsupportedPlatformError       platform        unsupported  the service does not run on this operating system or processor
 
 No number of HTTP or gRPC stands here: each face has one table over ``kind``.
+
+``NotFiniteError`` stands outside the tree: the service is at fault, not the request. Both faces answer such errors with 500 or INTERNAL
+and the request id, and log the story.
 """
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 Kind = Literal[
     "invalid", "unsupported", "too_large", "not_found", "unauthorized", "forbidden", "busy", "deadline", "not_ready"
@@ -121,6 +127,22 @@ class NoPoseError(StreetfixError):
 
     code = "no-pose"
     kind = "not_found"
+
+
+class NotLocalizedError(StreetfixError):
+    """A pose is wanted of an answer that is not LOCALIZED, so that it has none.
+
+    Args:
+        message: for people.
+        answer: the whole answer, a ``service.contract.schema.LocalizeAnswer``; its hypotheses are not confirmed.
+    """
+
+    code = "not-localized"
+    kind = "not_found"
+
+    def __init__(self, message: str, *, answer: Any) -> None:
+        super().__init__(message)
+        self.answer = answer
 
 
 class NotGeoreferencedError(StreetfixError):
@@ -217,6 +239,12 @@ class ForeignServiceError(UnreachableError):
     code = "foreign"
 
 
+class HandshakeError(UnreachableError):
+    """A service and its client do not agree on TLS: an unknown authority, another name, a missing client certificate."""
+
+    code = "handshake"
+
+
 class RefusedError(StreetfixError):
     """A service refused a request; the message carries the problem it answered with.
 
@@ -268,8 +296,27 @@ class KeysError(StreetfixError):
     kind = "not_ready"
 
 
+class NotFiniteError(ArithmeticError):
+    """A number of an answer is not finite; no such number may leave the core.
+
+    Args:
+        path: of the number in the answer.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__(f"{path} of the answer is not finite")
+        self.path = path
+
+
 class ExtraMissingError(StreetfixError):
     """A command needs packages of an extra that is not installed."""
 
     code = "extra-missing"
+    kind = "unsupported"
+
+
+class UnsupportedPlatformError(StreetfixError):
+    """The service does not run on this operating system or processor."""
+
+    code = "platform"
     kind = "unsupported"

@@ -12,17 +12,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from google.protobuf.message import DecodeError as ProtoError
 from pydantic import ValidationError
 
+from benchmarks.fuzz.grpc_bytes import SEEDS as GRPC_SEEDS
+from benchmarks.fuzz.grpc_bytes import GrpcCalls
 from benchmarks.fuzz.http_bytes import SEEDS, Connections
 from service.contract import schema
 from service.contract.convert import parsed, query_from, sequence_from
 from service.contract.oscp import GeoPoseRequest, query_of
 from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
-from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
-from service.grpc.messages import request_from, sequence_request_from
 from service.http.body import split_multipart
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb
 from service.imaging.depth_units import depth_from_values
@@ -82,7 +81,7 @@ def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
         "request_json": Target(_request, (request,), 0.18),
         "sequence_json": Target(_sequence, (sequence,), 0.06),
         "oscp_json": Target(_oscp, (_oscp_seed(),), 0.06),
-        "grpc_request": Target(_grpc, (_grpc_seed(),), 0.15),
+        "grpc": Target(GrpcCalls(bundle).take, GRPC_SEEDS, 0.15),
         "depth": Target(_depth, (*_depth_seeds(depth),), 0.14),
         "depth_png_rows": Target(_png_rows, (_rows_of(depth[:12, :16]),), 0.05),
         "colour": Target(lambda data: decode_rgb(data, limits=LIMITS), (*_colour_seeds(rgb),), 0.04),
@@ -119,14 +118,6 @@ def _sequence(data: bytes) -> None:
 def _oscp(data: bytes) -> None:
     with contextlib.suppress(ValidationError):  # the route turns it into a problem
         query_of(parsed(data, GeoPoseRequest), None)
-
-
-def _grpc(data: bytes) -> None:
-    with contextlib.suppress(ProtoError):
-        query_from(request_from(pb.LocalizeRequest.FromString(data)), rgb=b"", depth=b"")
-    with contextlib.suppress(ProtoError):
-        request = sequence_request_from(pb.LocalizeSequenceRequest.FromString(data))
-        sequence_from(request, [(b"", b"")] * len(request.frames))
 
 
 def _depth(data: bytes) -> None:
@@ -198,15 +189,6 @@ def _oscp_seed() -> bytes:
     return json.dumps(
         {"id": "1", "timestamp": "1", "type": "geopose", "sensors": [], "sensorReadings": readings}
     ).encode()
-
-
-def _grpc_seed() -> bytes:
-    message = pb.LocalizeRequest(
-        rgb=b"1", depth=b"2", map="tiny", camera=pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5),
-        depth_format=pb.DepthFormat(scale_m=0.001, kind=pb.DEPTH_KIND_DISPARITY, baseline_m=0.1, max_range_m=40.0),
-        options=pb.Options(refine=True, neighbours=5),
-    )  # fmt: skip
-    return message.SerializeToString()
 
 
 def _bundle_of(bundle: Path, scratch: Path) -> Callable[[bytes], None]:

@@ -11,12 +11,13 @@ from pathlib import Path
 
 from benchmarks.paper.data import PaperData, Size
 from benchmarks.paper.figures import draw_figures
-from benchmarks.paper.kept import MethodResult
+from benchmarks.paper.kept import COMMAND, MethodResult
 from benchmarks.paper.methods import RUNS, Bench
 from benchmarks.paper.pace import Pace, measure_pace
 from benchmarks.paper.page import write_page
 from benchmarks.paper.rows import METHODS, all_rows
-from benchmarks.report import REPORTS, ROOT, Report, loaded_commit
+from benchmarks.provenance import this_process
+from benchmarks.report import REPORTS, ROOT, Report
 from model_training.cli.progress import bars
 
 PACE = "pace"  # beside the methods: what each takes for the same number of images
@@ -64,7 +65,7 @@ def main() -> None:
     pace_file = out / "paper" / "pace.json"
     done = work / "done"
     done.mkdir(parents=True, exist_ok=True)
-    loaded_commit()
+    this_process(COMMAND)
     report = Report(
         "paper", "make paper" + (' ARGS="' + " ".join(sys.argv[1:]) + '"' if sys.argv[1:] else ""), folder=out
     )
@@ -86,9 +87,6 @@ def main() -> None:
     report.notes["size"] = (
         f"{size.frames} LiDAR frames, {size.pairs} RGB-D pairs, {len(bench.data.tests['other_drive'])} test images a split; "
         f"learned methods have up to {minutes:g} minutes of processor time each."
-    )
-    report.notes["runs"] = "; ".join(
-        f"{name} at {result.commit[:10]}, {result.machine or 'machine not kept'}" for name, result in results.items()
     )
     print(f"written: {report.write()}")
     pictures = draw_figures(out / "paper", bench.data, results, figures, pace)

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import loaded_commit, machine
+from benchmarks.provenance import Run, this_process
 from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.learning import CurvePoint
 
+COMMAND = "make paper"
 SPLITS = ("same_drive", "other_drive")
 
 
@@ -29,8 +30,7 @@ class MethodResult:
         ended: why its training ended.
         curve: of its training.
         extra: plain values that tables need.
-        commit: that it was run at.
-        machine: that it ran on; empty where that was not kept.
+        run: that gave the answers.
     """
 
     method: str
@@ -41,8 +41,7 @@ class MethodResult:
     ended: str = "nothing is learnt"
     curve: list[CurvePoint] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
-    commit: str = field(default_factory=loaded_commit)
-    machine: str = field(default_factory=machine)
+    run: Run = field(default_factory=lambda: this_process(COMMAND))
 
     @property
     def aside(self) -> float:
@@ -54,7 +53,7 @@ class MethodResult:
         """Write ``METHOD.json``, whole or not at all."""
         folder.mkdir(parents=True, exist_ok=True)
         told = {
-            "method": self.method, "commit": self.commit, "machine": self.machine, "training_s": self.training_s, "images": self.images,
+            "method": self.method, "run": self.run.as_json(), "training_s": self.training_s, "images": self.images,
             "training_set": self.training_set, "ended": self.ended, "extra": self.extra,
             "curve": [[p.images, p.processor_s, p.loss, p.score] for p in self.curve],
             "answers": {name: {"xy": _plain(each.xy), "street": each.street.tolist()} for name, each in self.answers.items()},
@@ -76,7 +75,7 @@ class MethodResult:
         }
         return MethodResult(
             told["method"], answers, told["training_s"], told["images"], told["training_set"], told["ended"],
-            [CurvePoint(int(a), b, c, d) for a, b, c, d in told["curve"]], told["extra"], told["commit"], told.get("machine", ""),
+            [CurvePoint(int(a), b, c, d) for a, b, c, d in told["curve"]], told["extra"], Run(**told["run"]),
         )  # fmt: skip
 
 

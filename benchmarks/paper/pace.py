@@ -17,8 +17,9 @@ import numpy as np
 import torch
 
 from benchmarks.paper.data import PaperData, Size
+from benchmarks.paper.kept import COMMAND
 from benchmarks.paper.ours import config_as_paper, pack_of, seconds_a_step
-from benchmarks.report import loaded_commit, machine
+from benchmarks.provenance import Run, this_process
 from model_training.baselines.dual import learn
 from model_training.baselines.dual.pictures import Sweeps, pictures_of
 from model_training.baselines.gallery import thinned
@@ -37,15 +38,14 @@ Measure = Callable[[], float]
 
 @dataclass(frozen=True)
 class Pace:
-    """Processor seconds an image by method, a value a round; where and at which commit they were measured.
+    """Processor seconds an image by method, a value a round, and the run that measured them.
 
     ``load``: processes that wanted a core, on average over a minute, before and after (1 is this one alone).
     """
 
     seconds_an_image: Mapping[str, list[float]]
     load: tuple[float, float] = (0.0, 0.0)
-    machine: str = field(default_factory=machine)
-    commit: str = field(default_factory=loaded_commit)
+    run: Run = field(default_factory=lambda: this_process(COMMAND))
 
     def minutes(self, method: str, images: int) -> float | None:
         """Processor minutes for so many images, by the median round; None for a method that was not measured."""
@@ -56,7 +56,7 @@ class Pace:
         """Write JSON, whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part")
-        part.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        part.write_text(json.dumps(asdict(self) | {"run": self.run.as_json()}, indent=1) + "\n")
         part.rename(path)
 
     @staticmethod
@@ -65,7 +65,7 @@ class Pace:
         if not path.exists():
             return None
         told = json.loads(path.read_text())
-        return Pace(**told | {"load": tuple(told["load"])})
+        return Pace(**told | {"load": tuple(told["load"]), "run": Run(**told["run"])})
 
     def to_the_quickest(self) -> list[float]:
         """Ours against the quickest of all other methods, round by round: under 1 it is the quicker."""

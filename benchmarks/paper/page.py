@@ -53,7 +53,7 @@ def _head(data: PaperData) -> list[str]:
     return [
         "# The paper, reproduced",
         "",
-        f"Made by `make paper` at commit `{head_commit()[:10]}`; none of it is typed by hand. The paper's machine: Intel Core",
+        f"Made by `make paper` at commit `{head_commit()[:10]}`; its figures come from the runs below. The paper's machine: Intel Core",
         "i5-8250U, 8 GB, MATLAB; ours are named under *Runs*. CARLA is replaced by our simulator, so figures compare methods on one",
         "city and not our city with theirs.",
         "",
@@ -111,13 +111,15 @@ def _runs(results: Mapping[str, MethodResult], pace: Pace | None) -> list[str]:
     lines = ["## Runs", "", "| method | commit | machine | training ended by |", "|---|---|---|---|"]
     for name, result in results.items():
         if name not in ("cnn_knn", "cnn_softmax"):  # stand for one of their variants
-            lines.append(f"| `{name}` | `{result.commit[:10]}` | {result.machine or 'not kept'} | {result.ended} |")
+            lines.append(
+                f"| `{name}` | `{result.run.commit[:10]}` | {result.run.machine or 'not kept'} | {result.ended} |"
+            )
     if pace is None:
         return lines
     ratios = pace.to_the_quickest()
     lines += [
-        "", (f"Steps of all learned methods in turn: commit `{pace.commit[:10]}`, {pace.machine}, load {pace.load[0]:.1f} before and "
-        f"{pace.load[1]:.1f} after. Ours to the quickest other method, round by round: "
+        "", (f"Steps of all learned methods in turn: commit `{pace.run.commit[:10]}`, {pace.run.machine}, load {pace.load[0]:.1f} before "
+        f"and {pace.load[1]:.1f} after. Ours to the quickest other method, round by round: "
         f"{', '.join(f'{ratio:.2f}' for ratio in ratios)}."), "",
         "| method | milliseconds an image, each round |", "|---|---|",
     ]  # fmt: skip

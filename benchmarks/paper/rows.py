@@ -99,18 +99,21 @@ def all_rows(
                 for key, unit in METRICS:
                     report.row(f"paper.{method}.{split}.{key}", None, unit, why=missing[method])
                 continue
-            _rows_of(report, method, split, results[method], found, len(tests[split]))
+            with report.made_by(results[method].run):
+                _rows_of(report, method, split, results[method], found, len(tests[split]))
         if method in results and (minutes := minutes_for_paper_images(method, results[method], pace)) is not None:
             bar = _quickest_other(results, pace) if method in TRAINED_BY_US else None
-            in_turn = _paced_minutes(method, results[method], pace) is not None
+            in_turn = pace is not None and _paced_minutes(method, results[method], pace) is not None
             how = "by steps of all methods in turn in one run" if in_turn else "scaled from its own run"
-            report.row(
-                f"paper.{method}.minutes_for_paper_images", minutes, "min", bar=bar, better="lower", n=PAPER_IMAGES,
-                why=f"processor minutes, {how}" + ("; bar: the quickest other learned method's" if bar else ""),
-            )  # fmt: skip
+            with report.made_by(pace.run if pace is not None and in_turn else results[method].run):
+                report.row(
+                    f"paper.{method}.minutes_for_paper_images", minutes, "min", bar=bar, better="lower", n=PAPER_IMAGES,
+                    why=f"processor minutes, {how}" + ("; bar: the quickest other learned method's" if bar else ""),
+                )  # fmt: skip
     for method, result in results.items():
         if method.startswith("cnn_knn_"):
-            _rows_of_other_pictures(report, method.removeprefix("cnn_knn_"), result)
+            with report.made_by(result.run):
+                _rows_of_other_pictures(report, method.removeprefix("cnn_knn_"), result)
     return found
 
 

@@ -145,6 +145,6 @@ def _paced(pace: Pace | None) -> str:
         return "scaled from each method's own run"
     rounds = len(next(iter(pace.seconds_an_image.values())))
     return (
-        f"by steps of all methods in turn within one run ({rounds} rounds, medians; {pace.machine}, one thread each, commit "
-        f"`{pace.commit[:10]}`); of the paper's baseline its first network alone"
+        f"by steps of all methods in turn within one run ({rounds} rounds, medians; {pace.run.machine}, one thread each, commit "
+        f"`{pace.run.commit[:10]}`); of the paper's baseline its first network alone"
     )

@@ -9,6 +9,7 @@ from benchmarks.real.loops import loop_rows
 from benchmarks.real.resume import identical_bundles
 from benchmarks.real.ros2 import answers_over_dds
 from benchmarks.real.round_trips import QUERIES, import_rows, round_trip_rows, simulated
+from benchmarks.real.streets import DRIVES, street_rows
 from benchmarks.report import ROOT, Report
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.stock import ENCODER
@@ -39,6 +40,7 @@ def main() -> None:
     parts: dict[str, Callable[[Report, argparse.Namespace], None]] = {
         "drive": lambda report, a: drive_rows(report, a.data, a.work),
         "stereo": lambda report, a: stereo_rows(report, a.data, a.work),
+        "streets": lambda report, a: street_rows(report, a.data, a.work, tuple(a.drives)),
         "round-trips": lambda report, a: round_trip_rows(report, a.work),
         "import": lambda report, a: import_rows(report, a.work),
         "loops": lambda report, _: loop_rows(report),
@@ -46,9 +48,11 @@ def main() -> None:
         "ros2": lambda report, a: ros2_rows(report, a.work),
     }
     parser.add_argument("--only", nargs="+", choices=list(parts), help="measure these parts and keep the other rows")
+    parser.add_argument("--drives", nargs="+", choices=DRIVES, default=list(DRIVES), help="of the part `streets`")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     only = f" --only {' '.join(arguments.only)}" if arguments.only else ""
+    only += "" if tuple(arguments.drives) == DRIVES else f" --drives {' '.join(arguments.drives)}"
     report = Report("real_data", f"python -m benchmarks.real{only}")
     if arguments.only:
         report.keep_others()

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.real.served import answers, away_m
+from benchmarks.real.served import away_m, served
+from benchmarks.real.streets import status_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset, read_tum
 from model_training.importing.kinds import OpenSettings, open_recording
@@ -57,7 +58,7 @@ def stereo_rows(report: Report, data: Path, work: Path) -> None:
     """``kitti_stereo``: the places of all frames in one map, the stereo frames asked with SGBM's depth."""
     source = data / "kitti_stereo"
     if not source.exists():
-        report.row("kitti_stereo.served.within_1_m", None, "share", bar=1.0, why=NO_DATA.format(name=data.name))
+        report.row("real.kitti_stereo.answered_within_1_m", None, "share", bar=1.0, why=NO_DATA.format(name=data.name))
         return
     folder, bundle = work / "kitti_stereo", work / "kitti_stereo_map"
     _fresh(folder, bundle)
@@ -65,9 +66,9 @@ def stereo_rows(report: Report, data: Path, work: Path) -> None:
     dataset = Dataset(folder)
     build_map(dataset, ENCODER, bundle, BuildSettings(name="kitti-stereo", expected_lidar_height_m=LIDAR_HEIGHT_M))
     truth = np.array([frame.T_map_camera for frame in dataset.queries("frames")])
-    away = away_m(answers(bundle, dataset, "frames"), truth)
-    report.share("kitti_stereo.served.within_1_m", away <= 1.0, bar=1.0)
-    report.row("kitti_stereo.served.median_m", float(np.median(away)), "m", n=len(away))
+    answered = served(bundle, dataset, "frames")
+    away = away_m(answered.T_map_camera, truth)
+    status_rows(report, "real.kitti_stereo", away, answered.localized, bars=(1.0, None, None))
 
 
 def _both_halves(source: Path, poses: Trajectory, work: Path, reference: Path) -> NDArray[np.float64]:
@@ -79,14 +80,13 @@ def _both_halves(source: Path, poses: Trajectory, work: Path, reference: Path) -
         recording = open_recording("kitti-raw", source, SETTINGS)
         take(recording, poses, folder, TakeSettings(depth="lidar", hold_out=2, hold_out_first=first))
         dataset = Dataset(folder)
-        settings = BuildSettings(
-            name="kitti-drive", spacing_m=0.0, expected_lidar_height_m=LIDAR_HEIGHT_M, traffic_vote=True
-        )
+        settings = BuildSettings(name="kitti-drive", spacing_m=0.0, expected_lidar_height_m=LIDAR_HEIGHT_M)
         build_map(dataset, ENCODER, bundle, settings)
         frames = list(dataset.queries("recorded"))
         camera = np.array(frames[0].camera.T_vehicle_sensor)
         stamps = np.array([frame.stamp_s for frame in frames], np.float64)
-        away.append(away_m(answers(bundle, dataset, "recorded"), read_pose_file(reference).between(stamps) @ camera))
+        answered = served(bundle, dataset, "recorded").T_map_camera
+        away.append(away_m(answered, read_pose_file(reference).between(stamps) @ camera))
     return np.concatenate(away)
 
 

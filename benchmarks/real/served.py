@@ -1,26 +1,53 @@
 """Query sets of a dataset asked over HTTP of a service that serves one map."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
+import httpx
 import numpy as np
 from numpy.typing import NDArray
 
 from model_training.cli.demo_service import serving
 from model_training.datasets.dataset import Dataset
-from service.client import Client
+from model_training.loadtest.payloads import payloads
 from service.geometry.rigid import rotation_from_quaternion_xyzw, transform_from
 
+_TIMEOUT_S = 60.0
 
-def answers(bundle: Path, dataset: Dataset, queries: str) -> NDArray[np.float64]:
-    """T_map_camera (n, 4, 4) of every query's answer, whatever its status: the best hypothesis counts."""
-    found = []
-    with serving(bundle, 0) as service, Client(service.url) as client:
-        for frame in dataset.queries(queries):
-            answer = client.localize(frame.rgb(), frame.depth_m(), frame.camera.pinhole())
-            position, turned = answer.pose.position, answer.pose.orientation
-            R = rotation_from_quaternion_xyzw(np.array([turned.x, turned.y, turned.z, turned.w]))
-            found.append(transform_from(R, np.array([position.x, position.y, position.z])))
-    return np.array(found).reshape(-1, 4, 4)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Served:
+    """A service's answers, a row a query.
+
+    Attributes:
+        T_map_camera: of the best hypothesis, whatever the status (n, 4, 4); infinite where there is none.
+        localized: whether the answer is accepted (n).
+        confidence: NaN where there is none (n).
+    """
+
+    T_map_camera: NDArray[np.float64]
+    localized: NDArray[np.bool_]
+    confidence: NDArray[np.float64]
+
+
+def served(bundle: Path, dataset: Dataset, queries: str) -> Served:
+    """Every query of a set, as a user posts it: the files, the intrinsics and the depth format of the dataset."""
+    poses, localized, confidence = [], [], []
+    with serving(bundle, 0) as service, httpx.Client(base_url=service.url, timeout=_TIMEOUT_S) as client:
+        for asked in payloads(dataset, queries, map_name=None, refine=True, most=1_000_000):
+            reply = client.post("/v1/localize", content=asked.body, headers={"Content-Type": asked.content_type})
+            answer = reply.raise_for_status().json()
+            pose = answer["hypotheses"][0]["pose"] if answer["hypotheses"] else answer["pose"]
+            localized.append(answer["status"] == "LOCALIZED")
+            confidence.append(np.nan if answer["confidence"] is None else answer["confidence"])
+            poses.append(np.full((4, 4), np.inf) if pose is None else _transform(pose))
+    return Served(np.array(poses).reshape(-1, 4, 4), np.array(localized, bool), np.array(confidence, np.float64))
+
+
+def _transform(pose: dict[str, dict[str, float]]) -> NDArray[np.float64]:
+    position, turned = pose["position"], pose["orientation"]
+    R = rotation_from_quaternion_xyzw(np.array([turned[axis] for axis in "xyzw"]))
+    return transform_from(R, np.array([position[axis] for axis in "xyz"]))
 
 
 def away_m(T: NDArray[np.float64], T_true: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,17 +13,21 @@ from benchmarks.plans import paper_plan
 from benchmarks.report import ROOT, Report
 from benchmarks.runs import Runs
 from benchmarks.serving.decoding import decoding_rows
-from benchmarks.serving.fire import overload_rows, sigterm_rows, soak_rows, swap_rows
+from benchmarks.serving.fire import overload_rows, sigterm_rows, swap_rows
 from benchmarks.serving.hostile import hostile_rows
 from benchmarks.serving.machines import LOADING_CORE, SERVED_CORE, pin
 from benchmarks.serving.memory import memory_rows
+from benchmarks.serving.native import native_rows, sanitizer_rows
 from benchmarks.serving.peers.measure import PEERS, peer_rows
 from benchmarks.serving.ratios import Site, ratio_rows, tail_rows
 from benchmarks.serving.sizes import size_rows
+from benchmarks.serving.soak import JUDGED_MINUTES, soak_rows
 from model_training.stock import ENCODER
 from service.maps.reader import MapBundle
 
 QUERIES, PAIRS = "drive1_precise", 50
+#: Parts that need no map of the paper's city.
+WITHOUT_A_MAP = {"native", "sanitizers"}
 
 
 def site_from(arguments: argparse.Namespace) -> Site:
@@ -44,26 +48,23 @@ def main() -> None:
     parser.add_argument("--queries", default=QUERIES)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each round")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--soak-minutes", type=float, default=30.0)
+    parser.add_argument("--soak-minutes", type=float, default=JUDGED_MINUTES)
+    parser.add_argument(
+        "--soak-rate",
+        type=float,
+        help="pairs of pictures a second in the soak, where other work shares the machine; default: 60 %% of what one core answers",
+    )
     parser.add_argument(
         "--only",
         nargs="+",
-        help="parts: ratios decoding tail overload swap sigterm sizes hostile memory both_cores peers soak",
+        help="parts: ratios decoding tail overload swap sigterm sizes hostile memory both_cores peers soak native sanitizers",
     )
     parser.add_argument("--peers", nargs="+", default=PEERS, choices=PEERS, help="who else hosts the pipeline")
     arguments = parser.parse_args()
-    site = site_from(arguments)
     told = " ".join(sys.argv[1:])
     report = Report("serving", "make bench-serving" + (f' ARGS="{told}"' if told else ""))
     if arguments.only:
         report.keep_others()
-    counts = MapBundle.open(site.bundle, verify=False).manifest.counts
-    report.notes["map"] = (
-        f"Map {site.bundle.name}: {counts.places} places, {counts.views} views, {counts.cloud_points} points."
-    )
-    report.notes["requests"] = (
-        f"{PAIRS} pairs of {site.queries}, 640x480 JPEG and 16-bit PNG; server on core {SERVED_CORE}, load on {LOADING_CORE}."
-    )
     core, seconds = SERVED_CORE, arguments.seconds
     parts: dict[str, Callable[[], object]] = {
         "ratios": lambda: ratio_rows(report, site, seconds=seconds, rounds=arguments.rounds, core=core),
@@ -79,14 +80,25 @@ def main() -> None:
         "peers": lambda: peer_rows(
             report, site, seconds=seconds, rounds=arguments.rounds, core=core, names=arguments.peers
         ),
-        "soak": lambda: soak_rows(report, site, minutes=arguments.soak_minutes, core=core),
+        "soak": lambda: soak_rows(report, site, minutes=arguments.soak_minutes, rate=arguments.soak_rate, core=core),
+        "native": lambda: native_rows(report, arguments.work),
+        "sanitizers": lambda: sanitizer_rows(report),
     }
     if unknown := set(arguments.only or ()) - set(parts):
         parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(parts)}")
+    if set(arguments.only or parts) - WITHOUT_A_MAP:
+        site = site_from(arguments)
+        counts = MapBundle.open(site.bundle, verify=False).manifest.counts
+        report.notes["map"] = (
+            f"Map {site.bundle.name}: {counts.places} places, {counts.views} views, {counts.cloud_points} points."
+        )
+        report.notes["requests"] = (
+            f"{PAIRS} pairs of {site.queries}, 640x480 JPEG and 16-bit PNG; server on core {SERVED_CORE}, load on {LOADING_CORE}."
+        )
     for name, part in parts.items():
         if arguments.only and name not in arguments.only:
             continue
-        pin(0, None if name in ("both_cores", "memory") else LOADING_CORE)
+        pin(0, None if name in {"both_cores", "memory", *WITHOUT_A_MAP} else LOADING_CORE)
         part()
         print(f"written: {report.write()}", flush=True)
 

@@ -19,7 +19,6 @@ from benchmarks.report import Report
 from benchmarks.serving.loads import closed, load, opened
 from benchmarks.serving.machines import Server
 from benchmarks.serving.ratios import MANY, Site
-from model_training.loadtest.drive import Load
 from model_training.loadtest.payloads import Payload
 from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import read_manifest
@@ -164,35 +163,3 @@ def sigterm_rows(report: Report, site: Site, *, core: int | None) -> None:
     report.row("sigterm.failed_requests", len(failed), "count", bar=0, better="lower", n=len(answers) + len(failed),
                why=f"first: {failed[0]}" if failed else None)  # fmt: skip
     report.row("sigterm.exit_code", code, "count", bar=0, better="lower")
-
-
-def soak_rows(report: Report, site: Site, *, minutes: float, core: int | None) -> None:
-    """Memory over time at 80 % of the rate that saturates; the first sixth is warm-up."""
-    sent = site.payloads(refine=True)
-    threads = {} if core is None else {"threads": 1}
-    with Server(site.bundle, core=core, **threads) as server:
-        peak, _ = load(server, "rest", sent, closed(15, MANY))
-        at_s, resident, anonymous = [], [], []
-        over = threading.Event()
-
-        def watch() -> None:
-            began = time.monotonic()
-            while not over.wait(5.0):
-                at_s.append(time.monotonic() - began)
-                used = server.used
-                resident.append(used.resident_mib)
-                anonymous.append(used.anonymous_mib)
-
-        watcher = threading.Thread(target=watch)
-        watcher.start()
-        how = Load(rate=0.8 * peak.answered_per_s, warm_up_s=0.0, duration_s=60 * minutes)
-        found, _ = load(server, "rest", sent, how)
-        over.set()
-        watcher.join()
-    late = np.array(at_s) >= 10 * minutes
-    hours = np.array(at_s)[late] / 3600
-    slope, own = (float(np.polyfit(hours, np.array(each)[late], 1)[0]) for each in (resident, anonymous))
-    why = None if minutes >= 30 else f"of {minutes:g} minutes only"
-    report.row("soak.slope_mib_per_hour", slope, "MiB/h", bar=5, better="lower", n=found.answers, why=why)
-    report.row("soak.anonymous_slope_mib_per_hour", own, "MiB/h", n=found.answers)  # less the pages of mapped files
-    report.row("soak.failed_requests", sum(found.errors.values()), "count", n=found.answers)

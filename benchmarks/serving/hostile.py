@@ -26,7 +26,7 @@ _REQUEST = json.dumps({"camera": _CAMERA}).encode()
 def hostile_rows(report: Report, site: Site, *, core: int | None) -> None:
     """Memory over what it was, requests of others that failed, and how each kind was answered."""
     sent = site.payloads(refine=True)
-    good = {"rgb": _part(sent[0].body, b"rgb"), "depth": _part(sent[0].body, b"depth"), "request": _REQUEST}
+    good = {"rgb": part_of(sent[0].body, b"rgb"), "depth": part_of(sent[0].body, b"depth"), "request": _REQUEST}
     kinds = hostile_kinds(good)
     with Server(site.bundle, core=core, request_timeout_s=10) as server:
         with asking(server.url, sent[:2]) as (answers, failed):
@@ -171,7 +171,7 @@ def _endless_headers(url: str) -> str:
         return _first_line(connection)
 
 
-def _part(body: bytes, name: bytes) -> bytes:
+def part_of(body: bytes, name: bytes) -> bytes:
     """Content of a part of a body that we made."""
     start = body.index(b"\r\n\r\n", body.index(b'name="' + name + b'"')) + 4
     boundary = body[: body.index(b"\r\n")]

@@ -11,6 +11,7 @@ from model_training.calibration.fit import Asked, expected_calibration_error, fi
 from model_training.calibration.plans import CITIES, calibration_plan, repeating_plan
 from model_training.calibration.strangers import KINDS
 from model_training.datasets.dataset import Dataset
+from model_training.datasets.files import read_arrays
 from model_training.datasets.without_streets import WithoutStreets
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.simulate import simulate
@@ -97,10 +98,15 @@ def _kept(work: Path, encoder: Path, city: Dataset, ask: Callable[[], list[Asked
     """Answers of an earlier run, or those of a new one."""
     kept = work / f"asked-{city.name}-{Encoder.open(encoder).sha256[:12]}.npz"
     if not kept.exists() or anew:
-        asked = pooled(ask())
-        np.savez_compressed(kept, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
-    with np.load(kept) as arrays:
-        return Asked(*(arrays[name] for name in Asked.__dataclass_fields__))
+        asked, part = pooled(ask()), kept.with_suffix(".part.npz")
+        np.savez_compressed(part, **{name: getattr(asked, name) for name in Asked.__dataclass_fields__})
+        part.rename(kept)
+
+    def read() -> Asked:
+        with kept.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return Asked(*(arrays[name] for name in Asked.__dataclass_fields__))
+
+    return read_arrays(kept, read, remedy="remove it, and its queries are asked anew")
 
 
 def _ask(work: Path, encoder: Path, cities: list[Dataset], index: int, report: Report) -> list[Asked]:

@@ -32,7 +32,7 @@ def command(
     traffic_vote: Annotated[
         bool,
         typer.Option(help="drop what later scans of a drive look through: vehicles that drove while it was surveyed"),
-    ] = False,
+    ] = True,
     align_survey: Annotated[
         bool,
         typer.Option(

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from model_training.datasets.dataset import Dataset
-from model_training.evaluation.compare import Comparison, compare
+from model_training.evaluation.compare import Comparison, compare, p_text
 from model_training.evaluation.saved_run import SavedRun
 from model_training.reporting.comparison_page import HEAD, LABELS, row_of, write_comparison_page
 from model_training.reporting.plan import Plan
@@ -40,6 +40,7 @@ def command(
         part.write_text(json.dumps(found.as_json(), indent=1) + "\n")
         part.rename(json_file)
     Console().print(_table(found))
+    console.print(_errors(found), highlight=False)
     console.print(found.verdict, highlight=False)
     if out is not None:
         page = write_comparison_page(
@@ -60,6 +61,18 @@ def _table(found: Comparison) -> Table:
         for name, each in found.sets.items():
             table.add_row(*row_of(name, each))
     return table
+
+
+def _errors(found: Comparison) -> str:
+    each = found.errors
+    if each is None:
+        return "forced errors: there is no query that both runs answered"
+    low, high = each.median_interval_m
+    return (
+        f"forced errors, whatever the status, of {each.count} queries: median {each.first_median_m:.3f} m of A, "
+        f"{each.second_median_m:.3f} m of B, "
+        f"median difference {each.median_difference_m:+.3f} m (95 % interval {low:+.3f} to {high:+.3f}; Wilcoxon's p {p_text(each.p)})"
+    )
 
 
 def _dataset(run: SavedRun, given: Path | None, console: Console) -> Dataset | None:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from model_training.cli.demo_map import Question
+from model_training.evaluation.measures import RIGHT_M
 from service.cli.localize import localize
 from service.errors import RefusedError
 from service.geometry.rigid import heading_of_camera, wrap_angle
@@ -22,7 +23,10 @@ from service.geometry.rigid import heading_of_camera, wrap_angle
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A question and its answer of the REST contract, or why there is none; ``elapsed_s`` over HTTP."""
+    """A question and its answer of the REST contract, or why there is none; ``elapsed_s`` over HTTP.
+
+    An answer that is not LOCALIZED has neither street nor pose, so it is neither right nor wrong.
+    """
 
     question: Question
     answer: dict[str, Any] | None
@@ -31,30 +35,47 @@ class Outcome:
 
     @property
     def right(self) -> bool | None:
-        """Whether the street, or where places are single frames the first place, is the true one; None: not known."""
+        """Whether the street, or where places are single frames the first place, is the true one; None: not known, or no pose."""
         if self.question.place is None and self.question.street is None:
             return None
         if self.answer is None:
             return False
         if self.question.place is not None:
             return bool(self.answer["neighbours"][0]["place"] == self.question.place)
+        if self.answer["pose"] is None:
+            return None
         street = self.answer["street"]
         return street is not None and self.question.street is not None and street["id"] == self.question.street[0]
 
     @property
     def error_m(self) -> float | None:
-        """Horizontal distance of the answered position from the true one; None in another one of single places."""
-        T = self.question.T_map_camera
-        if T is None or self.answer is None or self._is_elsewhere:
+        """Horizontal distance of the answered position from the true one; None without a pose, or in another one of single places."""
+        return None if self.answer is None else self._off_m(self.answer["pose"])
+
+    @property
+    def forced_error_m(self) -> float | None:
+        """The same of the best guess, whatever the status; None where nothing was registered either."""
+        if self.answer is None:
             return None
-        position = self.answer["pose"]["position"]
-        return math.hypot(position["x"] - T[0, 3], position["y"] - T[1, 3])
+        guesses = self.answer["hypotheses"]
+        return self._off_m(guesses[0]["pose"] if guesses else self.answer["pose"])
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether the status says that the pose can be used."""
+        return self.answer is not None and self.answer["status"] == "LOCALIZED"
+
+    def _off_m(self, pose: dict[str, Any] | None) -> float | None:
+        T = self.question.T_map_camera
+        if T is None or pose is None or self._is_elsewhere:
+            return None
+        return math.hypot(pose["position"]["x"] - T[0, 3], pose["position"]["y"] - T[1, 3])
 
     @property
     def heading_error_deg(self) -> float | None:
         """Angle between the answered heading and the true one; None where ``error_m`` is."""
         T = self.question.T_map_camera
-        if T is None or self.answer is None or self._is_elsewhere:
+        if T is None or self.answer is None or self.answer["pose"] is None or self._is_elsewhere:
             return None
         return abs(math.degrees(wrap_angle(math.radians(self.answer["pose"]["heading_deg"]) - heading_of_camera(T))))
 
@@ -123,7 +144,7 @@ def _streets_table(outcomes: list[Outcome]) -> Table:
 
 def _places_table(outcomes: list[Outcome], places: tuple[str, ...]) -> Table:
     table = Table(title="Which place is it?", title_justify="left")
-    for heading in ("frame", "first place", "similarity", "own place first"):
+    for heading in ("frame", "first place", "similarity", "own place first", "status"):
         table.add_column(heading)
     table.add_column("error", justify="right")
     for outcome in outcomes:
@@ -131,7 +152,7 @@ def _places_table(outcomes: list[Outcome], places: tuple[str, ...]) -> Table:
         name = _flat(outcome.problem) if first is None else places[first["place"]]
         similarity = "" if first is None else f"{first['similarity']:.3f}"
         own = "not in the map" if outcome.question.place is None else _verdict(outcome.right)
-        table.add_row(outcome.question.name, name, similarity, own, _errors(outcome))
+        table.add_row(outcome.question.name, name, similarity, own, _status(outcome), _errors(outcome))
     return table
 
 
@@ -140,9 +161,17 @@ def _answered(outcome: Outcome) -> str:
     if answer is None:
         return _flat(outcome.problem)
     pose, street = answer["pose"], answer["street"]
-    text = _where(street and street["name"], pose["position"]["x"], pose["position"]["y"], pose["heading_deg"])
-    sure = "" if answer["confidence"] is None else f" {answer['confidence']:.3f}"
-    return f"{text}\n{answer['status']}{sure}"
+    text = "no pose"
+    if pose is not None:
+        text = _where(street and street["name"], pose["position"]["x"], pose["position"]["y"], pose["heading_deg"])
+    return f"{text}\n{_status(outcome)}"
+
+
+def _status(outcome: Outcome) -> str:
+    answer = outcome.answer
+    if answer is None:
+        return "refused"
+    return str(answer["status"]) + ("" if answer["confidence"] is None else f" {answer['confidence']:.3f}")
 
 
 def _where(street: str | None, x: float, y: float, heading_deg: float) -> str:
@@ -154,9 +183,9 @@ def _verdict(right: bool | None) -> str:
 
 
 def _errors(outcome: Outcome) -> str:
-    if outcome.error_m is None:
-        return ""
-    return f"{outcome.error_m:.2f} m\n{outcome.heading_error_deg:.0f}°"
+    if outcome.error_m is not None:
+        return f"{outcome.error_m:.2f} m\n{outcome.heading_error_deg:.0f}°"
+    return "" if outcome.forced_error_m is None else f"not accepted\n(forced {outcome.forced_error_m:.2f} m)"
 
 
 def _flat(problem: str) -> str:
@@ -165,10 +194,17 @@ def _flat(problem: str) -> str:
 
 def _summary(outcomes: list[Outcome], what: str) -> str:
     verdicts = [outcome.right for outcome in outcomes if outcome.right is not None]
-    errors = sorted(error for outcome in outcomes if (error := outcome.error_m) is not None)
     parts = [f"{sum(verdicts)} of {len(verdicts)} {what} right"]
-    if errors:
-        parts.append(f"position off by {median(errors):.2f} m (median), {errors[-1]:.2f} m (largest)")
+    accepted = sum(outcome.is_accepted for outcome in outcomes)
+    parts.append(f"{accepted} of {len(outcomes)} answers accepted (LOCALIZED), the others have no pose")
+    errors = sorted(error for outcome in outcomes if (error := outcome.error_m) is not None)
+    forced = sorted(error for outcome in outcomes if (error := outcome.forced_error_m) is not None)
+    for name, each in (("accepted answers", errors), ("forced, whatever the status", forced)):
+        if each:
+            wrong = sum(error > RIGHT_M for error in each)
+            parts.append(
+                f"{name}: position off by {median(each):.2f} m (median), {each[-1]:.2f} m (largest); {wrong} of {len(each)} over 1 m"
+            )
     parts.append(f"{1e3 * median(outcome.elapsed_s for outcome in outcomes):.0f} ms a query over HTTP (median)")
     return "\n".join(parts)
 

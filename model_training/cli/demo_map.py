@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.cli.progress import Report
-from model_training.datasets.dataset import CameraSensor, Dataset, QueryFrame
+from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.importing.kitti_object import import_kitti_object
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.plan import QueryPlan, SimulationPlan
@@ -161,16 +161,12 @@ def _recorded_questions(dataset: Dataset, folder: Path) -> Iterator[Question]:
 def _question(
     name: str, frame: QueryFrame, folder: Path, *, street: tuple[str, str] | None = None, place: int | None = None
 ) -> Question:
-    camera = _camera_file(folder, frame.camera)
+    camera = _camera_file(folder, frame)
     return Question(name, frame.rgb_path, frame.depth_path, camera, frame.T_map_camera, street, place)
 
 
-def _camera_file(folder: Path, camera: CameraSensor) -> Path:
+def _camera_file(folder: Path, frame: QueryFrame) -> Path:
     """The request's parts that a camera decides, as ``streetfix localize --camera`` takes them."""
-    parts = {
-        "camera": {"model": "PINHOLE", **camera.model_dump(include={"width", "height", "fx", "fy", "cx", "cy"})},
-        "depth": camera.depth.model_dump(exclude_none=True),
-    }
-    path = folder / f"{camera.name}.json"
-    path.write_text(json.dumps(parts, indent=1) + "\n")
+    path = folder / f"{frame.camera.name}.json"
+    path.write_text(json.dumps(frame.request(), indent=1) + "\n")
     return path

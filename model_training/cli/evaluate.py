@@ -12,24 +12,37 @@ from rich.table import Table
 
 from model_training.baselines.raw_range import raw_best_views
 from model_training.cli.progress import bars
+from model_training.cli.queries_table import print_queries
+from model_training.cli.stages_table import print_stages
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.evaluate import evaluate, write_trajectory
 from model_training.evaluation.measures import recall_at
 from model_training.evaluation.predict import Predictions
 from model_training.evaluation.saved_run import save_run
+from model_training.evaluation.stages import stages_of
+from model_training.evaluation.why_refused import FEW, causes
 from model_training.reporting.run_page import write_run_page
 from service.errors import DatasetError
+from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 SHOWN = (
-    ("queries", "queries", "{:d}"), ("localized", "answered", "{:.2%}"), ("street_accuracy", "street right", "{:.2%}"),
-    ("mean_distance_error_m", "mean error", "{:.3f} m"), ("median_distance_error_m", "median error", "{:.3f} m"),
-    ("p95_distance_error_m", "95th percentile", "{:.3f} m"), ("rms_distance_error_m", "RMS error", "{:.3f} m"),
-    ("mse_m2", "MSE", "{:.3f} m2"), ("within_0_5_m", "within 0.5 m", "{:.2%}"), ("within_1_m", "within 1 m", "{:.2%}"),
-    ("within_5_m", "within 5 m", "{:.2%}"), ("recall_at_1_5m", "R@1 at 5 m", "{:.2%}"), ("recall_at_5_5m", "R@5 at 5 m", "{:.2%}"),
-    ("recall_at_10_5m", "R@10 at 5 m", "{:.2%}"), ("raw_recall_at_1_5m", "raw range image R@1", "{:.2%}"),
-    ("median_heading_error_deg", "median heading error", "{:.2f} deg"), ("ms_per_query", "time per query", "{:.1f} ms"),
+    ("queries", "queries", "{:d}"), ("localized", "accepted", "{:.2%}"), ("accepted_wrong", "accepted, over 1 m off", "{:.2%}"),
+    ("median_confidence", "median confidence", "{:.3f}"), ("street_accuracy", "accepted, street right", "{:.2%}"),
+    ("within_0_5_m", "accepted, within 0.5 m", "{:.2%}"), ("within_1_m", "accepted, within 1 m", "{:.2%}"),
+    ("within_5_m", "accepted, within 5 m", "{:.2%}"), ("mean_distance_error_m", "accepted, mean error", "{:.3f} m"),
+    ("median_distance_error_m", "accepted, median error", "{:.3f} m"), ("p95_distance_error_m", "accepted, 95th percentile", "{:.3f} m"),
+    ("rms_distance_error_m", "accepted, RMS error", "{:.3f} m"), ("mse_m2", "accepted, MSE", "{:.3f} m2"),
+    ("median_heading_error_deg", "accepted, median heading error", "{:.2f} deg"),
+    ("forced.within_0_5_m", "forced, within 0.5 m", "{:.2%}"), ("forced.within_1_m", "forced, within 1 m", "{:.2%}"),
+    ("forced.within_5_m", "forced, within 5 m", "{:.2%}"), ("forced.median_distance_error_m", "forced, median error", "{:.3f} m"),
+    ("forced.p95_distance_error_m", "forced, 95th percentile", "{:.3f} m"), ("recall_at_1_5m", "R@1 at 5 m", "{:.2%}"),
+    ("recall_at_5_5m", "R@5 at 5 m", "{:.2%}"), ("recall_at_10_5m", "R@10 at 5 m", "{:.2%}"), ("recall_at_1_10m", "R@1 at 10 m", "{:.2%}"),
+    ("raw_recall_at_1_5m", "raw range image R@1", "{:.2%}"), ("ms_per_query", "time per query", "{:.1f} ms"),
 )  # fmt: skip
+_CAPTION = (
+    "accepted: status LOCALIZED, shares of all queries; forced: the best guess of every query, whatever its status"
+)
 
 
 def command(
@@ -52,6 +65,12 @@ def command(
         Path | None,
         typer.Option("--report", help="folder for a page to read (index.html), the answers and the run's settings"),
     ] = None,
+    most: Annotated[
+        int, typer.Option("--list", help="queries that are listed one by one, the worst first; 0: none", min=0)
+    ] = 10,
+    stages: Annotated[
+        bool, typer.Option("--stages", help="say for each query which stage of the answer loses it; asks twice")
+    ] = False,
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="register each query on the cloud, or measure retrieval alone")
     ] = True,
@@ -79,6 +98,11 @@ def command(
         if raw_baseline:
             places = raw_best_views(opened, data, list(result.predictions), report=report)
             _add_raw(figures, opened, places, result.predictions)
+        traced = (
+            {name: stages_of(Localizer.open(opened), data, name, report=report) for name in names} if stages else {}
+        )
+    if stages:
+        figures["stages"] = {name: [each.as_json() for each in found] for name, found in traced.items()}
     if trajectory is not None:
         write_trajectory(trajectory, next(iter(result.predictions.values())))
     if predictions is not None:
@@ -92,6 +116,11 @@ def command(
         part.write_text(json.dumps(figures, indent=1) + "\n")
         part.rename(json_file)
     Console().print(_table(figures))
+    _say_why(opened, data, result.predictions)
+    for name, answers in result.predictions.items():
+        print_queries(name, answers, Console(), most=most)
+    for name, found in traced.items():
+        print_stages(name, found, Console())
     if report_folder is not None:
         Console(soft_wrap=True).print(f"report: {page}")
 
@@ -120,16 +149,43 @@ def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[st
     return {"raw_recall_at_1_5m": recalls[best], "raw": {"best_setting": best, "recall_at_1_5m": recalls}}
 
 
+def _say_why(bundle: MapBundle, data: Dataset, predictions: dict[str, Predictions]) -> None:
+    """Where nearly nothing was accepted, say what to check, the likeliest cause first."""
+    console = Console(soft_wrap=True, highlight=False)
+    for name, answers in predictions.items():
+        if bundle.calibration is None or answers.localized.mean() >= FEW:
+            continue
+        console.print(
+            f"{name}: {answers.localized.mean():.0%} of the answers are accepted. What to check, the likeliest first:"
+        )
+        found = causes(Localizer.open(bundle), list(data.queries(name)), answers)
+        for number, cause in enumerate(found, 1):
+            console.print(f"  {number}. {cause}")
+        if not found:
+            console.print(
+                "  all evidence lies in the range that calibration saw: these places are probably not in the map"
+            )
+
+
 def _table(figures: dict[str, Any]) -> Table:
-    table = Table(title=f"{figures['dataset']} on map {figures['map']['name']} {figures['map']['version']}")
+    table = Table(
+        caption=_CAPTION, title=f"{figures['dataset']} on map {figures['map']['name']} {figures['map']['version']}"
+    )
     columns = [("all", figures), *figures["sets"].items()] if len(figures["sets"]) > 1 else [*figures["sets"].items()]
     table.add_column("")
     for name, values in columns:
         table.add_column(f"{name}\n{values['split'].replace('_', ' ')}", justify="right")
     for key, label, form in SHOWN:
-        cells = [form.format(v[key]) if v.get(key) is not None else "-" for _, v in columns]
+        cells = [_cell(values, key, form) for _, values in columns]
         if any(cell != "-" for cell in cells):
             table.add_row(label, *cells)
     if "raw" in figures:
         table.add_row("raw range image's setting", *(v["raw"]["best_setting"] for _, v in columns))
     return table
+
+
+def _cell(values: dict[str, Any], key: str, form: str) -> str:
+    for part in key.split(".")[:-1]:
+        values = values[part]
+    value = values.get(key.split(".")[-1])
+    return "-" if value is None else form.format(value)

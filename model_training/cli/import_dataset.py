@@ -72,8 +72,17 @@ def command(
         bool | None, typer.Option(help="a bag's pictures are rectified already [default: if the topic's name says so]")
     ] = None,
     deskew: Annotated[
-        bool, typer.Option(help="take the vehicle's motion out of scans that tell their points' times")
+        bool,
+        typer.Option(
+            help="take the vehicle's motion out of scans that tell their points' times; of kitti-raw the azimuth tells them"
+        ),
     ] = True,
+    vertical_correction: Annotated[
+        bool | None,
+        typer.Option(
+            help="turn KITTI's points up by 0.205 degrees, which its HDL-64 errs by [default: of KITTI's layouts]"
+        ),
+    ] = None,
 ) -> None:
     """Turn somebody else's recording into a dataset folder.
 
@@ -101,6 +110,7 @@ def command(
         depth=cast(DepthFrom, depth or "recorded"), topics=_topics(topic or []), rectified=rectified,
         camera=None if camera is None else read_camera(camera),
         extrinsics=None if extrinsics is None else read_extrinsics(extrinsics), poses=poses, pictures=pictures,
+        vertical_correction=vertical_correction,
     )  # fmt: skip
     if odometry and poses is not None:
         raise DatasetError("poses: --odometry finds them; give one of the two", field="poses")
@@ -175,6 +185,11 @@ def _single_frames(source: Path, out: Path, depth: str) -> None:
 def _tell(console: Console, out: Path, summary: TakeSummary) -> None:
     held = f" ({summary.held_out} held out)" if summary.held_out else ""
     console.print(f"{out}: {summary.scans} scans{held}, {summary.pictures} picture pairs", soft_wrap=True)
+    told = f"the vehicle's motion was taken out of {summary.deskewed} of {summary.scans + summary.held_out} scans"
+    console.print(
+        told + ("" if summary.deskewed else ", since their points have no times or --no-deskew was given"),
+        soft_wrap=True,
+    )
     if summary.points_without_numbers:
         console.print(f"left out: {summary.points_without_numbers} points that are no numbers")
     for line in summary.dropped:

@@ -17,6 +17,9 @@ from model_training.loadtest.payloads import Payload, payloads
 from model_training.loadtest.processes import Usage, usage
 from model_training.loadtest.summary import Summary, summarise
 from model_training.loadtest.targets import Grpc, Rest, Target
+from service.cli.tls_options import Ca, Cert, Key
+from service.client import Client, GrpcClient
+from service.client.tls import ClientTls
 from service.errors import RequestError, UnreachableError
 
 LATE_MS = 10.0  # a generator that is later than that to send, at p99, is told of
@@ -43,8 +46,15 @@ def command(
     cheap_depth: Annotated[
         bool, typer.Option("--cheap-depth", help="send depth as raw16+lz4, the cheapest to decode")
     ] = False,
-    key: Annotated[
+    api_key: Annotated[
         str | None, typer.Option("--api-key", envvar="STREETFIX_API_KEY", help="where the service asks for one")
+    ] = None,
+    ca: Ca = None,
+    cert: Cert = None,
+    key: Key = None,
+    tls: Annotated[
+        bool | None,
+        typer.Option("--tls/--no-tls", help="over gRPC [default: if --ca or --cert is given]", show_default=False),
     ] = None,
     pid: Annotated[
         int | None, typer.Option(help="process of a service on this machine: its processor time is counted")
@@ -69,10 +79,11 @@ def command(
     ]
     if pid is not None:
         usage(pid)  # said before the load, not after it
+    spoken = _tls_of(url, grpc, ca=ca, cert=cert, key=key, tls=tls, api_key=api_key)
     console = Console()
     found = []
     for run in runs:
-        target: Target = Rest(url, key=key) if grpc is None else Grpc(grpc, key=key)
+        target: Target = Rest(url, key=api_key, tls=spoken) if grpc is None else Grpc(grpc, key=api_key, tls=spoken)
         found.append(asyncio.run(_run(target, sent, run, pid, console)))
     console.print(table_of(found))
     if json_file is not None:
@@ -83,6 +94,31 @@ def command(
         draw(found, plot)
     if not any(each.answers for each in found):
         raise UnreachableError(f"{grpc or url}: not one request was answered: {found[-1].errors}")
+
+
+def _tls_of(
+    url: str, address: str | None, *, ca: Path | None, cert: Path | None, key: Path | None, tls: bool | None, api_key: str | None
+) -> ClientTls | None:  # fmt: skip
+    """What to speak; None: no TLS. A handshake that fails is told before the load, not as so many failed requests.
+
+    Raises:
+        RequestError: TLS is described for an address without it.
+        HandshakeError: it fails.
+    """
+    if address is None and tls is not None:
+        raise RequestError("--tls: it is for --grpc; over REST the address says it, as https://HOST:PORT", field="tls")
+    spoken = ClientTls.of(ca, cert, key)
+    if address is None:
+        with Client(url, api_key=api_key, ca=ca, cert=cert, key=key) as client:
+            if not url.startswith("https:"):
+                return None
+            client.maps()
+    else:
+        with GrpcClient(address, api_key=api_key, ca=ca, cert=cert, key=key, tls=tls) as messages:
+            if not (spoken.is_wanted if tls is None else tls):
+                return None
+            messages.maps()
+    return spoken
 
 
 async def _run(target: Target, sent: list[Payload], load: Load, pid: int | None, console: Console) -> Summary:

@@ -1,7 +1,11 @@
-"""Progress bars of long commands, on stderr."""
+"""Progress of long commands, on stderr: bars on a terminal, else a line a minute and a line a stage."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Protocol
 
 from rich.console import Console
@@ -14,6 +18,9 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+#: Between two lines of a stage where there is no terminal.
+EVERY_S = 60.0
 
 
 class Report(Protocol):
@@ -40,9 +47,136 @@ class _Bars:
         self._progress.update(self._tasks[stage], description=text)
 
 
+@dataclass(slots=True)
+class _Stage:
+    """Where a stage began (``first``: what was done by then, of a build that goes on), and where it is."""
+
+    began_s: float
+    first: int
+    done: int
+    total: int
+    text: str = ""
+    told_end: bool = False
+
+
+class Lines:
+    """Tells progress in lines: when a stage begins, once a minute, and when it has ended.
+
+    Args:
+        write: is given each line, without its end.
+        clock: seconds, as ``time.monotonic``.
+        every_s: between two lines of a running stage.
+    """
+
+    def __init__(
+        self, write: Callable[[str], None], *, clock: Callable[[], float] = time.monotonic, every_s: float = EVERY_S
+    ) -> None:
+        self._write, self._clock, self._every_s = write, clock, every_s
+        self._stages: dict[str, _Stage] = {}
+        self._current: str | None = None
+        self._told_s = clock()
+        self._lock = threading.Lock()
+
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        """Take note; write what is due."""
+        with self._lock:
+            if stage != self._current:
+                self._end_current()
+                self._current = stage
+            known = self._stages.get(stage)
+            if known is None or done < known.done:  # less than before: the same work on something else
+                self._stages[stage] = _Stage(self._clock(), done, done, total)
+                self._tell(f"{stage}: {_share(done, total)}, begins")
+            else:
+                known.done, known.total = done, total
+            self._tell_if_due()
+
+    def describe(self, stage: str, text: str, /) -> None:
+        """Keep a text that is told with the stage's next lines."""
+        with self._lock:
+            self._stages[stage].text = text
+
+    def tick(self) -> None:
+        """Write a line if the last one is long ago: stages that report seldom must not look dead."""
+        with self._lock:
+            self._tell_if_due()
+
+    def close(self) -> None:
+        """Tell the end of the last stage."""
+        with self._lock:
+            self._end_current()
+
+    def _tell_if_due(self) -> None:
+        if self._current is not None and self._clock() - self._told_s >= self._every_s:
+            self._tell(self._line(self._current, self._stages[self._current]))
+
+    def _end_current(self) -> None:
+        stage = self._stages.get(self._current or "")
+        if stage is not None and stage.done >= stage.total and not stage.told_end:
+            stage.told_end = True
+            self._tell(f"{self._current}: {stage.done:,} done in {_span(self._clock() - stage.began_s)}")
+
+    def _tell(self, line: str) -> None:
+        self._told_s = self._clock()
+        self._write(line)
+
+    def _line(self, name: str, stage: _Stage) -> str:
+        elapsed_s, parts = self._clock() - stage.began_s, [f"{name}: {_share(stage.done, stage.total)}"]
+        parts += [stage.text] if stage.text else []
+        rate = (stage.done - stage.first) / elapsed_s if elapsed_s > 0 else 0.0
+        if rate > 0:
+            parts.append(f"{rate:.3g} a second" if rate >= 1 else f"{60 * rate:.3g} a minute")
+        parts.append(f"{_span(elapsed_s)} so far")
+        if rate > 0 and stage.done < stage.total:
+            parts.append(f"about {_span((stage.total - stage.done) / rate)} left")
+        return ", ".join(parts)
+
+
+def _share(done: int, total: int) -> str:
+    return f"{done:,} of {total:,} ({100 * done / total:.0f} %)" if done < total else f"{done:,}"
+
+
+def _span(seconds: float) -> str:
+    """As people say it: 40 s, 12 min, 2 h 10 min."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
+
+
+@contextmanager
+def lines(write: Callable[[str], None], *, every_s: float = EVERY_S) -> Iterator[Lines]:
+    """``Lines`` that also tell when nothing is reported for long."""
+    told, ended = Lines(write, every_s=every_s), threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(every_s):
+            told.tick()
+
+    watcher = threading.Thread(target=watch, name="progress", daemon=True)
+    watcher.start()
+    try:
+        yield told
+        told.close()
+    finally:
+        ended.set()
+        watcher.join()
+
+
+def _to_stderr(line: str) -> None:
+    with suppress(BrokenPipeError):  # nobody reads it any more; the work goes on
+        sys.stderr.write(f"{line}\n")
+        sys.stderr.flush()
+
+
 @contextmanager
 def bars() -> Iterator[Report]:
-    """A bar for each stage that is reported."""
+    """A bar for each stage that is reported; lines where stderr is no terminal that can draw bars."""
+    console = Console(stderr=True)
+    if not console.is_terminal or console.is_dumb_terminal:
+        with lines(_to_stderr) as told:
+            yield told
+        return
     columns = (
         TextColumn("{task.description:24}"),
         BarColumn(),
@@ -50,5 +184,5 @@ def bars() -> Iterator[Report]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(*columns, console=console) as progress:
         yield _Bars(progress)

@@ -5,6 +5,7 @@ Frames are read one at a time; nothing here loads a whole drive.
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,10 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from service.errors import DatasetError
+from model_training.datasets.files import ROW_BYTES, read_bytes, read_rows, reading, size_of
+from service.errors import DatasetError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_from
 from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
+from service.imaging.view_grid import ViewGrid
+from service.localization.decoding import DepthFormat, decoded_query
+from service.localization.query import Query
 
 FORMAT = 1
 Transforms = NDArray[np.float64]  # (n, 4, 4)
@@ -96,16 +101,44 @@ class QueryFrame:
     stamp_s: float | None
 
     def rgb(self) -> NDArray[np.uint8]:
-        """The colour picture (H, W, 3)."""
-        return decode_rgb(self.rgb_path.read_bytes(), limits=ImageLimits())
+        """The colour picture (H, W, 3).
+
+        Raises:
+            DatasetError: the file vanished or is damaged.
+        """
+        data = read_bytes(self.rgb_path)
+        with _decoding(self.rgb_path):
+            return decode_rgb(data, limits=ImageLimits())
 
     def depth_m(self) -> NDArray[np.float32]:
-        """Z (H, W), metres, 0 where nothing was measured."""
+        """Z (H, W), metres, 0 where nothing was measured.
+
+        Raises:
+            DatasetError: the file vanished or is damaged.
+        """
+        spec, data = self.camera.depth, read_bytes(self.depth_path)
+        with _decoding(self.depth_path):
+            return decode_depth(
+                data, encoding=None, scale_m=spec.scale_m, kind=spec.kind, camera=self.camera.pinhole(),
+                baseline_m=spec.baseline_m, max_range_m=spec.max_range_m, limits=ImageLimits(),
+            )  # fmt: skip
+
+    def query(self, grid: ViewGrid) -> Query:
+        """The query that a service makes of these pictures for a map with this view grid, all options at their defaults."""
         spec = self.camera.depth
-        return decode_depth(
-            self.depth_path.read_bytes(), encoding=None, scale_m=spec.scale_m, kind=spec.kind, camera=self.camera.pinhole(),
-            baseline_m=spec.baseline_m, max_range_m=spec.max_range_m, limits=ImageLimits(),
-        )  # fmt: skip
+        how = DepthFormat(
+            kind=spec.kind, scale_m=spec.scale_m, baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
+        )
+        return decoded_query(
+            self.rgb_path.read_bytes(), self.depth_path.read_bytes(), self.camera.pinhole(), how, grid=grid
+        )
+
+    def request(self) -> dict[str, Any]:
+        """The parts of a request to the service that follow from the camera, as ``streetfix localize --camera`` takes them."""
+        return {
+            "camera": self.camera.model_dump(include={"width", "height", "fx", "fy", "cx", "cy"}),
+            "depth": self.camera.depth.model_dump(exclude_none=True),
+        }
 
 
 class Dataset:
@@ -127,7 +160,7 @@ class Dataset:
                 field="dataset.json",
             )
         try:
-            self.description = DatasetDescription.model_validate_json(path.read_bytes())
+            self.description = DatasetDescription.model_validate_json(read_bytes(path))
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
@@ -148,8 +181,8 @@ class Dataset:
         if not path.exists():
             return None
         try:
-            loaded: dict[str, Any] = json.loads(path.read_text())
-        except json.JSONDecodeError as error:
+            loaded: dict[str, Any] = json.loads(read_bytes(path))
+        except (ValueError, RecursionError) as error:
             raise DatasetError(f"{path}: not JSON: {error}", field="streets.geojson") from error
         return loaded
 
@@ -166,12 +199,12 @@ class Dataset:
         path = scan_path(self.folder, number)
         if not path.is_file():
             raise DatasetError(f"{path} is missing, but survey/poses.txt has a line for it", field=str(path.name))
-        size = path.stat().st_size
-        if size == 0 or size % 16:
+        size = size_of(path)
+        if size == 0 or size % ROW_BYTES:
             raise DatasetError(
                 f"{path}: {size} bytes are no rows of four float32; the file is truncated", field=str(path.name)
             )
-        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        points = read_rows(path, size)
         finite: NDArray[np.float32] = points[np.isfinite(points[:, :3]).all(axis=1)]
         finite[:, 3] = np.maximum(np.nan_to_num(finite[:, 3], posinf=0.0), 0.0)
         return finite
@@ -179,7 +212,8 @@ class Dataset:
     def query_sets(self, *, with_truth: bool = False) -> list[str]:
         """Names of the query sets, sorted."""
         root = self.folder / "queries"
-        names = sorted(p.name for p in root.iterdir() if (p / "rgb").is_dir()) if root.is_dir() else []
+        with reading(root):
+            names = sorted(p.name for p in root.iterdir() if (p / "rgb").is_dir()) if root.is_dir() else []
         return [n for n in names if not with_truth or (root / n / "poses.txt").exists()]
 
     def queries(self, name: str) -> Iterator[QueryFrame]:
@@ -190,7 +224,8 @@ class Dataset:
             raise DatasetError(f"{self.folder} has no query set {name!r}; it has: {known}", field="queries")
         poses_path = folder / "poses.txt"
         stamps, truth = read_tum(poses_path) if poses_path.exists() else (None, None)
-        pictures = sorted(p for p in (folder / "rgb").iterdir() if p.suffix in PICTURES and p.stem.isdigit())
+        with reading(folder / "rgb"):
+            pictures = sorted(p for p in (folder / "rgb").iterdir() if p.suffix in PICTURES and p.stem.isdigit())
         names = _camera_names(folder, len(pictures))
         cameras = {camera.name: camera for camera in self.description.sensors.cameras}
         if not cameras:
@@ -214,12 +249,21 @@ class Dataset:
             )  # fmt: skip
 
 
+@contextmanager
+def _decoding(path: Path) -> Iterator[None]:
+    """What is wrong with a picture, said of its file; a request's field would say nothing here."""
+    try:
+        yield
+    except StreetfixError as error:
+        raise DatasetError(f"{path}: {error.message}", field=path.name) from error
+
+
 def _camera_names(folder: Path, count: int) -> list[str] | None:
     """Names in ``cameras.txt`` (a line a query), or None where all frames are of the first camera."""
     path = folder / "cameras.txt"
     if not path.exists():
         return None
-    names = path.read_text().split()
+    names = read_bytes(path).decode(errors="replace").split()
     if len(names) != count:
         raise DatasetError(f"{path} has {len(names)} lines for {count} pictures", field="cameras.txt")
     return names
@@ -262,7 +306,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.float64], Transforms]:
     if not path.is_file():
         raise DatasetError(f"{path} is missing", field=path.name)
     stamps, transforms = [], []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+    for number, line in enumerate(read_bytes(path).decode(errors="replace").splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
         try:

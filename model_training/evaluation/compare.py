@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.evaluation.failures import RIGHT_M, position_errors
-from model_training.evaluation.measures import recall_at
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.measures import RIGHT_M, recall_at
 from model_training.evaluation.paired import PairedErrors, PairedShares, paired_errors, paired_shares
 from model_training.evaluation.predict import RANKED, Predictions, joined
 from model_training.evaluation.saved_run import SavedRun
@@ -44,17 +44,27 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """One line that says no more than the queries do."""
-        right = self.shares["within_1_m"]
-        low, high = (f"{100 * side:+.1f}" for side in right.interval)
-        told = (
-            f"{right.only_second} of {right.count} queries are won and {right.only_first} lost: {100 * right.difference:+.1f} points "
-            f"within 1 m (95 % interval {low} to {high}; McNemar's p {p_text(right.p)})"
-        )
-        if right.only_first + right.only_second == 0:
-            return f"No difference: A and B are right about the same queries ({right.count}, {right.second:.1%} within 1 m)."
-        if right.p < _P:
-            return f"B is {'better' if right.difference > 0 else 'worse'} than A by more than chance explains: {told}."
+        """What the queries say, and no more.
+
+        A run is better only if it has more right answers without more wrong ones that are accepted, or fewer wrong ones that are
+        accepted without fewer right ones; at least one of the two by more than chance explains.
+        """
+        right, wrong = self.shares["within_1_m"], self.shares["accepted_but_wrong"]
+        told = f"{_told(right, 'accepted and within 1 m')}; {_told(wrong, 'accepted and wrong')}"
+        won, lost = _surely_more(right), _surely_less(right)
+        safer, riskier = _surely_less(wrong), _surely_more(wrong)
+        if (won and wrong.difference <= 0) or (safer and not lost):
+            return f"B is better than A by more than chance explains: {told}."
+        if (lost and wrong.difference >= 0) or (riskier and not won):
+            return f"B is worse than A by more than chance explains: {told}."
+        if won or lost:
+            more, fewer = ("B", "A") if won else ("A", "B")
+            return f"Neither is better: {more} has more right answers, {fewer} accepts fewer wrong ones: {told}."
+        if right.only_first + right.only_second + wrong.only_first + wrong.only_second == 0:
+            return (
+                f"No difference: A and B are right about the same queries ({right.count}, {right.second:.1%} within 1 m), "
+                "and accept the same wrong ones."
+            )
         return f"No difference can be told from chance: {told}."
 
     def as_json(self) -> dict[str, Any]:
@@ -66,6 +76,22 @@ class Comparison:
             "errors": None if self.errors is None else asdict(self.errors),
             "gained": self.gained, "lost": self.lost,
         }  # fmt: skip
+
+
+def _surely_more(each: PairedShares) -> bool:
+    return each.p < _P and each.difference > 0
+
+
+def _surely_less(each: PairedShares) -> bool:
+    return each.p < _P and each.difference < 0
+
+
+def _told(each: PairedShares, what: str) -> str:
+    low, high = (f"{100 * side:+.1f}" for side in each.interval)
+    return (
+        f"{what}: {each.first:.1%} of A, {each.second:.1%} of B, {each.only_second} of {each.count} queries by B alone, "
+        f"{each.only_first} by A alone, {100 * each.difference:+.1f} points (95 % interval {low} to {high}; McNemar's p {p_text(each.p)})"
+    )
 
 
 def p_text(p: float) -> str:
@@ -100,6 +126,8 @@ def _flags(a: Predictions, b: Predictions) -> Iterator[tuple[str, NDArray[np.boo
     true_xy = a.T_true[:, :2, 3]
     for name, reach in (("within_0_5_m", 0.5), ("within_1_m", RIGHT_M), ("within_5_m", 5.0)):
         yield name, a.localized & (position_errors(a) <= reach), b.localized & (position_errors(b) <= reach)
+    for name, reach in (("forced_within_0_5_m", 0.5), ("forced_within_1_m", RIGHT_M)):
+        yield name, position_errors(a) <= reach, position_errors(b) <= reach
     for k in (1, 5, RANKED):
         yield f"recall_at_{k}_5m", recall_at(a.ranked_xy, true_xy, k), recall_at(b.ranked_xy, true_xy, k)
     yield "localized", a.localized, b.localized

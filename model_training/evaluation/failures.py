@@ -6,11 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.evaluation.error_measures import distance_errors
-from model_training.evaluation.measures import RIGHT_PLACE_M, recall_at
+from model_training.evaluation.measures import RIGHT_M, RIGHT_PLACE_M, recall_at
 from model_training.evaluation.predict import RANKED, Predictions
-
-#: An answer within it is right (what ``confidence`` is the probability of); metres on the ground.
-RIGHT_M = 1.0
 
 
 class Stage(StrEnum):

@@ -21,12 +21,16 @@ from model_training.evaluation.error_measures import (
 from model_training.evaluation.predict import Predictions, headings_of
 
 RIGHT_PLACE_M = 5.0
+#: An answer within it is right (what ``confidence`` is the probability of); metres on the ground.
+RIGHT_M = 1.0
 
 
-def recall_at(ranked_xy: NDArray[np.float64], true_xy: NDArray[np.float64], k: int) -> NDArray[np.bool_]:
-    """Whether one of the first k distinct places lies within 5 m of the truth, (n)."""
+def recall_at(
+    ranked_xy: NDArray[np.float64], true_xy: NDArray[np.float64], k: int, *, within_m: float = RIGHT_PLACE_M
+) -> NDArray[np.bool_]:
+    """Whether one of the first k distinct places lies within 5 m (or another distance) of the truth, (n)."""
     distance = np.linalg.norm(ranked_xy[:, :k] - true_xy[:, None], axis=2)
-    return np.asarray((np.nan_to_num(distance, nan=np.inf) <= RIGHT_PLACE_M).any(axis=1))
+    return np.asarray((np.nan_to_num(distance, nan=np.inf) <= within_m).any(axis=1))
 
 
 def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]:
@@ -45,6 +49,7 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
         "recall_at_1_5m": recall_at(p.ranked_xy, true_xy, 1),
         "recall_at_5_5m": recall_at(p.ranked_xy, true_xy, 5),
         "recall_at_10_5m": recall_at(p.ranked_xy, true_xy, 10),
+        "recall_at_1_10m": recall_at(p.ranked_xy, true_xy, 1, within_m=10.0),
         "localized": answered,
     }
     in_street = p.street_true >= 0
@@ -55,7 +60,12 @@ def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]
     result.setdefault("street_accuracy", None)
     result["error_rate"] = error_rate(shares["street_accuracy"]) if in_street.any() else None
     result |= _distances(distance[answered])
+    result["accepted_wrong"] = float(np.mean(answered & (distance > RIGHT_M)))
+    forced = {"within_0_5_m": distance <= 0.5, "within_1_m": distance <= RIGHT_M, "within_5_m": distance <= 5.0}
     result["forced"] = _distances(distance[has_pose]) | {"answered": float(np.mean(has_pose))}
+    result["forced"] |= {name: float(np.mean(flags)) for name, flags in forced.items()}
+    known = np.isfinite(p.confidence)
+    result["median_confidence"] = float(np.median(p.confidence[known])) if known.any() else None
     headings = (
         heading_errors_deg(headings_of(p.T_answer[answered]), headings_of(p.T_true[answered]))
         if answered.any()

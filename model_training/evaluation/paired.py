@@ -5,6 +5,7 @@ from math import comb, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import wilcoxon
 
 from model_training.evaluation.error_measures import wilson_interval
 
@@ -76,7 +77,10 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class PairedErrors:
-    """Errors of queries that both runs answered, metres: medians, mean difference (B less A) and its bootstrap interval."""
+    """Errors of queries that both runs answered, metres: medians, mean difference (B less A) and its bootstrap interval.
+
+    ``p`` is that of Wilcoxon's signed-rank test, two-sided, of no difference; 1 where no query differs.
+    """
 
     first_median_m: float
     second_median_m: float
@@ -84,6 +88,7 @@ class PairedErrors:
     mean_interval_m: tuple[float, float]
     median_difference_m: float
     median_interval_m: tuple[float, float]
+    p: float
     count: int
 
 
@@ -104,8 +109,14 @@ def paired_errors(first_m: NDArray[np.float64], second_m: NDArray[np.float64]) -
     return PairedErrors(
         float(np.median(first_m[both])), float(np.median(second_m[both])),
         float(difference.mean()), _percentiles(np.concatenate(means)),
-        float(np.median(difference)), _percentiles(np.concatenate(medians)), int(both.sum()),
+        float(np.median(difference)), _percentiles(np.concatenate(medians)), _signed_rank(difference), int(both.sum()),
     )  # fmt: skip
+
+
+def _signed_rank(difference: NDArray[np.float64]) -> float:
+    if not difference.any():
+        return 1.0
+    return float(wilcoxon(difference).pvalue)
 
 
 def _percentiles(values: NDArray[np.float64]) -> tuple[float, float]:

@@ -81,7 +81,7 @@ class Predictions:
     @staticmethod
     def load(path: Path) -> "Predictions":
         """Read what ``save`` wrote."""
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return Predictions(
                 **{
                     name: arrays[name]
@@ -149,7 +149,9 @@ def _ask(
     localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool, prior_of: PriorOf | None
 ) -> tuple[Answer | None, float]:
     began = time.perf_counter()
-    queries, poses = as_query(frames, np.random.default_rng([77, number]), ranked=RANKED, refine=refine)
+    queries, poses = as_query(
+        frames, np.random.default_rng([77, number]), grid=localizer.bundle.grid, ranked=RANKED, refine=refine
+    )
     T_map_camera = frames[-1].T_map_camera
     if prior_of is not None and T_map_camera is not None:
         prior = prior_of(T_map_camera, np.random.default_rng([78, number]))
@@ -173,7 +175,7 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
     for k, (answer, _) in enumerate(answers):
         if answer is None:
             continue
-        T_answer[k] = answer.T_map_camera
+        T_answer[k] = answer.T_map_camera_guess
         status[k] = answer.status
         if answer.confidence is not None:
             confidence[k] = answer.confidence

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Literal
+from zipfile import BadZipFile
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 
@@ -13,6 +14,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.evaluation.evaluate import Evaluation
 from model_training.evaluation.predict import Predictions
 from service.errors import DatasetError
+from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.maps.reader import MapBundle
 
 FILE, ANSWERS = "run.json", "answers"
@@ -93,7 +95,7 @@ def _answers(folder: Path, each: RunSet) -> Predictions:
     path = folder / ANSWERS / f"{each.name}.npz"
     try:
         found = Predictions.load(path)
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, BadZipFile, *NPY_HEADER_ERRORS) as error:
         raise DatasetError(f"{path}: no answers of ours ({error}); make the report anew", field=each.name) from error
     if len(found.T_true) != each.queries:
         raise DatasetError(

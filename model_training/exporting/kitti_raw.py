@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from model_training.datasets.dataset import CameraSensor, Dataset, write_tum
+from model_training.datasets.layouts import SCANS_AT_REST
 from model_training.datasets.png import write_png
 from model_training.datasets.whole_folder import whole_or_not_at_all
 from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, the_camera
@@ -50,6 +51,7 @@ def write_kitti_raw(dataset: Dataset, queries: str | None, out: Path, *, report:
         times = "".join(f"{_time(stamp_s)}\n" for stamp_s in stamps)
         for folder in ("velodyne_points", "image_02"):
             (drive / folder / "timestamps.txt").write_text(times)
+        (drive / SCANS_AT_REST).write_text("Each scan was measured at one moment; nothing is to be corrected.\n")
         _write_calibration(part / DAY, T_vehicle_scan, camera)
     return len(stamps)
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from model_training.datasets.dataset import CameraSensor, Dataset
+from model_training.datasets.files import read_bytes
 from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, the_camera
 from service.errors import DatasetError
 from service.geometry.rigid import Transform, quaternion_xyzw_from
@@ -135,7 +136,7 @@ class _Messages:
         """Whole millimetres as they are; other steps as metres, since 16UC1 has none but millimetres (REP-118)."""
         assert moment.frame is not None  # noqa: S101
         spec = moment.frame.camera.depth
-        values = read_depth_values(moment.frame.depth_path.read_bytes(), encoding=None, limits=ImageLimits())
+        values = read_depth_values(read_bytes(moment.frame.depth_path), encoding=None, limits=ImageLimits())
         if values.dtype == np.uint16 and spec.scale_m == 0.001 and spec.kind == "z":
             return self._image(moment.stamp_s, values.astype(np.uint16, copy=False), "16UC1")
         return self._image(moment.stamp_s, moment.frame.depth_m(), "32FC1")

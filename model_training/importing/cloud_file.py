@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import NDArray
 
+from model_training.datasets.files import size_of, unreadable
 from model_training.importing.scan_file import read_scan
 
 Points = Float32[NDArray[np.float32], "N 4"]
@@ -24,15 +25,22 @@ def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
     Args:
         path: its suffix says the format.
         max_points: more is refused.
+
+    Raises:
+        DatasetError: the file vanished, or cannot be read.
     """
     if path.suffix.lower() == ".bin":
         return read_scan(path, max_points=max_points)
-    if path.stat().st_size > MAX_BYTES:
+    if size_of(path) > MAX_BYTES:
         return f"more than {MAX_BYTES >> 20} MiB"
     try:
         columns = _READERS[path.suffix.lower()](path, max_points)
     except ModuleNotFoundError:
         raise
+    except OSError as error:
+        if error.errno is not None:  # of the system; a package's own complaint of the content has no number
+            raise unreadable(path, error) from error
+        return f"it cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
     except Exception as error:  # three packages, each with errors of its own, and whatever damage makes NumPy raise
         return f"it cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
     if isinstance(columns, str):

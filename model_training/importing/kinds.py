@@ -7,6 +7,7 @@ from typing import Literal
 
 from model_training.importing.extrinsics import Extrinsics
 from model_training.importing.recording import Recording
+from model_training.importing.spinning import KITTI_VERTICAL_DEG
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
@@ -25,6 +26,7 @@ class OpenSettings:
         rectified: whether a bag's pictures are rectified already; None believes the topic's name.
         poses: TUM file of the poses, which scans in files of their own have their times from.
         pictures: whether they will be asked for.
+        vertical_correction: turn the points of KITTI's HDL-64 up by the error of its angles; None does so where there is one.
     """
 
     depth: DepthFrom = "recorded"
@@ -34,6 +36,12 @@ class OpenSettings:
     rectified: bool | None = None
     poses: Path | None = None
     pictures: bool = True
+    vertical_correction: bool | None = None
+
+    @property
+    def kitti_vertical_deg(self) -> float:
+        """How much KITTI's points are turned up."""
+        return 0.0 if self.vertical_correction is False else KITTI_VERTICAL_DEG
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +54,13 @@ class Kind:
 
 
 #: Settings that concern some formats only, and what the command line calls them.
-_OPTIONS = {"topics": "topic", "extrinsics": "extrinsics", "camera": "camera", "rectified": "rectified"}
+_OPTIONS = {
+    "topics": "topic",
+    "extrinsics": "extrinsics",
+    "camera": "camera",
+    "rectified": "rectified",
+    "vertical_correction": "vertical-correction",
+}
 
 
 def open_recording(kind: str, source: Path, settings: OpenSettings) -> Recording:
@@ -82,13 +96,13 @@ def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
 def _kitti_raw(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.kitti_raw import open_kitti_raw
 
-    return open_kitti_raw(source, depth=_kitti_depth(settings.depth))
+    return open_kitti_raw(source, depth=_kitti_depth(settings.depth), vertical_deg=settings.kitti_vertical_deg)
 
 
 def _kitti_odometry(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.kitti_odometry import open_kitti_odometry
 
-    return open_kitti_odometry(source, depth=_kitti_depth(settings.depth))
+    return open_kitti_odometry(source, depth=_kitti_depth(settings.depth), vertical_deg=settings.kitti_vertical_deg)
 
 
 def _clouds(source: Path, settings: OpenSettings) -> Recording:
@@ -133,8 +147,8 @@ def _kitti_depth(depth: DepthFrom) -> Literal["none", "stored", "sgbm"]:
 
 _KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
 KINDS: dict[str, Kind] = {
-    "kitti-raw": Kind(_kitti_raw, _KITTI),
-    "kitti-odometry": Kind(_kitti_odometry, _KITTI),
+    "kitti-raw": Kind(_kitti_raw, _KITTI, frozenset({"vertical_correction"})),
+    "kitti-odometry": Kind(_kitti_odometry, _KITTI, frozenset({"vertical_correction"})),
     "rosbag": Kind(_rosbag, ("recorded", "lidar"), frozenset({"topics", "extrinsics", "camera", "rectified"})),
     "carla": Kind(_carla, ("recorded", "lidar")),
     "clouds": Kind(_clouds, ("recorded",)),

@@ -31,6 +31,11 @@ class KittiCalibration:
     focal_baseline_px_m: float | None
     T_camera_lidar: Transform
 
+    @property
+    def baseline_m(self) -> float | None:
+        """Distance of cameras 2 and 3, metres; None where the right one is not told."""
+        return None if self.focal_baseline_px_m is None else self.focal_baseline_px_m / self.fx
+
 
 def read_calibration(path: Path) -> KittiCalibration:
     """Read a frame's calibration of the object layout: ``calib/NNNNNN.txt`` with P2, P3, R0_rect and Tr_velo_to_cam.

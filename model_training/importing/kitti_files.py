@@ -1,12 +1,12 @@
 """The files of a frame in KITTI's object layout, read with every doubt."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8, UInt16
 from numpy.typing import NDArray
 
+from model_training.datasets.files import ROW_BYTES, read_bytes, read_rows, size_of
 from service.errors import DatasetError, StreetfixError
 from service.imaging.decode import ImageLimits, decode_rgb
 from service.imaging.depth_formats import read_depth_values
@@ -20,13 +20,14 @@ def copy_scan(path: Path, to: Path) -> None:
     Raises:
         DatasetError: it is empty or cut off, or a number in it is not finite.
     """
-    size = path.stat().st_size
-    if size == 0 or size % 16:
+    size = size_of(path)
+    if size == 0 or size % ROW_BYTES:
         raise damaged(path, f"{size} bytes are no rows of four float32")
-    if not np.isfinite(np.fromfile(path, np.float32)).all():
+    points = read_rows(path, size)
+    if not np.isfinite(points).all():
         raise damaged(path, "a coordinate is not finite")
     to.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(path, to)
+    points.tofile(to)
 
 
 def read_rgb(path: Path) -> UInt8[NDArray[np.uint8], "H W 3"]:
@@ -36,7 +37,7 @@ def read_rgb(path: Path) -> UInt8[NDArray[np.uint8], "H W 3"]:
         DatasetError: it is damaged.
     """
     try:
-        return decode_rgb(path.read_bytes(), limits=_LIMITS)
+        return decode_rgb(read_bytes(path), limits=_LIMITS)
     except StreetfixError as error:
         raise damaged(path, str(error)) from error
 
@@ -54,7 +55,7 @@ def read_stored_depth(path: Path, size: tuple[int, ...]) -> UInt16[NDArray[np.ui
     if not path.is_file():
         raise damaged(path, "the stored depth of this frame is missing (--depth sgbm does without)")
     try:
-        values = read_depth_values(path.read_bytes(), encoding=None, limits=_LIMITS)
+        values = read_depth_values(read_bytes(path), encoding=None, limits=_LIMITS)
     except StreetfixError as error:
         raise damaged(path, str(error)) from error
     if values.dtype != np.uint16 or values.shape != size:

@@ -193,7 +193,9 @@ class _Importer:
             fy=calibration.fy,
             cx=calibration.cx,
             cy=calibration.cy,
-            depth=DepthSpec(scale_m=DEPTH_SCALE_M, kind="z"),
+            depth=DepthSpec(
+                scale_m=DEPTH_SCALE_M, kind="z", baseline_m=calibration.baseline_m if self._depth == "sgbm" else None
+            ),
             T_vehicle_sensor=inverse(calibration.T_camera_lidar).tolist(),
         )
         for known in self._cameras:

@@ -4,19 +4,22 @@ from pathlib import Path
 
 import numpy as np
 
+from model_training.datasets.files import read_bytes
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
+from model_training.importing.spinning import KITTI_VERTICAL_DEG
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 from service.geometry.rigid import inverse, transform_from
 
 
-def open_kitti_odometry(source: Path, *, depth: KittiDepth) -> KittiSequence:
-    """Open a sequence.
+def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float = KITTI_VERTICAL_DEG) -> KittiSequence:
+    """Open a sequence. Its scans are compensated for the vehicle's motion already, so points get no times.
 
     Args:
         source: its folder, ``.../sequences/NN``.
         depth: what a picture's depth comes from.
+        vertical_deg: how much every point is turned up.
 
     Raises:
         DatasetError: a scan, calibration or time is missing or broken.
@@ -33,7 +36,7 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth) -> KittiSequence:
     stamps = _times(source / "times.txt", numbers[-1])
     frames = tuple(KittiFrame(f"{n:06d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers)  # fmt: skip
     poses = _poses(source.parent.parent / "poses" / f"{source.name}.txt", stamps, T_lidar_cam0)
-    return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses)
+    return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses, vertical_deg=vertical_deg)
 
 
 def _calibration(path: Path) -> tuple[KittiCalibration, np.ndarray]:
@@ -47,7 +50,7 @@ def _times(path: Path, last: int) -> list[float]:
     if not path.is_file():
         return [n / RATE_HZ for n in range(last + 1)]
     try:
-        times = [float(line) for line in path.read_text(encoding="ascii").split()]
+        times = [float(line) for line in read_bytes(path).decode("ascii").split()]
     except ValueError as error:
         raise DatasetError(f"{path}: not a number a line: {error}", field=path.name) from error
     if len(times) <= last:
@@ -60,7 +63,7 @@ def _poses(path: Path, stamps: list[float], T_lidar_cam0: np.ndarray) -> Traject
     if not path.is_file():
         return None
     poses, times = [], []
-    for number, line in enumerate(path.read_text(encoding="ascii", errors="replace").splitlines()):
+    for number, line in enumerate(read_bytes(path).decode("ascii", errors="replace").splitlines()):
         try:
             values = np.array(line.split(), np.float64).reshape(3, 4)
         except ValueError as error:

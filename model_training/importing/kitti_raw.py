@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from model_training.datasets.files import read_bytes
+from model_training.datasets.layouts import SCANS_AT_REST
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
 from model_training.importing.oxts import read_oxts
+from model_training.importing.spinning import KITTI_VERTICAL_DEG, period_of
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 from service.geometry.rigid import Transform, transform_from
@@ -21,30 +24,45 @@ from service.geometry.rigid import Transform, transform_from
 _PICTURES = (".png", ".jpg")
 
 
-def open_kitti_raw(source: Path, *, depth: KittiDepth) -> KittiSequence:
-    """Open a drive.
+def open_kitti_raw(source: Path, *, depth: KittiDepth, vertical_deg: float = KITTI_VERTICAL_DEG) -> KittiSequence:
+    """Open a drive. A scan's stamp is the moment when the laser faces ahead, and its points' times follow from their azimuths.
+
+    A drive that ``streetfix convert`` wrote holds scans of one moment each; the file ``SCANS_AT_REST`` in it says so.
 
     Args:
         source: the drive's folder, or the day's with a single drive in it.
         depth: what a picture's depth comes from.
+        vertical_deg: how much every point is turned up.
 
     Raises:
         DatasetError: there is no drive, no scan, or no calibration.
     """
     drive = _drive(source)
-    calibration = _calibration(drive.parent)
+    calibration = _calibration(drive)
     scans = numbered(drive / "velodyne_points" / "data", (".bin",))
     left, right = (numbered(drive / camera / "data", _PICTURES) for camera in ("image_02", "image_03"))
     stored = numbered(drive / "proj_depth" / "groundtruth" / "image_02", (".png",))
     if not scans:
         raise DatasetError(f"{drive}/velodyne_points/data has no scan; add the scans", field="velodyne_points")
     numbers = sorted(scans.keys() | left.keys())
-    stamps = _stamps(drive / "velodyne_points" / "timestamps.txt", numbers) or {n: n / RATE_HZ for n in numbers}
+    times = drive / "velodyne_points" / "timestamps.txt"
+    stamps = _stamps(times, numbers) or {n: n / RATE_HZ for n in numbers}
+    at_rest = (drive / SCANS_AT_REST).is_file()
     frames = tuple(
         KittiFrame(f"{n:010d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers
     )
     poses, georeference = _poses(drive)
-    return KittiSequence("kitti-raw", drive, frames, calibration, depth, poses, georeference)
+    return KittiSequence(
+        "kitti-raw", drive, frames, calibration, depth, poses, georeference, turn_s=None if at_rest else _turn_s(times),
+        vertical_deg=0.0 if at_rest else vertical_deg,
+    )  # fmt: skip
+
+
+def _turn_s(times: Path) -> float:
+    """Time of one turn, by the stamps of all scans of the drive, those that an extract leaves out among them."""
+    count = len(times.read_bytes().splitlines()) if times.is_file() else 0
+    stamps = _stamps(times, list(range(count))) or {}
+    return period_of(np.array([stamps[n] for n in sorted(stamps)]), otherwise_s=1 / RATE_HZ)
 
 
 def _drive(source: Path) -> Path:
@@ -59,13 +77,29 @@ def _drive(source: Path) -> Path:
     return drives[0]
 
 
-def _calibration(day: Path) -> KittiCalibration:
-    velodyne, cameras = day / "calib_velo_to_cam.txt", day / "calib_cam_to_cam.txt"
-    Tr = _rigid(velodyne)
+def _calibration(drive: Path) -> KittiCalibration:
+    cameras = _calibration_file(drive, "calib_cam_to_cam.txt")
+    Tr = _rigid(_calibration_file(drive, "calib_velo_to_cam.txt"))
     found = read_matrices(
         cameras, {"R_rect_00": (3, 3), "P_rect_02": (3, 4), "P_rect_03": (3, 4)}, optional=frozenset({"P_rect_03"})
     )
     return calibration_from(cameras, P2=found["P_rect_02"], P3=found.get("P_rect_03"), R0=found["R_rect_00"], Tr=Tr[:3])
+
+
+def _calibration_file(drive: Path, name: str) -> Path:
+    """One of the day's calibration files: inside the drive's folder or next to it, there or in a folder ``calib``.
+
+    Raises:
+        DatasetError: it lies in none of them.
+    """
+    places = [drive, drive / "calib", drive.parent, drive.parent / "calib"]
+    found = next((folder / name for folder in places if (folder / name).is_file()), None)
+    if found is None:
+        raise DatasetError(
+            f"{drive}: there is no {name}, neither in the drive's folder nor next to it; put the day's calibration there "
+            "(KITTI offers it as DATE_calib.zip)", field=name,
+        )  # fmt: skip
+    return found
 
 
 def _rigid(path: Path) -> Transform:
@@ -80,7 +114,7 @@ def _poses(drive: Path) -> tuple[Trajectory | None, dict[str, Any] | None]:
     if not files:
         return None, None
     stamps = _stamps(drive / "oxts" / "timestamps.txt", sorted(files)) or {n: n / RATE_HZ for n in files}
-    T_lidar_imu = _rigid(drive.parent / "calib_imu_to_velo.txt")
+    T_lidar_imu = _rigid(_calibration_file(drive, "calib_imu_to_velo.txt"))
     T_map_imu, georeference = read_oxts([files[n] for n in sorted(files)])
     at: NDArray[np.float64] = np.array([stamps[n] for n in sorted(files)])
     return Trajectory(at, T_map_imu, str(drive / "oxts")).moved_by(T_lidar_imu), georeference
@@ -90,7 +124,7 @@ def _stamps(path: Path, numbers: list[int]) -> dict[int, float] | None:
     """Seconds by a frame's number, or None where no times were recorded."""
     if not path.is_file():
         return None
-    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    lines = read_bytes(path).decode("ascii", errors="replace").splitlines()
     if numbers and numbers[-1] >= len(lines):
         raise DatasetError(
             f"{path} has {len(lines)} lines, and there is a frame {numbers[-1]:010d}; take the file from the recording again",

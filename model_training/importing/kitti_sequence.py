@@ -14,6 +14,7 @@ from model_training.importing.kitti_calibration import KittiCalibration
 from model_training.importing.kitti_files import read_rgb, read_stored_depth
 from model_training.importing.recording import Event, Notes, RecordedPicture, RecordedScan, Unusable
 from model_training.importing.scan_file import read_scan
+from model_training.importing.spinning import raised, times_by_azimuth
 from model_training.importing.stereo import StereoMatching, depth_from_stereo
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
@@ -54,6 +55,8 @@ class KittiSequence:
         depth: what a picture's depth comes from; ``none`` leaves it to who takes the recording.
         poses: T_map_lidar, or None.
         georeference: of the poses.
+        turn_s: time of one turn of the LiDAR; points' times then follow from their azimuths. None: the scans are compensated already.
+        vertical_deg: how much every point is turned up.
     """
 
     kind: str
@@ -64,6 +67,8 @@ class KittiSequence:
     poses: Trajectory | None
     georeference: dict[str, Any] | None = None
     lidar: LidarSensor = HDL64
+    turn_s: float | None = None
+    vertical_deg: float = 0.0
 
     @property
     def notes(self) -> Notes:
@@ -71,10 +76,22 @@ class KittiSequence:
         scans, left, right = (
             sum(getattr(frame, kind) is not None for frame in self.frames) for kind in ("scan", "left", "right")
         )
-        source: dict[str, Any] = {"path": self.path.name, "depth": self.depth}
+        source: dict[str, Any] = {
+            "path": self.path.name, "depth": self.depth, "vertical_correction_deg": self.vertical_deg,
+            "point_times": "none" if self.turn_s is None else "azimuth",
+        }  # fmt: skip
+        if self.turn_s is not None:
+            source["turn_s"] = self.turn_s
         if self.depth == "sgbm":
             source["matching"] = StereoMatching().description()
-        return Notes((f"{len(self.frames)} moments: {scans} scans, {left} left and {right} right pictures",), source)
+        times = (
+            "scans are taken as compensated for the vehicle's motion"
+            if self.turn_s is None
+            else f"points' times by azimuth, {self.turn_s:.4f} s a turn"
+        )
+        turned = f"; points turned up by {self.vertical_deg:g} degrees" if self.vertical_deg else ""
+        counted = f"{len(self.frames)} moments: {scans} scans, {left} left and {right} right pictures"
+        return Notes((counted, times + turned), source)
 
     def count(self) -> int:
         """Scans and left pictures."""
@@ -100,9 +117,13 @@ class KittiSequence:
             if frame.scan is not None:
                 points = read_scan(frame.scan)
                 name = f"velodyne {frame.name}"
-                yield Unusable("scan", name, points) if isinstance(points, str) else RecordedScan(name, frame.stamp_s, points)  # fmt: skip
+                yield Unusable("scan", name, points) if isinstance(points, str) else self._scan(name, frame, points)
             if pictures and frame.left is not None:
                 yield self._picture(frame, frame.left)
+
+    def _scan(self, name: str, frame: KittiFrame, points: NDArray[np.float32]) -> RecordedScan:
+        offsets = None if self.turn_s is None else times_by_azimuth(points, period_s=self.turn_s)
+        return RecordedScan(name, frame.stamp_s, raised(points, self.vertical_deg), offsets)
 
     def _picture(self, frame: KittiFrame, left: Path) -> RecordedPicture | Unusable:
         name, calibration = f"image {frame.name}", self.calibration
@@ -131,7 +152,7 @@ class KittiSequence:
         depth_m: Float32[NDArray[np.float32], "H W"] = depth_from_stereo(
             picture.rgb, right, focal_baseline_px_m=self.calibration.focal_baseline_px_m
         )
-        return replace(picture, depth=depth_m)
+        return replace(picture, depth=depth_m, baseline_m=self.calibration.baseline_m)
 
 
 def _without_names(message: str, files: tuple[Path | None, ...]) -> str:

@@ -53,6 +53,7 @@ class RecordedPicture:
         T_vehicle_camera: takes the optical frame to the vehicle's.
         file: the file that ``rgb`` was read from, to be copied as it is where nothing has to be rectified.
         lens: what ``camera.distortion`` are the coefficients of: OpenCV's pinhole models, or its fisheye's.
+        baseline_m: of the stereo rig that the depth was matched from, metres; None where it comes from elsewhere.
     """
 
     name: str
@@ -64,6 +65,7 @@ class RecordedPicture:
     depth_scale_m: float = 0.001
     file: Path | None = None
     lens: Lens = "pinhole"
+    baseline_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import LidarSensor, read_tum
+from model_training.datasets.files import read_bytes
 from model_training.importing.depth_scan import scan_from_depth
 from model_training.importing.kitti_files import read_rgb
 from model_training.importing.recording import Event, Notes, RecordedPicture, Unusable
@@ -88,7 +89,11 @@ class RgbdFolder:
             values = read_depth_values(frame.depth.read_bytes(), encoding=None, limits=_LIMITS)
         except (StreetfixError, OSError) as error:
             file = "its depth" if rgb is not None else "it"
-            why = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read ({type(error).__name__})"
+            why = (
+                "is missing"
+                if isinstance(error.__cause__ or error, FileNotFoundError)
+                else f"cannot be read ({type(error).__name__})"
+            )
             return Unusable("picture", frame.rgb.name, f"{file} {why}")
         depth = np.asarray(values, np.uint16) if values.dtype == np.uint16 else np.asarray(values, np.float32)
         size = (self.camera.height, self.camera.width)
@@ -173,7 +178,7 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
     if not path.is_file():
         raise DatasetError(f"{path} is missing; TUM's layout has it beside the pictures", field=path.name)
     found = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+    for number, line in enumerate(read_bytes(path).decode(errors="replace").splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
         parts = line.split()
@@ -201,7 +206,7 @@ def _open3d_camera(path: Path) -> PinholeCamera:
 
 def _open3d_poses(path: Path) -> Trajectory:
     """T_world_camera: a line of three whole numbers, then four rows, a frame."""
-    lines = [line for line in path.read_text(errors="replace").splitlines() if line.strip()]
+    lines = [line for line in read_bytes(path).decode(errors="replace").splitlines() if line.strip()]
     stamps, poses = [], []
     for start in range(0, len(lines), 5):
         try:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import NDArray
 
-ROW_BYTES = 16
+from model_training.datasets.files import ROW_BYTES, read_rows, size_of
 
 
 def read_scan(path: Path, *, max_points: int = 5_000_000) -> Float32[NDArray[np.float32], "N 4"] | str:
@@ -15,12 +15,15 @@ def read_scan(path: Path, *, max_points: int = 5_000_000) -> Float32[NDArray[np.
     Args:
         path: of the file.
         max_points: more is refused.
+
+    Raises:
+        DatasetError: the file vanished, or cannot be read: what is named in a recording is not simply left out.
     """
-    size = path.stat().st_size
+    size = size_of(path)
     if size == 0:
         return "the file is empty"
     if size % ROW_BYTES:
         return "its bytes are no rows of four float32: truncated"
     if size > max_points * ROW_BYTES:
         return f"more than {max_points} points"
-    return np.fromfile(path, np.float32).reshape(-1, 4)
+    return read_rows(path, size)

@@ -83,7 +83,10 @@ class TakeSettings:
 
 @dataclass(frozen=True, slots=True)
 class TakeSummary:
-    """What came in, and what did not: ``dropped`` counts frames by kind and reason, with the first name of each."""
+    """What came in, and what did not: ``dropped`` counts frames by kind and reason, with the first name of each.
+
+    ``deskewed`` counts the scans that the vehicle's motion was taken out of.
+    """
 
     scans: int
     held_out: int
@@ -91,6 +94,7 @@ class TakeSummary:
     points_without_numbers: int
     dropped: tuple[str, ...]
     notes: tuple[str, ...]
+    deskewed: int = 0
 
 
 def take(
@@ -133,7 +137,7 @@ class _Taking:
         self._survey, self._queries = SurveyWriter(out), QueryWriter(out, settings.queries)
         self._recent: deque[tuple[float, bool, NDArray[np.float32]]] = deque(maxlen=_RECENT_SCANS)
         self._waiting: deque[RecordedPicture] = deque()
-        self._seen = self._held = self._without_numbers = 0
+        self._seen = self._held = self._without_numbers = self._deskewed = 0
         self._last_scan_s = -np.inf
 
     def scan(self, scan: RecordedScan) -> None:
@@ -154,7 +158,10 @@ class _Taking:
                 "de-skew", scan.name, f"its points' times are more than {MOST_OFFSET_S:g} s from its stamp"
             )
             clean = replace(clean, offsets_s=None)
-        points = deskewed(clean, self._trajectory, self._T_vehicle_lidar) if self._settings.deskew else clean.points
+        points = clean.points
+        if self._settings.deskew and clean.offsets_s is not None:
+            points = deskewed(clean, self._trajectory, self._T_vehicle_lidar)
+            self._deskewed += 1
         self._last_scan_s = scan.stamp_s
         is_held = self._settings.holds_out(self._seen)
         self._seen += 1
@@ -189,7 +196,7 @@ class _Taking:
             **recording.notes.source,
             "poses": self._trajectory.name,
             "sync": settings.sync,
-            "deskewed": settings.deskew,
+            "scans_deskewed": self._deskewed,
             "hold_out": settings.hold_out,
             "dropped": self.dropped.lines(),
         }
@@ -198,7 +205,8 @@ class _Taking:
         )  # fmt: skip
         write_description(self._out, description)
         return TakeSummary(
-            self._survey.count, self._held, self._queries.count, self._without_numbers, tuple(self.dropped.lines()), recording.notes.lines
+            self._survey.count, self._held, self._queries.count, self._without_numbers, tuple(self.dropped.lines()), recording.notes.lines,
+            self._deskewed,
         )  # fmt: skip
 
     def _useless(self, scan: RecordedScan, finite: NDArray[np.bool_]) -> str | None:

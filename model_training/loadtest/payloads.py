@@ -66,17 +66,10 @@ def payloads(
 
 
 def _payload(frame: QueryFrame, map_name: str | None, refine: bool, cheap_depth: bool) -> Payload:
-    rgb, depth, camera = frame.rgb_path.read_bytes(), frame.depth_path.read_bytes(), frame.camera
+    rgb, depth, spec = frame.rgb_path.read_bytes(), frame.depth_path.read_bytes(), frame.camera.depth
     if cheap_depth:
         depth = _as_raw16(depth, frame)
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    intrinsics = {name: getattr(camera, name) for name in names}
-    spec = camera.depth
-    how = {"scale_m": spec.scale_m, "kind": spec.kind, "baseline_m": spec.baseline_m, "max_range_m": spec.max_range_m}
-    document: dict[str, Any] = {
-        "camera": intrinsics, "depth": {name: value for name, value in how.items() if value is not None},
-        "options": {"refine": refine},
-    }  # fmt: skip
+    document: dict[str, Any] = frame.request() | {"options": {"refine": refine}}
     if map_name is not None:
         document["map"] = map_name
     boundary = uuid.uuid4().hex
@@ -88,7 +81,7 @@ def _payload(frame: QueryFrame, map_name: str | None, refine: bool, cheap_depth:
         for name, content in parts.items()
     )
     message = pb.LocalizeRequest(
-        rgb=rgb, depth=depth, camera=pb.Camera(**intrinsics), map=map_name, options=pb.Options(refine=refine),
+        rgb=rgb, depth=depth, camera=pb.Camera(**document["camera"]), map=map_name, options=pb.Options(refine=refine),
         depth_format=pb.DepthFormat(
             scale_m=spec.scale_m, kind=_KINDS[spec.kind], baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
         ),

@@ -9,6 +9,7 @@ import numpy as np
 from model_training.loadtest.drive import Load, Shot
 from model_training.loadtest.payloads import Payload
 from model_training.loadtest.processes import Usage
+from model_training.loadtest.targets import Reply
 
 RIGHT_M = 1.0
 _SAME_M = 1e-6
@@ -70,12 +71,11 @@ def summarise(
     in_time = sum(shot.reply.code == "ok" and load.warm_up_s <= shot.done_s < total_s for shot in shots)
     answered = [shot for shot in counted if shot.reply.code == "ok"]
     refused = [shot for shot in counted if shot.reply.code != "ok"]
-    first: dict[int, tuple[float, float, float]] = {}
+    first: dict[int, Reply] = {}
     inconsistent = 0
     for shot in shots:
-        at = shot.reply.position_m
-        if at is not None:
-            inconsistent += bool(np.linalg.norm(np.subtract(first.setdefault(shot.payload, at), at)) > _SAME_M)
+        if shot.reply.code == "ok":
+            inconsistent += not _same(first.setdefault(shot.payload, shot.reply), shot.reply)
     localized = [shot for shot in answered if shot.reply.status == "LOCALIZED"]
     distances = [
         float(np.linalg.norm(np.subtract(at, true)[:2]))
@@ -94,6 +94,13 @@ def summarise(
         cpu_ms_per_answer=None if used is None or not in_time else 1e3 * used / in_time,
         resident_mib=None if after is None else after.resident_mib,
     )  # fmt: skip
+
+
+def _same(one: Reply, other: Reply) -> bool:
+    if one.status != other.status:
+        return False
+    pairs = ((one.position_m, other.position_m), (one.spread_mean_m, other.spread_mean_m))
+    return all(a is None or b is None or bool(np.linalg.norm(np.subtract(a, b)) <= _SAME_M) for a, b in pairs)
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float]:

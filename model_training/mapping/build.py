@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model_training.datasets.dataset import Dataset
+from model_training.datasets.dataset import Dataset, Transforms
 from model_training.mapping.align_survey import aligned
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.cloud import near, prepared, with_cloud
@@ -27,6 +27,7 @@ from model_training.mapping.survey import (
     fan,
     kept_scans,
     levelled_scans,
+    require_poses_within,
     rows_seen_by,
     thinned,
     view_ranges,
@@ -79,6 +80,7 @@ def build_map(
     threads = threads or os.cpu_count() or 1
     encoder = Encoder.open(encoder_file, threads=threads)
     poses, kept = kept_scans(dataset, settings)
+    require_poses_within(_cloud_around(poses, settings), poses, dataset)
     calibration = calibration_for(settings.calibration, encoder.sha256)
     apart: Set[int] = set() if calibration is None else held_out(len(kept))
     key = key_of(dataset, encoder.sha256, settings, threads=threads, held_out=len(apart))
@@ -89,7 +91,7 @@ def build_map(
             given = poses
             poses = work.part("poses", lambda: {"aligned": aligned(dataset, given, kept, report=report)})["aligned"]
         drive = Drive(dataset, poses, kept, settings, encoder, grid, rows_seen)
-        cloud = VoxelMap(settings.voxel_m, lattice_origin(settings.voxel_m, poses[:, :3, 3].mean(axis=0)))
+        cloud = _cloud_around(poses, settings)
         places = drive.places(cloud, work, apart=apart, report=report)
         content = _content(drive, places, encoder_file)
         if calibration is not None:
@@ -102,7 +104,17 @@ def build_map(
         if settings.passes_vote:
             gone = moved(cloud, dataset, poses, kept, settings, work, report=report)
             cloud.keep(~np.isin(cloud.sums()[0], gone))
-        return write_bundle(out, with_cloud(content, cloud), overwrite=overwrite)
+        report("writing", 0, 2)
+        content = with_cloud(content, cloud)
+        report("writing", 1, 2)
+        manifest = write_bundle(out, content, overwrite=overwrite)
+        report("writing", 2, 2)
+        return manifest
+
+
+def _cloud_around(poses: Transforms, settings: BuildSettings) -> VoxelMap:
+    """An empty cloud in the middle of a survey."""
+    return VoxelMap(settings.voxel_m, lattice_origin(settings.voxel_m, poses[:, :3, 3].mean(axis=0)))
 
 
 def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:

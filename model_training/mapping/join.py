@@ -15,9 +15,16 @@ from service.errors import BundleError
 from service.maps.content import BundleContent
 
 #: Parameters that two drives of one map may differ in.
-_OF_A_DRIVE = ("lidar_height_m", "survey_scans", "passes_vote", "survey_aligned", "expected_lidar_height_m")
+_OF_A_DRIVE = (
+    "lidar_height_m",
+    "survey_scans",
+    "passes_vote",
+    "traffic_vote",
+    "survey_aligned",
+    "expected_lidar_height_m",
+)
 #: Those of them that are said of a map where they hold of all of its drives.
-_OF_ALL = ("passes_vote", "survey_aligned")
+_OF_ALL = ("passes_vote", "traffic_vote", "survey_aligned")
 
 
 def require_same(a: BundleContent, b: BundleContent, *, names: tuple[str, str]) -> None:

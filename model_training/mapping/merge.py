@@ -7,7 +7,7 @@ from pathlib import Path
 from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
 from model_training.mapping.join import joined, require_same
-from model_training.mapping.stored_map import content_of, voxels_of
+from model_training.mapping.stored_map import content_of, empty_voxels_of, voxels_of
 from service.errors import BundleError
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
@@ -35,6 +35,7 @@ def merge_maps(
         report: told after every step.
 
     Raises:
+        DatasetError: the maps lie too far from each other for one cloud.
         BundleError: a bundle is damaged, they do not fit together (it says in what), or ``out`` exists.
     """
     if out.exists() and not overwrite:
@@ -45,6 +46,7 @@ def merge_maps(
     report("merge", 1, 4)
     one, other = content_of(a), content_of(b)
     require_same(one, other, names=(str(first), str(second)))
+    empty_voxels_of(a).require_within(other.T_map_place[:, :3, 3], lambda place: f"{second}: place {place}")
     content = replace(joined(one, other), name=name or one.name, tool_versions=tool_versions())
     report("merge", 2, 4)
     cloud = voxels_of(a)

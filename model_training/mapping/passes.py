@@ -155,15 +155,19 @@ def moved(
     drive = poses[numbers]
     passes = Passes.each_scan(drive) if each_scan else Passes.of(drive, spacing_m=settings.spacing_m)
     ballot = Ballot(targets, passes, behind_m=(1 if each_scan else 2) * cloud.voxel_m)
-    kind = "traffic" if each_scan else "votes"
+    kind, stage = ("traffic", "traffic") if each_scan else ("votes", "passes")
+
+    def told(done: int) -> None:
+        report(stage, done, len(numbers))
+
     hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
     for first in range(0, len(numbers), CHUNK):
         scans = range(first, min(first + CHUNK, len(numbers)))
-        make = partial(_votes, ballot, cloud, dataset, poses, numbers, settings, scans, report)
+        make = partial(_votes, ballot, cloud, dataset, poses, numbers, settings, scans, told)
         votes = work.part(f"{kind}-{first:07d}", make)
         hit[votes["of"]] |= votes["hit"]
         through[votes["of"]] |= votes["through"]
-        report("passes", scans.stop, len(numbers))
+        told(scans.stop)
     hits = np.maximum(np.bitwise_count(hit), 1).astype(np.int64)
     if earlier is not None:
         known = np.isin(targets.keys, earlier)
@@ -183,7 +187,7 @@ class Ballot:
 
 def _votes(
     ballot: Ballot, cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64],
-    settings: BuildSettings, scans: range, report: Report,
+    settings: BuildSettings, scans: range, told: Callable[[int], None],
 ) -> Arrays:  # fmt: skip
     targets, passes = ballot.targets, ballot.passes
     hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
@@ -198,7 +202,7 @@ def _votes(
         hit[at] |= passes.bits(scan, targets.tile[at])
         seen = looked_through(targets, targets.of_tiles(passes.tiles[scan]), points, T, behind_m=ballot.behind_m)
         through[seen] |= passes.bits(scan, targets.tile[seen])
-        report("passes", scan + 1, len(numbers))
+        told(scan + 1)
     of = np.flatnonzero(hit | through)
     return {"of": of, "hit": hit[of], "through": through[of]}
 

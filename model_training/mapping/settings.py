@@ -24,7 +24,7 @@ class BuildSettings:
     expected_lidar_height_m: float = 1.8
     remove_weather: bool = False
     passes_vote: bool = False
-    traffic_vote: bool = False
+    traffic_vote: bool = True
     align_survey: bool = True
     licence: str = ""
     calibration: Path | None = CALIBRATION
@@ -45,5 +45,6 @@ class BuildSettings:
             name=manifest.name, spacing_m=manifest.spacing_m, headings=manifest.headings, voxel_m=parameters["voxel_m"],
             expected_lidar_height_m=parameters.get("expected_lidar_height_m", parameters["lidar_height_m"]),
             remove_weather=bool(parameters.get("weather_removed", 0.0)), passes_vote=passes_vote, licence=manifest.licence,
-            align_survey=bool(parameters.get("survey_aligned", 0.0)), calibration=None,
+            align_survey=bool(parameters.get("survey_aligned", 0.0)), traffic_vote=bool(parameters.get("traffic_vote", 0.0)),
+            calibration=None,
         )  # fmt: skip

@@ -77,7 +77,7 @@ def site_of(
             answer = localizer.localize(query)
             odds = None if answer.evidence is None else float(calibration.right.log_odds(answer.evidence))
             confidence.append(-30.0 if odds is None else odds)
-            right.append(float(np.linalg.norm(answer.T_map_camera[:2, 3] - T_map_camera[:2, 3])) <= _RIGHT_M)
+            right.append(float(np.linalg.norm(answer.T_map_camera_guess[:2, 3] - T_map_camera[:2, 3])) <= _RIGHT_M)
             report("site check", number + 1, len(held))
     odds_of, is_right = np.array(confidence), np.array(right)
     offset = min(0.0, _offset(odds_of, is_right))

@@ -48,6 +48,12 @@ def voxel_edge_m(bundle: MapBundle) -> float:
     return edge
 
 
+def empty_voxels_of(bundle: MapBundle) -> VoxelMap:
+    """Voxels of a map's edge around its middle, with nothing in them."""
+    edge = voxel_edge_m(bundle)
+    return VoxelMap(edge, lattice_origin(edge, bundle.T_map_place[:, :3, 3].mean(axis=0)))
+
+
 def voxels_of(bundle: MapBundle) -> VoxelMap:
     """The voxels of a map, ready to take more points.
 
@@ -58,8 +64,8 @@ def voxels_of(bundle: MapBundle) -> VoxelMap:
     Raises:
         BundleError: the sums are not ours.
     """
-    edge = voxel_edge_m(bundle)
-    voxels = VoxelMap(edge, lattice_origin(edge, bundle.T_map_place[:, :3, 3].mean(axis=0)))
+    voxels = empty_voxels_of(bundle)
+    edge = voxels.voxel_m
     if parts.STATISTICS_FILE in bundle.manifest.files:
         voxels.add_statistics(read_statistics(bundle))
     elif bundle.cloud is not None:

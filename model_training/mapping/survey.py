@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
+from model_training.mapping.voxel_map import VoxelMap
 from service.errors import DatasetError
 from service.geometry.rigid import transform_from
 from service.imaging.pca import Level, level_scan, principal_heading
@@ -65,6 +66,15 @@ def kept_scans(dataset: Dataset, settings: BuildSettings) -> tuple[NDArray[np.fl
             f"{dataset.folder}/survey/poses.txt is empty: there is nothing to build a map of", field="survey"
         )
     return poses, thinned(poses, settings.spacing_m)
+
+
+def require_poses_within(cloud: VoxelMap, poses: NDArray[np.float64], dataset: Dataset) -> None:
+    """Refuse a survey that leaves the reach of a cloud; said before the work, not in its middle.
+
+    Raises:
+        DatasetError: names the file, the line's scan and how far off it is.
+    """
+    cloud.require_within(poses[:, :3, 3], lambda number: f"{dataset.folder}/survey/poses.txt: scan {number}")
 
 
 def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:

@@ -16,8 +16,8 @@ from model_training.mapping.join import joined, joined_streets, of_places
 from model_training.mapping.passes import moved
 from model_training.mapping.places import Drive, Places, views_of
 from model_training.mapping.settings import BuildSettings
-from model_training.mapping.stored_map import content_of, streets_of_bundle, voxel_edge_m, voxels_of
-from model_training.mapping.survey import kept_scans, rows_seen_by
+from model_training.mapping.stored_map import content_of, empty_voxels_of, streets_of_bundle, voxels_of
+from model_training.mapping.survey import kept_scans, require_poses_within, rows_seen_by
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
@@ -61,7 +61,6 @@ def update_map(
             f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
         )
     bundle = MapBundle.open(old)
-    voxel_edge_m(bundle)
     _require_frame(dataset, bundle)
     area = None if replace_area is None else polygon_of(replace_area)
     # What would be refused at the end is refused before the work.
@@ -70,6 +69,7 @@ def update_map(
     threads = threads or os.cpu_count() or 1
     encoder = Encoder.open(bundle.encoder_bytes(), threads=threads)
     poses, kept = kept_scans(dataset, settings)
+    require_poses_within(empty_voxels_of(bundle), poses, dataset)
     key = key_of(dataset, encoder.sha256, settings, threads=threads, map=bundle.manifest.version, replaced=_told(
         replace_covered, replace_area
     ))  # fmt: skip
@@ -86,6 +86,9 @@ def update_map(
         cloud = voxels_of(bundle)
         fresh = VoxelMap(cloud.voxel_m, cloud.origin)
         places = drive.places(fresh, work, report=report)
+        if settings.traffic_vote:
+            gone = moved(fresh, dataset, poses, kept, settings, work, each_scan=True, report=report)
+            fresh.keep(~np.isin(fresh.sums()[0], gone))
         content = content_of(bundle)
         if replace_covered or area is not None:
             area = area or covered_by(fresh.means(), places.T_map_level[:, :3, 3])
@@ -96,7 +99,12 @@ def update_map(
             gone = moved(cloud, dataset, poses, kept, settings, work, earlier=earlier, report=report)
             cloud.keep(~np.isin(cloud.sums()[0], gone))
         whole = joined(content, _content(drive, places, content), newer_streets=area is not None)
-        return write_bundle(out, with_cloud(replace(whole, tool_versions=tool_versions()), cloud), overwrite=overwrite)
+        report("writing", 0, 2)
+        whole = with_cloud(replace(whole, tool_versions=tool_versions()), cloud)
+        report("writing", 1, 2)
+        manifest = write_bundle(out, whole, overwrite=overwrite)
+        report("writing", 2, 2)
+        return manifest
 
 
 def _told(replace_covered: bool, replace_area: Path | None) -> str:

@@ -4,6 +4,7 @@ Each voxel keeps the moments of its points (count, sum, sum of products), so a d
 normal of a voxel is the axis of least variance of the moments of it and, for less, of its 26 neighbours.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -11,10 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import DatasetError
 from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M
 
 _SPAN = 1 << 20  # cells along an axis: a key is 3 x 20 bits
+#: Cells from the origin that have keys of their own, and whose neighbours have: beyond, two voxels would share a key.
+_FARTHEST = _SPAN // 2 - 2
 _SECOND = slice(4, 10)
 #: Count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre; brightness, and how many points have one.
 _MOMENTS, _BRIGHT = 12, slice(10, 12)
@@ -48,6 +52,9 @@ class Surfels:
 class VoxelMap:
     """Accumulates scans; ``tiles`` gives the surfels.
 
+    It reaches as far as its keys do (``reach_m``): 157 km from its origin along each axis with voxels of 0.3 m. What adds points beyond
+    that raises ``DatasetError``.
+
     Args:
         voxel_m: edge of a voxel.
         origin: a point near the map's middle, metres; coordinates stay small around it. ``lattice_origin`` gives one at which the
@@ -59,6 +66,27 @@ class VoxelMap:
         self._keys = np.zeros(0, np.int64)
         self._moments = np.zeros((0, _MOMENTS))
         self._waiting: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+
+    @property
+    def reach_m(self) -> float:
+        """How far from the origin points may lie along each axis."""
+        return _FARTHEST * self.voxel_m
+
+    def require_within(self, positions: NDArray[np.float64], what: Callable[[int], str]) -> None:
+        """Refuse positions (n, 3), metres, map frame, that lie beyond the map's reach; ``what`` says what one of them is.
+
+        Raises:
+            DatasetError: names the farthest of them.
+        """
+        away = np.abs(positions - self.origin).max(axis=1, initial=0.0)
+        away[~np.isfinite(away)] = np.inf
+        if len(away) and away.max() > self.reach_m:
+            farthest = int(away.argmax())
+            raise DatasetError(
+                f"{what(farthest)} lies {away[farthest] / 1000:,.0f} km from the middle of the map, and a map with voxels of "
+                f"{self.voxel_m:g} m reaches {self.reach_m / 1000:.0f} km; bring all poses into one frame (are some UTM?), or make a "
+                "map of each area", field="poses",
+            )  # fmt: skip
 
     def add(self, points_map: NDArray[np.float64], intensity: NDArray[np.floating[Any]] | None = None) -> None:
         """Add points (n, 3), metres, map frame, with the intensity of their returns (n), if it is known."""
@@ -106,7 +134,9 @@ class VoxelMap:
 
     def add_statistics(self, statistics: NDArray[Any]) -> None:
         """Add what ``statistics`` of a map of the same voxels gave; single precision loses less than a micrometre of a mean."""
-        keys = _keys_of_cells(statistics["cell"].astype(np.int64) - self._lattice())
+        cell = statistics["cell"].astype(np.int64) - self._lattice()
+        self.require_within(self.origin + cell * self.voxel_m, lambda _: "a voxel of the added map")
+        keys = _keys_of_cells(cell)
         moments = np.zeros((len(keys), _MOMENTS))
         moments[:, 0], moments[:, 1 : _BRIGHT.start] = statistics["points"], statistics["sums"]
         if statistics.dtype == VOXEL:
@@ -124,7 +154,10 @@ class VoxelMap:
         self.add_sums(*_summed(_keys_of_cells(cell), moments * points.astype(np.float64)[:, None]))
 
     def _cells(self, points_map: NDArray[np.float64]) -> NDArray[np.int64]:
-        return np.floor((points_map - self.origin) / self.voxel_m).astype(np.int64)
+        cell = np.floor((points_map - self.origin) / self.voxel_m)
+        if not (np.abs(cell) <= _FARTHEST).all():  # a number that is not finite neither
+            self.require_within(points_map, lambda number: f"a point at {np.round(points_map[number]).tolist()} m")
+        return cell.astype(np.int64)
 
     def _lattice(self) -> NDArray[np.int64]:
         """Cell of the lattice that the origin is the corner of."""

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 import model_training
 import service
 from model_training.datasets.dataset import Dataset
+from model_training.datasets.files import reading
 from model_training.mapping.settings import BuildSettings
 from service.errors import BundleError
 
@@ -112,10 +113,11 @@ def key_of(
         held_out: how many places the site check holds out.
         more: what else there is.
     """
-    scans = sorted(
-        (scan.name, scan.stat().st_size, scan.stat().st_mtime_ns)
-        for scan in os.scandir(dataset.folder / "survey" / "scans")
-    ) if (dataset.folder / "survey" / "scans").is_dir() else []  # fmt: skip
+    folder = dataset.folder / "survey" / "scans"
+    with reading(folder):
+        scans = sorted(
+            (scan.name, scan.stat().st_size, scan.stat().st_mtime_ns) for scan in os.scandir(folder)
+        ) if folder.is_dir() else []  # fmt: skip
     chosen = {name: value for name, value in asdict(settings).items() if name not in _NOT_IN_PARTS}
     made_of = {
         "dataset": [type(dataset).__qualname__, dataset.description.model_dump(mode="json"), scans],

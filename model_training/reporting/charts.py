@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from model_training.evaluation.error_measures import wilson_interval
-from model_training.evaluation.failures import RIGHT_M, position_errors
-from model_training.evaluation.measures import recall_at
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.measures import RIGHT_M, recall_at
 from model_training.evaluation.predict import RANKED, Predictions, joined
 from model_training.reporting.svg import COLOURS, Axis, Series, histogram, percent_axis, plot
 

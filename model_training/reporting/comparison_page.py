@@ -21,8 +21,9 @@ _SHOWN = 20
 #: No answer counts as one so far off where changes are put in order, metres.
 _FAR_M = 1e6
 LABELS = {
-    "within_0_5_m": "within 0.5 m", "within_1_m": "within 1 m", "within_5_m": "within 5 m", "recall_at_1_5m": "R@1 at 5 m",
-    "recall_at_5_5m": "R@5 at 5 m", "recall_at_10_5m": "R@10 at 5 m", "localized": "answered", "accepted_but_wrong": "accepted, wrong",
+    "within_0_5_m": "accepted, within 0.5 m", "within_1_m": "accepted, within 1 m", "within_5_m": "accepted, within 5 m",
+    "forced_within_0_5_m": "forced, within 0.5 m", "forced_within_1_m": "forced, within 1 m", "recall_at_1_5m": "R@1 at 5 m",
+    "recall_at_5_5m": "R@5 at 5 m", "recall_at_10_5m": "R@10 at 5 m", "localized": "accepted", "accepted_but_wrong": "accepted, wrong",
 }  # fmt: skip
 
 
@@ -78,7 +79,7 @@ HEAD = ("", "A", "B", "B - A", "95 % interval", "only A", "only B", "p")
 def _shares(found: Comparison) -> str:
     whole = table(
         "Paired differences in points over all queries: Newcombe's interval (method 10), McNemar's exact p. "
-        "Of so many measures some part by chance: one in twenty has p below 0.05 where nothing differs.",
+        "Forced: whatever the status. Of so many measures some part by chance: one in twenty has p below 0.05 where nothing differs.",
         HEAD, [row_of(escape(LABELS[name]), each) for name, each in found.shares.items()],
     )  # fmt: skip
     if len(found.sets) == 1:
@@ -100,7 +101,8 @@ def _errors(found: Comparison) -> str:
     ]
     return table(
         f"Errors of B less those of A, over the {each.count} queries that both answered, accepted or not "
-        f"(median of A {each.first_median_m:.3f} m, of B {each.second_median_m:.3f} m); intervals by paired bootstrap.",
+        f"(median of A {each.first_median_m:.3f} m, of B {each.second_median_m:.3f} m); intervals by paired bootstrap. "
+        f"Wilcoxon's signed-rank p {p_text(each.p)}.",
         ("", "B - A", "95 % interval"), rows,
     )  # fmt: skip
 

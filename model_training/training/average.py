@@ -13,7 +13,7 @@ import torch
 
 from model_training.training.draws import augmented_batches
 from model_training.training.encoder_net import EncoderNet
-from model_training.training.loop import TrainingConfig, load_run
+from model_training.training.loop import TrainingConfig, load_run, read_checkpoint, read_config, read_packs
 from service.errors import DatasetError
 
 BATCHES = 150
@@ -41,7 +41,7 @@ def average(
     if (run / "checkpoint.pt").exists():
         raise DatasetError(f"{run} holds a run already; take another --run folder, or remove it", field="run")
     net, other = load_run(first), load_run(second)
-    config = TrainingConfig.model_validate_json((second / "config.json").read_bytes())
+    config = read_config(second)
     if net.shape != other.shape:
         raise DatasetError(
             f"{first} and {second} are encoders of different shapes; only like ones have a mean", field="run"
@@ -54,7 +54,7 @@ def average(
     _renew_statistics(net, packs, config, seed, batches, report)
     run.mkdir(parents=True, exist_ok=True)
     (run / "config.json").write_text(config.model_dump_json(indent=2) + "\n")
-    names = {name: None for each in (first, second) for name in json.loads((each / "packs.json").read_text())}
+    names = {name: None for each in (first, second) for name in read_packs(each)}
     (run / "packs.json").write_text(json.dumps(list(names), indent=1) + "\n")
     part = run / "checkpoint.part"
     torch.save({"net": net.state_dict(), "log_scale": _log_scale(second)}, part)
@@ -81,5 +81,5 @@ def _renew_statistics(
 
 
 def _log_scale(run: Path) -> torch.Tensor:
-    scale: torch.Tensor = torch.load(run / "checkpoint.pt", map_location="cpu", weights_only=True)["log_scale"]
+    scale: torch.Tensor = read_checkpoint(run, "cpu")["log_scale"]
     return scale

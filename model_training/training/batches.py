@@ -1,6 +1,7 @@
 """Batches of pairs, all of one city; the caller may ask for some of them, so that negatives are hard."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from model_training.training.packs import Pack
+from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
 PAIR_REACH_M = 2.5
@@ -36,6 +38,25 @@ class Batch:
     def images(self) -> int:
         """Branches of pairs in the batch."""
         return 2 * len(self.query_xy)
+
+
+def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: int) -> "list[City]":
+    """Open packs, each of which must fill a batch of ``pairs`` pairs.
+
+    Raises:
+        DatasetError: a pack is damaged, or has too few queries that lie near a place.
+    """
+    cities = []
+    for folder in folders:
+        city = City(Pack.open(folder), grid, turn_deg=turn_deg)
+        if len(city.usable) < pairs:
+            raise DatasetError(
+                f"{folder}: {len(city.usable)} of its {len(city.pack.queries)} queries lie within {PAIR_REACH_M:g} m of a place, and a "
+                f"batch takes {pairs} pairs; make the city with more places or queries, or train with --pairs {len(city.usable)} or fewer",
+                field="pairs",
+            )  # fmt: skip
+        cities.append(city)
+    return cities
 
 
 class City:

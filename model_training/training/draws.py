@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from model_training.training.augment import Augmenter
-from model_training.training.batches import City
+from model_training.training.batches import open_cities
 from model_training.training.loop import TrainingConfig, views_of
-from model_training.training.packs import Pack
 from service.imaging.view_grid import ViewGrid
 
 
@@ -19,7 +18,7 @@ def augmented_batches(packs: list[Path], config: TrainingConfig, *, seed: int) -
     grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
     rng, place = np.random.default_rng(seed), torch.device("cpu")
     augment = Augmenter(config.augmentation, grid, torch.Generator().manual_seed(seed), place)
-    cities = [City(Pack.open(folder), grid, turn_deg=config.turn_deg) for folder in packs]
+    cities = open_cities(packs, grid, turn_deg=config.turn_deg, pairs=config.pairs)
     while True:
         batch = cities[int(rng.integers(len(cities)))].draw(config.pairs, rng)
         yield views_of(batch, augment, place, blind=config.blind), len(batch.query_xy)

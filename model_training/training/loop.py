@@ -6,20 +6,21 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from types import FrameType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 from torch.utils.tensorboard import SummaryWriter
 
+from model_training.datasets.files import read_bytes, reading
 from model_training.training.augment import Augmentation, Augmenter
-from model_training.training.batches import Batch, City
+from model_training.training.batches import Batch, open_cities
 from model_training.training.encoder_net import EncoderNet, EncoderShape
 from model_training.training.losses import Side, hardest_triplet, paired_info_nce
 from model_training.training.memory import DescriptorMemory
-from model_training.training.packs import Pack
 from model_training.training.precision import Precision, forward_in
 from service.errors import DatasetError
 from service.imaging.view_grid import PLANES, ViewGrid
@@ -111,14 +112,14 @@ def train(
     optimiser = _optimiser([*net.parameters(), log_scale], config)
     checkpoint = run / "checkpoint.pt"
     first = 0
-    cities = [City(Pack.open(folder), grid, turn_deg=config.turn_deg) for folder in packs]
+    cities = open_cities(packs, grid, turn_deg=config.turn_deg, pairs=config.pairs)
     memories = [DescriptorMemory(len(city.pack.queries), config.encoder.descriptor, place) for city in cities]
     if start_from is not None:
-        before = torch.load(start_from / "checkpoint.pt", map_location=place, weights_only=True)
+        before = read_checkpoint(start_from, place)
         net.load_state_dict(before["net"])
         log_scale.data.copy_(before["log_scale"])
     if resume and checkpoint.exists():
-        state = torch.load(checkpoint, map_location=place, weights_only=True)
+        state = read_checkpoint(run, place)
         net.load_state_dict(state["net"])
         optimiser.load_state_dict(state["optimiser"])
         log_scale.data.copy_(state["log_scale"])
@@ -146,7 +147,7 @@ def train(
             remembers = config.memory_after is not None and step >= config.memory_after
             known = memory.recent(step, config.memory_steps) if remembers else np.zeros(0, np.int64)
             if len(known) > config.pairs:
-                seeds = rng.choice(known, config.alike_seeds, replace=False)
+                seeds = rng.choice(known, min(config.alike_seeds, len(known)), replace=False)
                 wanted = memory.alike(seeds, known, config.alike_each)
             batch = cities[number].draw(config.pairs, rng, wanted)
             planes = views_of(batch, augment, place, blind=config.blind)
@@ -223,24 +224,72 @@ def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:
     """
     if not (run / "checkpoint.pt").exists():
         raise DatasetError(f"{run} holds no checkpoint.pt; train first: streetfix train --run {run}", field="run")
-    config = TrainingConfig.model_validate_json((run / "config.json").read_bytes())
-    net = EncoderNet(config.encoder)
-    net.load_state_dict(torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)["net"])
+    net = EncoderNet(read_config(run).encoder)
+    net.load_state_dict(read_checkpoint(run, device)["net"])
     return net.eval()
+
+
+def read_checkpoint(run: Path, device: str | torch.device) -> dict[str, Any]:
+    """The last checkpoint of a run.
+
+    Raises:
+        DatasetError: it is missing or damaged.
+    """
+    path = run / "checkpoint.pt"
+    with reading(path):
+        try:
+            loaded: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+        except (RuntimeError, EOFError, UnpicklingError) as error:
+            raise DatasetError(
+                f"{path}: it is damaged ({type(error).__name__}); train again in another --run folder", field="run"
+            ) from error
+    return loaded
+
+
+def read_config(run: Path) -> TrainingConfig:
+    """What a run was trained with.
+
+    Raises:
+        DatasetError: ``config.json`` is missing, or is not of this release.
+    """
+    path = run / "config.json"
+    try:
+        return TrainingConfig.model_validate_json(read_bytes(path))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise DatasetError(
+            f"{path}: {where or 'the file'}: {first['msg']}; train again in another --run folder", field="run"
+        ) from error
+
+
+def read_packs(run: Path) -> list[str]:
+    """Names of the packs that a run learnt from.
+
+    Raises:
+        DatasetError: ``packs.json`` is missing or damaged.
+    """
+    path = run / "packs.json"
+    try:
+        names = json.loads(read_bytes(path))
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: it is no JSON; train in another --run folder", field="run") from error
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DatasetError(f"{path}: it is no list of names; train again in another --run folder", field="run")
+    return names
 
 
 def trained_on(run: Path) -> tuple[str, ...]:
     """Cities that a run was trained on, ``KIND-SEED``, those of the run that it started from included."""
-    names: list[str] = json.loads((run / "packs.json").read_text())
-    return tuple("-".join(name.split("-")[1:3]) for name in names)
+    return tuple("-".join(name.split("-")[1:3]) for name in read_packs(run))
 
 
 def _keep_packs(run: Path, packs: list[Path], start_from: Path | None) -> None:
     """Write down what the run learns from, and what the run before it did; refuse to go on with other cities."""
     path = run / "packs.json"
-    earlier: list[str] = [] if start_from is None else json.loads((start_from / "packs.json").read_text())
+    earlier = [] if start_from is None else read_packs(start_from)
     names = earlier + [folder.name for folder in packs]
-    if path.exists() and json.loads(path.read_text()) != names:
+    if path.exists() and read_packs(run) != names:
         raise DatasetError(f"{path} names other cities; take another --run folder, or remove this one", field="run")
     path.write_text(json.dumps(names, indent=1) + "\n")
 
@@ -248,7 +297,7 @@ def _keep_packs(run: Path, packs: list[Path], start_from: Path | None) -> None:
 def _keep_config(run: Path, config: TrainingConfig) -> None:
     path = run / "config.json"
     if path.exists():
-        if TrainingConfig.model_validate_json(path.read_bytes()) != config:
+        if read_config(run) != config:
             raise DatasetError(
                 f"{path} is of another configuration; take another --run folder, or remove this one", field="run"
             )

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from model_training.datasets.files import read_arrays
 from model_training.simulation.city import City
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.lidar import LIDARS, scan
@@ -66,11 +67,16 @@ class Pack:
 
     @staticmethod
     def open(folder: Path) -> "Pack":
-        """Map a pack's arrays; they are read as they are needed."""
-        arrays = {
-            name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in Pack.__annotations__
-        }
-        return Pack(**arrays)
+        """Map a pack's arrays; they are read as they are needed.
+
+        Raises:
+            DatasetError: an array is missing or damaged.
+        """
+        remedy = f"remove {folder}, so that the next training makes the city anew"
+        return Pack(**{
+            name: read_arrays(path, partial(np.load, path, mmap_mode="r", allow_pickle=False), remedy=remedy)
+            for name, path in ((name, folder / f"{name}.npy") for name in Pack.__annotations__)
+        })  # fmt: skip
 
 
 def rows_seen_by(panoramas: NDArray[np.float16], *, least: float = 0.02) -> NDArray[np.bool_]:

@@ -140,8 +140,11 @@ def line_of(published: Published) -> str:
     at = f"{diagnosis.stamp_ns / 1e9:.3f}"
     if answer is None:
         return f"{at} failed: {diagnosis.message}"
-    p, confidence = answer.pose.position, answer.confidence
+    pose, confidence = answer.pose, answer.confidence
     street = "" if answer.street is None else f"  {answer.street.name}"
     sure = "" if confidence is None else f" {confidence:.3f}"
     told = "" if published.pose is not None else f"  ({diagnosis.message})"
-    return f"{at} {answer.status}{sure}  x {p.x:.2f}  y {p.y:.2f}  heading {answer.pose.heading_deg:.1f}{street}{told}"
+    where = ""
+    if pose is not None:
+        where = f"  x {pose.position.x:.2f}  y {pose.position.y:.2f}  heading {pose.heading_deg:.1f}{street}"
+    return f"{at} {answer.status}{sure}{where}{told}"

@@ -8,17 +8,15 @@ from service.errors import RequestError
 
 @dataclass(slots=True)
 class Gate:
-    """A limit on the rate of questions and on the doubt of answers.
+    """A limit on the rate of questions and on the doubt of answers. An answer that is not LOCALIZED never goes out.
 
     Attributes:
         rate_hz: questions a second at most; 0 asks for every pair.
         min_confidence: of an answer that goes out; an uncalibrated map's, which has none, passes only at 0.
-        publish_doubtful: answers that are not LOCALIZED may go out, too.
     """
 
     rate_hz: float = 1.0
     min_confidence: float = 0.9
-    publish_doubtful: bool = False
     _asked_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -48,7 +46,7 @@ class Gate:
 
     def why_not(self, answer: LocalizeAnswer) -> str:
         """Why an answer stays in; empty if it goes out."""
-        if answer.status != "LOCALIZED" and not self.publish_doubtful:
+        if answer.status != "LOCALIZED":
             return answer.status
         if self.min_confidence > 0 and answer.confidence is None:
             return "no confidence: the map is not calibrated; pass --min-confidence 0 to publish nevertheless"

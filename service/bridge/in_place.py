@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from service.contract.convert import answer_from
+from service.contract.convert import answer_from, require_camera
 from service.contract.schema import LocalizeAnswer
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import require_sizes
@@ -34,8 +34,9 @@ class InPlace:
         """Where a pair was taken, as ``Client.localize`` says it.
 
         Raises:
-            RequestError: a picture is of another size than the camera's, or holds no depth.
+            RequestError: the camera's numbers make no sense, a picture is of another size than it, or holds no depth.
         """
+        require_camera(camera)
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
         require_sizes(rgb, z_m, camera)
         answer = self._localizer.localize(Query(rgb=rgb, depth_m=z_m, camera=camera))

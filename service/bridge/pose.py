@@ -57,11 +57,15 @@ def pose_of(answer: LocalizeAnswer, T_vehicle_camera: Transform, *, stamp_ns: in
         T_vehicle_camera: where the camera sits; ``CAMERA_AS_BODY`` where the vehicle is the camera.
         stamp_ns: of the picture.
         frame_id: of the map.
+
+    Raises:
+        NotLocalizedError: the answer has no pose.
     """
-    p, q = answer.pose.position, answer.pose.orientation
+    posed = answer.require_pose()
+    p, q = posed.position, posed.orientation
     rotation = rotation_from_quaternion_xyzw(np.array([q.x, q.y, q.z, q.w]))
     T_map_camera = transform_from(rotation, np.array([p.x, p.y, p.z]))
-    told = answer.pose.covariance
+    told = posed.covariance
     covariance = _UNKNOWN if told is None else np.array(told, np.float64).reshape(6, 6)
     T_map_vehicle = T_map_camera @ inverse(T_vehicle_camera)
     moved = about(covariance, T_map_vehicle[:3, 3] - T_map_camera[:3, 3])

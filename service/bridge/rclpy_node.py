@@ -8,13 +8,14 @@ from service.bridge.bridge import Bridge, Published
 from service.bridge.diagnostics import NAME, Diagnosis
 from service.bridge.pose import StampedPose
 from service.errors import ExtraMissingError
+from service.runtime.wakeup import Wakeup
 
 #: Pictures are looked at so often, and diagnoses come after so long without any.
 _LOOK_S, _IDLE_S = 0.05, 1.0
 
 
 def run(
-    bridge: Bridge, over: Event, told: Callable[[Published], None] = lambda _: None, *,
+    bridge: Bridge, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None, *,
     domain: int = 0, reliable: bool = False, depth: int = 5,
 ) -> None:  # fmt: skip
     """Answer pictures until it is over; arguments as for ``DdsNode``.

@@ -18,6 +18,7 @@ from service.bridge.bridge import Bridge, Published
 from service.bridge.diagnostics import NAME, Diagnosis
 from service.bridge.pose import StampedPose
 from service.errors import AddressError
+from service.runtime.wakeup import Wakeup
 
 M = TypeVar("M", bound=IdlStruct)
 #: Diagnoses come at least so often, whether pictures do or not.
@@ -79,7 +80,7 @@ class DdsNode:
                 field="domain",
             ) from error
 
-    def run(self, over: Event, told: Callable[[Published], None] = lambda _: None) -> None:
+    def run(self, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None) -> None:
         """Answer pictures until it is over.
 
         Args:

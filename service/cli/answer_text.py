@@ -20,7 +20,7 @@ def print_answer(answer: dict[str, Any], console: Console | None = None) -> None
         facts.add_row(name, value)
     out.print(facts)
     out.print()
-    if answer["status"] != "LOCALIZED" and answer["hypotheses"]:
+    if answer["pose"] is None and answer["hypotheses"]:
         out.print(_hypotheses(answer["hypotheses"]))
     out.print(_neighbours(answer["neighbours"]))
     times = "  ".join(f"{stage} {value:.1f}" for stage, value in answer["timings_ms"].items())
@@ -30,8 +30,12 @@ def print_answer(answer: dict[str, Any], console: Console | None = None) -> None
 def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     pose, street, place = answer["pose"], answer["street"], answer["map"]
     confidence = answer["confidence"]
+    status = ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f})"))
+    version = ("map", f"{place['name']}, version {place['version']}")
+    if pose is None:
+        return [status, ("pose", "none: the answer is not LOCALIZED"), ("spread", _doubt(answer["spread"])), version]
     facts = [
-        ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f})")),
+        status,
         ("street", "none" if street is None else f"{street['name']} ({street['vote']:.0%} of the votes)"),
         ("position", f"{_metres(pose['position'])}, map frame{_spread(pose['covariance'], slice(0, 3), 1.0, 'm')}"),
         (
@@ -43,7 +47,13 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     if answer.get("vehicle_pose"):
         vehicle = answer["vehicle_pose"]
         facts.append(("vehicle", f"{_metres(vehicle['position'])}, heading {vehicle['heading_deg']:.1f} degrees"))
-    return [*facts, ("map", f"{place['name']}, version {place['version']}")]
+    return [*facts, version]
+
+
+def _doubt(spread: dict[str, Any]) -> str:
+    """How far apart the places are where the camera may be."""
+    largest_m = math.sqrt(max(spread["covariance"][4 * k] for k in range(3)))
+    return f"+- {largest_m:.1f} m (one sigma) over the hypotheses and the rest of the map"
 
 
 def _spread(covariance: list[float] | None, rows: slice, scale: float, unit: str) -> str:
@@ -56,7 +66,13 @@ def _spread(covariance: list[float] | None, rows: slice, scale: float, unit: str
 
 def _hypotheses(hypotheses: list[dict[str, Any]]) -> Table:
     table = Table(
-        "share", "inliers", "similarity", "position", "heading", title="where it may be", title_justify="left"
+        "share",
+        "inliers",
+        "similarity",
+        "position",
+        "heading",
+        title="where it may be (not confirmed)",
+        title_justify="left",
     )
     for each in hypotheses:
         table.add_row(

@@ -4,15 +4,16 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from service.cli.tls_options import Ca, Cert, Key
 from service.errors import RequestError
 
 if TYPE_CHECKING:
     from service.bridge.bridge import Localize, Published
+    from service.runtime.wakeup import Wakeup
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Answer a robot's own messages with its pose in the map."
@@ -36,12 +37,15 @@ def ros2(
     map_name: Annotated[
         str | None, typer.Option("--map-name", help="Needed where the service has several.", show_default=False)
     ] = None,
-    key: Annotated[
+    api_key: Annotated[
         str | None,
         typer.Option(
             "--api-key", envvar="STREETFIX_API_KEY", help="Where the service asks for one.", show_default=False
         ),
     ] = None,
+    ca: Ca = None,
+    cert: Cert = None,
+    key: Key = None,
     color_topic: Annotated[str, typer.Option(help="sensor_msgs/Image: rgb8, bgr8, rgba8, bgra8, mono8.")] = (
         "/camera/color/image_raw"
     ),
@@ -66,10 +70,9 @@ def ros2(
         bool, typer.Option("--rectified", help="The pictures are rectified, whatever lens the info tells of.")
     ] = False,
     rate: Annotated[float, typer.Option(help="Questions a second at most; 0: one for every pair.")] = 1.0,
-    min_confidence: Annotated[float, typer.Option(help="Of a pose that is published; 0 lets all pass.")] = 0.9,
-    publish_doubtful: Annotated[
-        bool, typer.Option("--publish-doubtful", help="Publish what is not LOCALIZED, too; for measuring.")
-    ] = False,
+    min_confidence: Annotated[
+        float, typer.Option(help="Of a pose that is published; 0 lets every LOCALIZED answer pass.")
+    ] = 0.9,
     tolerance: Annotated[float, typer.Option(help="Seconds that stamps of colour and depth may differ.")] = 0.02,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="Of the robot.")] = 0,
     reliable: Annotated[
@@ -91,10 +94,13 @@ def ros2(
     from service.bridge.pose import CAMERA_AS_BODY, mount_from
 
     topics = Topics(color_topic, depth_topic, info_topic, pose_topic, diagnostics_topic)
-    gate, pairs = Gate(rate, min_confidence, publish_doubtful), Pairs(tolerance_s=tolerance)
+    gate, pairs = Gate(rate, min_confidence), Pairs(tolerance_s=tolerance)
     T_vehicle_camera = CAMERA_AS_BODY if mount is None else mount_from(mount)
     run = _node_of(node, domain=domain, reliable=reliable, depth=queue)
-    with _asking(url, map_bundle, map_name=map_name, key=key) as localize, _until_told() as over:
+    with (
+        _asking(url, map_bundle, map_name=map_name, api_key=api_key, ca=ca, cert=cert, key=key) as localize,
+        _until_told() as over,
+    ):
         bridge = Bridge(
             localize=localize, topics=topics, gate=gate, pairs=pairs, T_vehicle_camera=T_vehicle_camera, frame_id=frame,
             rectified=rectified,
@@ -118,9 +124,13 @@ def _node_of(node: str, *, domain: int, reliable: bool, depth: int) -> "Callable
 
 
 @contextmanager
-def _asking(url: str, bundle: Path | None, *, map_name: str | None, key: str | None) -> "Iterator[Localize]":
+def _asking(
+    url: str, bundle: Path | None, *, map_name: str | None, api_key: str | None, ca: Path | None, cert: Path | None, key: Path | None
+) -> "Iterator[Localize]":  # fmt: skip
     """Whom to ask: a service, or the map itself."""
     if bundle is not None:
+        if given := next((name for name, file in (("ca", ca), ("cert", cert), ("key", key)) if file is not None), None):
+            raise RequestError(f"--{given} is for a service; --map asks none", field=given)
         if map_name is not None:
             raise RequestError("--map-name is for a service; --map has one map alone", field="map_name")
         from service.runtime.threads import limit_pools_before_import
@@ -133,14 +143,16 @@ def _asking(url: str, bundle: Path | None, *, map_name: str | None, key: str | N
     from service.client import Client, RetryPolicy
 
     patience = RetryPolicy(attempts=_ATTEMPTS, total_s=_PATIENCE_S)
-    with Client(url, api_key=key, timeout_s=_TIMEOUT_S, retry=patience) as client:
+    with Client(url, api_key=api_key, timeout_s=_TIMEOUT_S, retry=patience, ca=ca, cert=cert, key=key) as client:
         yield lambda rgb, depth_m, camera: client.localize(rgb, depth_m, camera, map=map_name)
 
 
 @contextmanager
-def _until_told() -> Iterator[Event]:
+def _until_told() -> Iterator["Wakeup"]:
     """Set by the first SIGINT or SIGTERM; the second does what it did before."""
-    over = Event()
+    from service.runtime.wakeup import Wakeup
+
+    over = Wakeup()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def end(number: int, _frame: object) -> None:

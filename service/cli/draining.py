@@ -3,7 +3,7 @@
 import asyncio
 import signal
 import socket
-import threading
+import time
 from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -37,6 +37,7 @@ class DrainingServer(uvicorn.Server):
         self._delay_s = delay_s
         self._leaving = leaving
         self._beside = beside
+        self._leave_at_s: float | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen, beside too."""
@@ -61,8 +62,16 @@ class DrainingServer(uvicorn.Server):
         first = not self._engine.is_draining
         self._engine.drain()
         if first and sig == signal.SIGTERM and self._delay_s > 0:
-            timer = threading.Timer(self._delay_s, super().handle_exit, (sig, frame))
-            timer.daemon = True
-            timer.start()
+            self._leave_at_s = time.monotonic() + self._delay_s
             return
         super().handle_exit(sig, frame)
+
+    async def on_tick(self, counter: int) -> bool:
+        """Uvicorn's look at what is to be done, ten times a second; whether to leave.
+
+        The while is watched here: a timer's thread cannot be started in a signal handler, which may have interrupted the start of
+        another thread, whose lock it would wait for.
+        """
+        if self._leave_at_s is not None and time.monotonic() >= self._leave_at_s:
+            self.should_exit = True
+        return await super().on_tick(counter)

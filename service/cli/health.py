@@ -7,24 +7,32 @@ import urllib.request
 
 import typer
 
+from service.cli.tls_options import Ca, Cert, Key
 from service.errors import UnreachableError
 
 _TIMEOUT_S = 2.0
 
 
-def command() -> None:
+def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
     """Ask the service that STREETFIX_* describes, on this machine, whether it is ready: leaves with 0 or 1.
+
+    Without --ca any certificate will do, since the service is on this machine. A service that asks for client certificates is only
+    asked if --cert and --key are given, else it has to listen.
 
     Example: STREETFIX_PORT=8000 streetfix health
     """
+    from service.client.tls import ClientTls
     from service.runtime.settings import load_settings
 
     settings = load_settings(insecure_public=True)  # what is asked here is not what is served
     if settings.health_port is not None:
         _ask(f"http://{_address(settings.health_host or settings.host)}:{settings.health_port}/readyz", None)
         return
+    tls = ClientTls.of(ca, cert, key)
     address = _address(settings.host)
-    if settings.tls_client_ca is not None:  # it would ask for a certificate: that it listens must do
+    if (
+        settings.tls_client_ca is not None and tls.cert is None
+    ):  # without a certificate only that it listens can be seen
         try:
             socket.create_connection((address.strip("[]"), settings.port), timeout=_TIMEOUT_S).close()
         except OSError as error:
@@ -33,8 +41,10 @@ def command() -> None:
     scheme = "http" if settings.tls_certificate is None else "https"
     context = None
     if scheme == "https":  # its own certificate names the outside, not loopback
-        context = ssl.create_default_context()
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        context = tls.context()
+        context.check_hostname = False
+        if not tls.is_wanted or tls.ca is None:
+            context.verify_mode = ssl.CERT_NONE
     _ask(f"{scheme}://{address}:{settings.port}/readyz", context)
 
 

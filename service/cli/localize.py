@@ -6,9 +6,12 @@ from typing import Annotated, Any
 
 import typer
 
+from service.cli.tls_options import Ca, Cert, Key
 from service.errors import RequestError
 
 _TIMEOUT_S = 60.0
+#: Exit code for an answer that is not LOCALIZED, so that a script does not take it for a pose. 1 and 2 are errors.
+NOT_LOCALIZED = 3
 
 
 def command(
@@ -26,26 +29,36 @@ def command(
     heading: Annotated[
         float | None, typer.Option(help="Where it looked, roughly: degrees, counter-clockwise from map x.")
     ] = None,
-    key: Annotated[
+    api_key: Annotated[
         str | None,
         typer.Option(
             "--api-key", envvar="STREETFIX_API_KEY", help="Where the service asks for one.", show_default=False
         ),
     ] = None,
+    ca: Ca = None,
+    cert: Cert = None,
+    key: Key = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the answer as it came.")] = False,
 ) -> None:
     """Ask where two pictures were taken.
 
+    Exit code: 0 if the answer is LOCALIZED; 3 if it is AMBIGUOUS or OUT_OF_MAP, then there is no pose; 1 for an error, 2 for wrong
+    options.
+
     Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json --near 12,-40
     """
     prior = _prior(near, heading)
-    answer = localize(url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior, key=key)
+    answer = localize(
+        url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior, api_key=api_key, ca=ca, cert=cert, key=key
+    )  # fmt: skip
     if as_json:
         typer.echo(json.dumps(answer))
     else:
         from service.cli.answer_text import print_answer
 
         print_answer(answer)
+    if answer["status"] != "LOCALIZED":
+        raise typer.Exit(NOT_LOCALIZED)
 
 
 def _prior(near: str | None, heading_deg: float | None) -> dict[str, Any] | None:
@@ -69,7 +82,10 @@ def localize(
     camera: Path,
     map_name: str | None = None,
     prior: dict[str, Any] | None = None,
-    key: str | None = None,
+    api_key: str | None = None,
+    ca: Path | None = None,
+    cert: Path | None = None,
+    key: Path | None = None,
 ) -> dict[str, Any]:
     """Post a pair of pictures.
 
@@ -80,10 +96,14 @@ def localize(
         camera: JSON file with the request's parts: camera, depth, gravity and so on.
         map_name: which map; goes above the file's.
         prior: as in the REST contract; goes above the file's.
-        key: API key, where the service asks for one.
+        api_key: where the service asks for one.
+        ca: PEM file of the authorities of the service's certificate, as in ``Client``.
+        cert: PEM file of the client's certificate.
+        key: PEM file of its private key.
 
     Raises:
         RequestError: a file cannot be read, the camera file is no JSON object, or the address is none.
+        KeysError: a file of TLS cannot be used.
         UnreachableError: nothing answers at the address, or something that is no Streetfix.
         RefusedError: the service answered with a problem.
     """
@@ -97,7 +117,8 @@ def localize(
         "request": ("request.json", json.dumps(request).encode(), "application/json"),
     }
     # Who types a command wants to know at once.
-    with Client(url, api_key=key, timeout_s=_TIMEOUT_S, retry=RetryPolicy(attempts=1)) as client:
+    patience = RetryPolicy(attempts=1)
+    with Client(url, api_key=api_key, timeout_s=_TIMEOUT_S, retry=patience, ca=ca, cert=cert, key=key) as client:
         return client.call(rest.Call("POST", "/v1/localize", _answer, files))
 
 
@@ -108,7 +129,11 @@ def _answer(body: bytes) -> dict[str, Any]:
         ValueError: it is no answer.
     """
     answer = json.loads(body)
-    if not isinstance(answer, dict) or "pose" not in answer:
+    if (
+        not isinstance(answer, dict)
+        or "status" not in answer
+        or (answer["status"] == "LOCALIZED") != bool(answer.get("pose"))
+    ):
         raise ValueError("no answer")
     return answer
 

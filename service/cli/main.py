@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from importlib.metadata import version as installed_version
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
@@ -52,10 +53,17 @@ _EXTRA_OF_PACKAGE = {
     "rerun": "view",
     "foxglove": "view",
 }
+#: Packages without a wheel for every supported platform, as the markers in ``pyproject.toml`` have it.
+_NOT_EVERYWHERE = {
+    "embreex": "for x86-64 and macOS",
+    "carla": "for Python before 3.13 on x86-64",
+    "cyclonedds": "for Python before 3.14 on x86-64 and macOS",
+    "kiss_icp": "for Python before 3.14",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage."""
+    """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage; a command may have more."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         _run(given)
@@ -70,6 +78,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
+    except OSError as error:
+        if error.errno is None:  # not the system's: a defect of ours, to be seen whole
+            raise
+        typer.echo(f"streetfix: {_told_by_system(error)}", err=True)
+        sys.exit(1)
+
+
+def _told_by_system(error: OSError) -> str:
+    """What the system says of a file, in a line: it vanished, may not be read, or the disk is full or fails."""
+    files = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+    return f"{files or 'a file'}: {error.strerror}; check the file, its folder and the disk, and start again"
 
 
 def _run(arguments: list[str]) -> None:
@@ -97,7 +116,8 @@ def app_for(arguments: Sequence[str]) -> typer.Typer:
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         summary, extra = _KNOWN.get(point.name, (f"From the package {point.dist.name if point.dist else '?'}.", None))
         if point.name != called:
-            app.command(point.name, help=summary)(_not_called)
+            if _is_installed(point):
+                app.command(point.name, help=summary)(_not_called)
             continue
         loaded = _load(point, extra)
         if isinstance(loaded, typer.Typer):
@@ -128,11 +148,23 @@ def _not_called() -> None:
     """Stand in the list of commands for one that is not imported."""
 
 
+def _is_installed(point: EntryPoint) -> bool:
+    """Whether a command is there: the container image leaves out the package that builds maps and encoders."""
+    return find_spec(point.module.partition(".")[0]) is not None
+
+
 def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any] | typer.Typer:
     """The command's function, or its application where it has commands of its own.
 
     A missing package is told as a missing extra, whether now or when it runs.
     """
+    if not _is_installed(point):
+        remedy = f"streetfix[{extra}]" if extra else "streetfix"
+        raise ExtraMissingError(
+            f"the command {point.name!r} is not part of this installation, which is the service alone (as in its container image): "
+            f'where maps are built, pip install "{remedy}"',
+            field=point.name,
+        )
     try:
         loaded: Callable[..., Any] | typer.Typer = point.load()
     except ModuleNotFoundError as error:
@@ -163,4 +195,6 @@ def _package(error: ModuleNotFoundError) -> str:
 def _extra_missing(command: str, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
     extra = _EXTRA_OF_PACKAGE.get(_package(error), extra)
     remedy = f'pip install "streetfix[{extra}]"' if extra else "install the packages it needs"
+    if _package(error) in _NOT_EVERYWHERE:
+        remedy = f"it is to be had {_NOT_EVERYWHERE[_package(error)]} alone ({remedy})"
     return ExtraMissingError(f"the command {command!r} needs the package {error.name!r}: {remedy}", field=command)

@@ -8,8 +8,9 @@ import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -21,9 +22,9 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from service.cli.certificates import Certificates
-    from service.runtime.choices import Choices
     from service.runtime.engine import Engine
     from service.runtime.keys import KeyRing
+    from service.runtime.serving_table import ServingTable
     from service.runtime.settings import Settings
 
 _BACKLOG = 128
@@ -60,15 +61,24 @@ def command(
             "--check", help="Check settings, keys, certificates and maps, print the effective settings, and leave."
         ),
     ] = False,
+    strict: Annotated[
+        bool | None,
+        typer.Option(
+            "--strict", help="Do not start if any bundle cannot be mounted, or if there is none.", show_default=False
+        ),
+    ] = None,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.03]"),
+        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
     ] = None,
 ) -> None:
     """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
 
     Every option can be set as STREETFIX_HOST, STREETFIX_PORT and so on, the maps as STREETFIX_MAPS (':' between); or in a TOML
     file that --config or STREETFIX_CONFIG names.
+
+    Damaged bundles are passed over and reported (log, /readyz, /metrics). The service ends only if there are bundles and none can be
+    mounted. With an empty maps folder it is not ready until a bundle arrives.
 
     Example: streetfix serve maps/paper-city --port 8000 --grpc-port 50051
     """
@@ -80,7 +90,7 @@ def command(
     (check_only if check else serve)(
         load_settings(
             config, maps=tuple(maps) if maps else None, host=host, port=port, grpc_port=grpc_port, threads=threads, queue=queue,
-            workers=workers, false_accept_rate=false_accept_rate, samples=samples,
+            workers=workers, strict=strict, false_accept_rate=false_accept_rate, samples=samples,
         )
     )  # fmt: skip
 
@@ -89,7 +99,7 @@ def check_only(settings: "Settings") -> None:
     """Open all that a service would open, say what it found, and leave.
 
     Raises:
-        StreetfixError: what would keep it from serving.
+        StreetfixError: what would keep it, or one of its maps, from serving.
     """
     from service.cli.certificates import Certificates
     from service.console.samples import Samples
@@ -105,19 +115,23 @@ def check_only(settings: "Settings") -> None:
         Certificates.read(settings)
     engine = Engine.open(settings)
     typer.echo(settings.model_dump_json(indent=2))
+    engine.close()
     for localizer in engine.registry:
-        engine.warm(localizer)
         manifest = localizer.bundle.manifest
         typer.echo(f"map {manifest.name} {manifest.version}: opens and answers")
     typer.echo(f"keys of {callers} callers" if callers else "no keys")
-    engine.close()
+    if refused := engine.registry.refused:
+        reasons = "; ".join(each.reason for each in refused)
+        raise BundleError(f"of the map bundles {len(refused)} cannot be mounted: {reasons}")
+    if not len(engine.registry):
+        typer.echo(_no_map_yet(settings))
 
 
 def serve(settings: "Settings") -> None:
     """Open the maps and answer until SIGINT or SIGTERM.
 
     Raises:
-        BundleError: a map is missing, damaged or mismatched, or none is given.
+        StreetfixError: no map is given, or none of the given ones can be mounted; with ``strict``, one of them cannot.
         AddressError: the address is taken or not ours.
     """
     from service.runtime.heap import keep_little
@@ -127,7 +141,11 @@ def serve(settings: "Settings") -> None:
         raise BundleError("there is no map to serve: streetfix serve BUNDLE, or set STREETFIX_MAPS")
     keep_little(settings.threads or usable_cores())
     if settings.workers == 1:
-        with _listen(settings.host, settings.port) as listener, _listen_for_health(settings) as health:
+        with (
+            _hangup_held_back(),
+            _listen(settings.host, settings.port) as listener,
+            _listen_for_health(settings) as health,
+        ):
             _answer(settings, listener, health)
     else:
         _answer_by_workers(settings)
@@ -135,16 +153,18 @@ def serve(settings: "Settings") -> None:
 
 
 def _answer_by_workers(settings: "Settings") -> None:
-    """Several processes on the same ports; what they count together, and what an operator chose, lies in a folder of theirs.
+    """Several processes on the same ports. They count together in a folder of theirs, and agree on versions of maps in shared memory.
 
     Each listens on a socket of its own, between which the system spreads connections: of one socket that all share, whoever is quick
     takes all connections of clients that keep them.
     """
+    from service.cli.shared_counts import reserve
     from service.cli.workers import supervise
-    from service.runtime.choices import Choices
+    from service.runtime.serving_table import SharedMemory, SharedServingTable
 
     with (
         tempfile.TemporaryDirectory(prefix="streetfix-") as folder,
+        closing(SharedMemory()) as memory,
         _held_port(settings.host, settings.port) as port,
         _held_port(settings.host, settings.grpc_port) as grpc_port,
         _held_port(settings.health_host or settings.host, settings.health_port) as health_port,
@@ -153,20 +173,27 @@ def _answer_by_workers(settings: "Settings") -> None:
         counts.mkdir()
         os.environ[METRICS_FOLDER] = str(counts)  # Prometheus' client looks here when it is imported, which workers do
         shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port, "health_port": health_port})
-        choices = Path(folder) / "choices.json"
 
         def work(number: int, ready: Callable[[], None]) -> None:
             with (
-                _listen(shared.host, shared.port, shared=True) as listener,
+                _bind_shared(shared.host, shared.port) as listener,
                 _listen_for_health(shared, shared=True) as health,
             ):
-                _answer(shared, listener, health, choices=Choices(choices), ready=ready, says_where=number == 0)
+                table = SharedServingTable(memory, number)
+                if (error := reserve(counts)) is not None:
+                    del os.environ[METRICS_FOLDER]
+                    told = f"worker {number} counts for itself alone until it is started again ({counts}: {error.strerror})"
+                    typer.echo(f"streetfix: {told}", err=True)
+                _answer(shared, listener, health, table=table, ready=ready, says_where=number == 0)
 
-        def fell(pid: int) -> None:
+        def ended(pid: int) -> None:
             for path in counts.glob(f"gauge_live*_{pid}.db"):  # what it had in hand it has no more
                 path.unlink(missing_ok=True)
 
-        code = supervise(settings.workers, work, fell=fell)
+        # Requests and streams each end within the grace; what still runs long after it hangs.
+        code = supervise(
+            settings.workers, work, ended=ended, kill_after_s=settings.drain_s + 2 * settings.grace_s + 10.0
+        )
     if code:
         raise typer.Exit(code)
 
@@ -183,12 +210,7 @@ def _held_port(host: str, port: int | None) -> Iterator[int | None]:
         return
     with _listen(host, port) as alone:  # a service that shares its ports would else be joined by another one in silence
         chosen = int(alone.getsockname()[1])
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as holder:
-        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        try:
-            holder.bind((host, chosen))
-        except OSError as error:
-            raise _cannot_listen(host, chosen, error) from error
+    with _bind_shared(host, chosen):
         yield chosen
 
 
@@ -197,7 +219,7 @@ def _answer(
     listener: socket.socket,
     health: socket.socket | None,
     *,
-    choices: "Choices | None" = None,
+    table: "ServingTable | None" = None,
     ready: Callable[[], None] = lambda: None,
     says_where: bool = True,
 ) -> None:
@@ -219,7 +241,7 @@ def _answer(
     if settings.grpc_port is not None:
         import service.grpc.server  # noqa: F401  # so that it is among what stays
     with _settled():
-        engine = Engine.open(settings, choices=choices)
+        engine = Engine.open(settings, table)
         try:
             config = uvicorn.Config(
                 create_app(engine, keys), http=BoundedHttp, ws="none", proxy_headers=False, log_config=None, access_log=False,
@@ -228,7 +250,7 @@ def _answer(
             beside = [] if health is None else [(health, _plain(create_health_app(engine)))]
             with (
                 _grpc(engine, keys, tls) as (grpc_port, leave),
-                _watching(engine),
+                _reloading(engine),
                 reloading(keys, tls, every_s=settings.watch_s),
             ):
                 server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave, beside=beside)
@@ -290,18 +312,38 @@ def _grpc(
 
 
 @contextmanager
-def _watching(engine: "Engine") -> Iterator[None]:
-    """Mount new bundles inside: every so often, and on SIGHUP."""
-    from service.runtime.map_watcher import MapWatcher
+def _hangup_held_back() -> Iterator[None]:
+    """SIGHUP waits inside until ``_reloading`` has a handler for it; without one it would end the process.
 
-    watcher = MapWatcher(engine.registry, engine.settings.maps, warm=engine.warm, after=engine.follow_choices)
-    watcher.start(engine.settings.watch_s or threading.TIMEOUT_MAX)
-    before = signal.signal(signal.SIGHUP, lambda *_: watcher.look_now()) if hasattr(signal, "SIGHUP") else None
+    The supervisor does the same for workers.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
         yield
     finally:
-        if before is not None:
-            signal.signal(signal.SIGHUP, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _reloading(engine: "Engine") -> Iterator[None]:
+    """Look for new bundles inside: every so often, and on SIGHUP.
+
+    SIGHUP means: read again what lies outside. Whatever else is to be read anew belongs into ``reload``. Nothing inside the service
+    sends SIGHUP; workers tell each other about maps through the serving table.
+    """
+    watcher = engine.watcher
+
+    def reload(_number: int, _frame: FrameType | None) -> None:  # runs between two instructions of the main thread
+        watcher.look_now()
+
+    watcher.start(engine.settings.watch_s or threading.TIMEOUT_MAX)
+    before = signal.signal(signal.SIGHUP, reload)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})  # one that came meanwhile is handled now
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+        signal.signal(signal.SIGHUP, before)
         watcher.stop()
 
 
@@ -315,16 +357,33 @@ def _listen_for_health(settings: "Settings", *, shared: bool = False) -> Iterato
     if settings.health_port is None:
         yield None
         return
-    with _listen(settings.health_host or settings.host, settings.health_port, shared=shared) as listener:
+    listen = _bind_shared if shared else _listen
+    with listen(settings.health_host or settings.host, settings.health_port) as listener:
         yield listener
 
 
-def _listen(host: str, port: int, *, shared: bool = False) -> socket.socket:
+def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=_BACKLOG, reuse_port=shared)
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
     except OSError as error:
         raise _cannot_listen(host, port, error) from error
+
+
+def _bind_shared(host: str, port: int) -> socket.socket:
+    """A socket on a port that other processes share.
+
+    It does not listen yet. The system gives connections only to sockets that listen, so nobody waits for a worker that still opens maps.
+    """
+    bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    try:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        bound.bind((host, port))
+    except OSError as error:
+        bound.close()
+        raise _cannot_listen(host, port, error) from error
+    return bound
 
 
 def _cannot_listen(host: str, port: int, error: OSError) -> AddressError:
@@ -340,6 +399,8 @@ def _say_where(
         typer.echo(
             f"map {manifest.name} {manifest.version}: {manifest.counts.places} places, {manifest.counts.views} views"
         )
+    if not len(engine.registry):
+        typer.echo(_no_map_yet(engine.settings))
     shown = f"[{host}]" if ":" in host else host
     if grpc_port is not None:
         typer.echo(f"serving gRPC at {shown}:{grpc_port} (what it can do: proto/, or by reflection)")
@@ -349,3 +410,8 @@ def _say_where(
     if engine.settings.console:
         typer.echo(f"console at {scheme}://{shown}:{port}/console/")
     typer.echo(f"serving at {scheme}://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")
+
+
+def _no_map_yet(settings: "Settings") -> str:
+    where = ", ".join(map(str, settings.maps))
+    return f"no map yet: not ready (/readyz answers 503) until a map bundle lies in {where}"

@@ -1,90 +1,189 @@
-"""``streetfix serve --workers N``: processes that answer on the same ports; maps are in memory once, since all map the same files."""
+"""``streetfix serve --workers N``: the supervisor, which starts worker processes, restarts them and ends them.
+
+The supervisor changes its list of workers in one place only, its main loop. Signal handlers do nothing: the interpreter writes the number
+of each signal into a pipe, and the loop reads it. So no handler can run between ``fork`` and the entry of the new process in the
+list, or between ``waitpid`` and the removal of the ended one.
+"""
 
 import ctypes
 import os
+import select
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
-from types import FrameType
 
 import typer
 
 from service.errors import StreetfixError
 
-#: A worker that fell is started again after this long, so that one that falls at once does not keep the machine busy.
-AGAIN_S = 1.0
+#: Seconds before a worker that ended by itself is started again, so that one that ends at once does not keep the machine busy.
+RESTART_S = 1.0
 _PR_SET_PDEATHSIG = 1
+_STOPPING = (signal.SIGTERM, signal.SIGINT)
+_WATCHED = (*_STOPPING, signal.SIGHUP, signal.SIGCHLD)
+#: Exit codes of a worker that ended because it was told to: by itself, or by the signal before it had a handler.
+_AS_TOLD = (0, -signal.SIGTERM, -signal.SIGINT)
 Work = Callable[[int, Callable[[], None]], None]
 
 
-def supervise(count: int, work: Work, *, fell: Callable[[int], None] = lambda _: None) -> int:
-    """Run workers until SIGTERM or SIGINT; SIGHUP is passed on to all of them.
+def supervise(
+    count: int, work: Work, *, ended: Callable[[int], None] = lambda _: None, kill_after_s: float | None = None
+) -> int:
+    """Run workers until SIGTERM or SIGINT, and pass SIGHUP on to all of them.
 
-    Must be called before anything that holds threads: workers are forked.
+    It must be called in the main thread, before anything that starts threads, because workers are forked.
 
     Args:
-        count: of workers.
-        work: of one: its number, and what it calls when it answers. It returns when it was told to stop.
-        fell: told the process of a worker that is no more.
+        count: number of workers, at most 256.
+        work: what a worker does. It gets the worker's number and a function to call once it answers requests, and returns when the worker
+            was told to stop. SIGHUP is blocked when it is called; it must unblock SIGHUP when it has a handler for it.
+        ended: called with the process id of every worker that has ended.
+        kill_after_s: workers that still run so many seconds after they were told to stop are killed; None waits without limit.
 
     Returns:
-        The exit code: 1 where a worker ended before it ever answered (it said why), or a worker ended badly when told to stop.
+        The exit code. It is 1 if a worker ended before it ever answered, if one ended with an error when it was told to stop, or if one had
+        to be killed.
     """
-    ready, told = os.pipe()
-    os.set_blocking(ready, False)
-    running: dict[int, int] = {}
-    leaving, code = False, 0
+    with _signals_as_bytes() as signals:
+        return _Supervisor(count, work, signals, ended, kill_after_s).run()
 
-    def pass_on(number: int, _frame: FrameType | None) -> None:
-        nonlocal leaving
-        leaving = leaving or number != signal.SIGHUP
-        for pid in list(running):
+
+class _Supervisor:
+    def __init__(
+        self, count: int, work: Work, signals: int, ended: Callable[[int], None], kill_after_s: float | None
+    ) -> None:
+        self._work, self._signals, self._ended, self._kill_after_s = work, signals, ended, kill_after_s
+        self._ready, self._tell_ready = os.pipe()
+        os.set_blocking(self._ready, False)
+        self._running: dict[int, int] = {}  # process id -> number of the worker
+        self._due = dict.fromkeys(range(count), 0.0)  # number of a worker that is to be started -> when
+        self._answered: set[int] = set()
+        self._stopping = False
+        self._kill_at: float | None = None
+        self._code = 0
+
+    def run(self) -> int:
+        try:
+            while self._running or self._due:
+                self._start_what_is_due()
+                select.select([self._signals], [], [], self._patience_s())
+                received = _bytes(self._signals)
+                if signal.SIGCHLD in received:
+                    self._reap()
+                for number in (signal.SIGHUP, *_STOPPING):
+                    if number in received:
+                        self._pass_on(number)
+                if self._kill_at is not None and time.monotonic() >= self._kill_at:
+                    self._kill()
+            return self._code
+        except BaseException:  # a defect here must not leave workers behind
+            self._pass_on(signal.SIGTERM)
+            raise
+        finally:
+            os.close(self._ready)
+            os.close(self._tell_ready)
+
+    def _start_what_is_due(self) -> None:
+        now = time.monotonic()
+        for number in [each for each, at in self._due.items() if at <= now]:
+            del self._due[number]
+            try:
+                self._running[_forked(number, self._work, self._tell_ready)] = number
+            except OSError as error:  # the machine has no room for another process
+                typer.echo(f"streetfix: worker {number} cannot be started ({error.strerror})", err=True)
+                self._not_running(number)
+
+    def _patience_s(self) -> float | None:
+        """Seconds until something has to be done although no signal comes; None if nothing has."""
+        moments = [*self._due.values(), *([] if self._kill_at is None else [self._kill_at])]
+        return max(0.0, min(moments) - time.monotonic()) if moments else None
+
+    def _reap(self) -> None:
+        while self._running:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if pid == 0:
+                return
+            if pid not in self._running:  # a process that somebody else in this program started
+                continue
+            number, code = self._running.pop(pid), os.waitstatus_to_exitcode(status)
+            self._answered.update(_bytes(self._ready))
+            self._ended(pid)
+            if self._stopping:
+                self._code = self._code or int(code not in _AS_TOLD)
+            else:
+                if number in self._answered:
+                    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+                    typer.echo(f"streetfix: worker {number} ended by itself and is started again ({how})", err=True)
+                self._not_running(number)
+
+    def _not_running(self, number: int) -> None:
+        """Start a worker again after a while if it ever answered; else end the service."""
+        if number in self._answered:
+            self._due[number] = time.monotonic() + RESTART_S
+        else:
+            self._code = 1
+            self._pass_on(signal.SIGTERM)
+
+    def _pass_on(self, number: int) -> None:
+        if number in _STOPPING:
+            self._stopping = True
+            self._due.clear()
+            if self._kill_at is None and self._kill_after_s is not None:
+                self._kill_at = time.monotonic() + self._kill_after_s
+        for pid in self._running:  # none of them was reaped, so each id is still that of the worker
             os.kill(pid, number)
 
-    before = {number: signal.signal(number, pass_on) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
-    answered: set[int] = set()
+    def _kill(self) -> None:
+        typer.echo("streetfix: workers that did not stop are killed", err=True)
+        self._kill_at, self._kill_after_s, self._code = None, None, 1
+        for pid in self._running:
+            os.kill(pid, signal.SIGKILL)
+
+
+@contextmanager
+def _signals_as_bytes() -> Iterator[int]:
+    """A pipe that holds one byte, the number, for each signal that has come."""
+    read, write = os.pipe()
+    for end in (read, write):
+        os.set_blocking(end, False)
+    wakeup = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    before = {number: signal.signal(number, lambda *_: None) for number in _WATCHED}
     try:
-        for number in range(count):
-            running[_forked(number, work, told)] = number
-        while running:
-            pid, status = os.wait()
-            number, ended = running.pop(pid), os.waitstatus_to_exitcode(status)
-            answered.update(_bytes(ready))
-            fell(pid)
-            if leaving:
-                code = code or int(
-                    ended not in (0, -signal.SIGTERM)
-                )  # a signal before it had a handler ends it as well
-            elif number not in answered:
-                code = 1
-                pass_on(signal.SIGTERM, None)
-            else:
-                typer.echo(f"streetfix: worker {number} ended by itself and is started again", err=True)
-                time.sleep(AGAIN_S)
-                if not leaving:  # a signal may have come meanwhile
-                    running[_forked(number, work, told)] = number
+        yield read
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        os.close(ready)
-        os.close(told)
-    return code
+        signal.set_wakeup_fd(wakeup)
+        os.close(read)
+        os.close(write)
 
 
-def _forked(number: int, work: Work, told: int) -> int:
-    pid = os.fork()
-    if pid:
-        return pid
+def _forked(number: int, work: Work, tell_ready: int) -> int:
+    """Start a worker; its process id."""
+    parent = os.getpid()
+    # A signal for the child must wait until the child has its own handlers: until then it would be written into the parent's pipe and lost.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _WATCHED)
+    try:
+        pid = os.fork()
+        if pid:
+            return pid
+    finally:
+        if os.getpid() == parent:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
     code = 1
     try:
-        os.setpgid(0, 0)  # Ctrl-C of a terminal reaches the parent alone, which passes it on
-        _die_with_the_parent()
-        for each in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.set_wakeup_fd(-1)
+        for each in _WATCHED:
             signal.signal(each, signal.SIG_DFL)
-        work(number, partial(_write, told, number))
+        os.setpgid(0, 0)  # Ctrl-C of a terminal reaches the parent alone, which passes it on
+        _die_with_the_parent(parent)
+        # By default SIGHUP would end a worker that has no handler yet.
+        signal.pthread_sigmask(signal.SIG_SETMASK, {*before, signal.SIGHUP})
+        work(number, partial(_write, tell_ready, number))
         code = 0
     except StreetfixError as error:
         typer.echo(f"streetfix: {error.message}", err=True)
@@ -102,13 +201,16 @@ def _write(pipe: int, number: int) -> None:
 
 def _bytes(pipe: int) -> bytes:
     try:
-        return os.read(pipe, 4096)
+        return os.read(pipe, 65536)
     except BlockingIOError:
         return b""
 
 
-def _die_with_the_parent() -> None:
+def _die_with_the_parent(parent: int) -> None:
     """On Linux a worker whose parent was killed is told to stop; elsewhere it stays until it is told."""
     prctl = getattr(ctypes.CDLL(None), "prctl", None)
-    if prctl is not None:
-        prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
+    if prctl is None:
+        return
+    prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
+    if os.getppid() != parent:  # it was killed before it could be watched
+        os.kill(os.getpid(), signal.SIGTERM)

@@ -16,7 +16,10 @@ from service.contract.schema import (
 )
 from service.errors import (
     ForeignServiceError,
+    HandshakeError,
+    KeysError,
     NoAnswerInTimeError,
+    NotLocalizedError,
     RefusedError,
     RequestError,
     StreetfixError,
@@ -33,9 +36,12 @@ __all__ = [
     "ForeignServiceError",
     "Frame",
     "GrpcClient",
+    "HandshakeError",
+    "KeysError",
     "LocalizeAnswer",
     "MapEntry",
     "NoAnswerInTimeError",
+    "NotLocalizedError",
     "Options",
     "PinholeCamera",
     "Pose",

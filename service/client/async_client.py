@@ -4,6 +4,7 @@ import asyncio
 import random
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
 
@@ -13,6 +14,7 @@ from service.client import asking, rest
 from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.encode import JPEG_QUALITY, Packing
 from service.client.retry import Attempts, RetryPolicy
+from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
 from service.errors import RefusedError, StreetfixError
 from service.imaging.raw16 import Codec
@@ -29,11 +31,13 @@ class AsyncClient:
     def __init__(
         self, url: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
         quality: int | None = JPEG_QUALITY, depth_codec: Codec = "zstd",
+        ca: str | Path | None = None, cert: str | Path | None = None, key: str | Path | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep, clock: Callable[[], float] = time.monotonic,
         draw: Callable[[], float] = random.random,
     ) -> None:  # fmt: skip
-        how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s)
+        self._tls = ClientTls.of(ca, cert, key)
+        how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s, tls=self._tls)
         self._url, self._timeout_s = url, timeout_s
         self._packing = Packing(quality, depth_codec)
         self._policy = retry or RetryPolicy()
@@ -88,7 +92,7 @@ class AsyncClient:
         attempts = Attempts(self._policy, self._clock, self._draw)
         while True:
             try:
-                with rest.errors_of_httpx(self._url, self._timeout_s):
+                with rest.errors_of_httpx(self._url, self._timeout_s, self._tls):
                     response = await self._http.request(call.method, call.path, files=call.files or None)
                 return rest.answer_of(call, response)
             except StreetfixError as error:

@@ -3,6 +3,7 @@
 import random
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
 
@@ -12,6 +13,7 @@ from service.client import asking, rest
 from service.client.asking import About, AboutSequence, Camera, Depth, Frame, Rgb
 from service.client.encode import JPEG_QUALITY, Packing
 from service.client.retry import Attempts, RetryPolicy
+from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
 from service.errors import RefusedError, StreetfixError
 from service.imaging.raw16 import Codec
@@ -29,23 +31,30 @@ class Client:
         retry: when to ask again.
         quality: of the JPEG that colour is sent as, 1 to 100; None sends PNG.
         depth_codec: of the raw16 that depth is sent as; lz4 costs both sides less time and the link more bytes than zstd.
+        ca: PEM file of the authorities that may have signed the service's certificate; else the file of ``STREETFIX_CLIENT_CA``, of
+            ``SSL_CERT_FILE``, and the public authorities.
+        cert: PEM file of the client's own certificate, where the service asks for one; else that of ``STREETFIX_CLIENT_CERT``.
+        key: PEM file of its private key, not encrypted; else that of ``STREETFIX_CLIENT_KEY``.
         transport: httpx', in place of sockets.
         sleep: waits between attempts.
         clock: monotonic seconds.
         draw: a random number in [0, 1).
 
     Raises:
-        RequestError: the address is none, or a number makes no sense.
+        RequestError: the address is none, a number makes no sense, or a certificate lacks its key.
+        KeysError: a file of ``ca``, ``cert`` or ``key`` cannot be used.
     """
 
     def __init__(
         self, url: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
         quality: int | None = JPEG_QUALITY, depth_codec: Codec = "zstd",
+        ca: str | Path | None = None, cert: str | Path | None = None, key: str | Path | None = None,
         transport: httpx.BaseTransport | None = None,
         sleep: Callable[[float], None] = time.sleep, clock: Callable[[], float] = time.monotonic,
         draw: Callable[[], float] = random.random,
     ) -> None:  # fmt: skip
-        how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s)
+        self._tls = ClientTls.of(ca, cert, key)
+        how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s, tls=self._tls)
         self._url, self._timeout_s = url, timeout_s
         self._packing = Packing(quality, depth_codec)
         self._policy = retry or RetryPolicy()
@@ -81,6 +90,7 @@ class Client:
             RefusedError: the service answered with a problem.
             UnavailableError: it refused for now, and did so until patience ended.
             UnreachableError: nothing answers.
+            HandshakeError: TLS failed; the message says what to check.
         """
         return self.call(rest.localize(asking.one(rgb, depth, camera, about, self._packing)))
 
@@ -135,7 +145,7 @@ class Client:
         attempts = Attempts(self._policy, self._clock, self._draw)
         while True:
             try:
-                with rest.errors_of_httpx(self._url, self._timeout_s):
+                with rest.errors_of_httpx(self._url, self._timeout_s, self._tls):
                     response = self._http.request(call.method, call.path, files=call.files or None)
                 return rest.answer_of(call, response)
             except StreetfixError as error:

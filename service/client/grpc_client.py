@@ -3,6 +3,7 @@
 import random
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar, Unpack
 
@@ -14,6 +15,7 @@ from service.client.encode import JPEG_QUALITY, Packing
 from service.client.grpc_errors import errors_of_grpc, refused_in_batch
 from service.client.rest import geojson
 from service.client.retry import Attempts, RetryPolicy
+from service.client.tls import ClientTls
 from service.contract.schema import LocalizeAnswer, MapEntry
 from service.errors import RefusedError, RequestError, StreetfixError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
@@ -40,18 +42,25 @@ class GrpcClient:
         retry: when to ask again.
         quality: of the JPEG that colour is sent as, 1 to 100; None sends PNG.
         depth_codec: of the raw16 that depth is sent as; lz4 costs both sides less time and the link more bytes than zstd.
-        credentials: TLS; None speaks without.
+        ca: PEM file of the authorities that may have signed the service's certificate; else the file of ``STREETFIX_CLIENT_CA``, of
+            ``SSL_CERT_FILE``, and the public authorities.
+        cert: PEM file of the client's own certificate, where the service asks for one; else that of ``STREETFIX_CLIENT_CERT``.
+        key: PEM file of its private key, not encrypted; else that of ``STREETFIX_CLIENT_KEY``.
+        tls: whether to speak TLS; None does where ``ca`` or ``cert`` is given, as an argument or as a variable of ours.
+        credentials: TLS of the caller's own making, in place of all that.
         sleep: waits between attempts.
         clock: monotonic seconds.
         draw: a random number in [0, 1).
 
     Raises:
-        RequestError: the address is none.
+        RequestError: the address is none, a certificate lacks its key, or TLS is described twice or for a call without TLS.
+        KeysError: a file of ``ca``, ``cert`` or ``key`` cannot be used.
     """
 
     def __init__(
         self, address: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
         quality: int | None = JPEG_QUALITY, depth_codec: Codec = "zstd",
+        ca: str | Path | None = None, cert: str | Path | None = None, key: str | Path | None = None, tls: bool | None = None,
         credentials: grpc.ChannelCredentials | None = None,
         sleep: Callable[[float], None] = time.sleep, clock: Callable[[], float] = time.monotonic,
         draw: Callable[[], float] = random.random,
@@ -68,6 +77,12 @@ class GrpcClient:
         self._packing = Packing(quality, depth_codec)
         self._policy = retry or RetryPolicy()
         self._sleep, self._clock, self._draw = sleep, clock, draw
+        self._tls = ClientTls.of(ca, cert, key)
+        if self._tls.is_argument and (tls is False or credentials is not None):
+            raise RequestError("ca: it does not go with tls=False, nor with credentials; give one of them", field="ca")
+        if credentials is None and (self._tls.is_wanted if tls is None else tls):
+            credentials = grpc.ssl_channel_credentials(*self._tls.pems())
+        self._speaks_tls = credentials is not None
         self._channel = (
             grpc.insecure_channel(address, options=_OPTIONS)
             if credentials is None
@@ -124,7 +139,7 @@ class GrpcClient:
         attempts = Attempts(self._policy, self._clock, self._draw)
         while True:
             try:
-                with errors_of_grpc(self._address, self._timeout_s):
+                with errors_of_grpc(self._address, self._timeout_s, self._tls if self._speaks_tls else None):
                     return read(method(message, timeout=self._timeout_s, metadata=self._metadata))
             except StreetfixError as error:
                 wait_s = attempts.wait_after(error)

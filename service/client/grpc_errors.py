@@ -9,6 +9,7 @@ from google.rpc import error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
 from service.client.problems import refused
+from service.client.tls import ClientTls, closed_hint, handshake_error
 from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, StreetfixError, UnreachableError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
@@ -16,10 +17,16 @@ REQUEST_ID = "x-request-id"
 
 
 @contextmanager
-def errors_of_grpc(address: str, timeout_s: float) -> Iterator[None]:
+def errors_of_grpc(address: str, timeout_s: float, tls: ClientTls | None) -> Iterator[None]:
     """Errors of the library as ours.
 
+    Args:
+        address: of the service.
+        timeout_s: that it had.
+        tls: that the client spoke; None: it spoke none.
+
     Raises:
+        HandshakeError: TLS failed.
         RefusedError: the service answered with a problem.
         NoAnswerInTimeError: the time has ended.
         UnreachableError: the connection failed.
@@ -28,7 +35,7 @@ def errors_of_grpc(address: str, timeout_s: float) -> Iterator[None]:
     try:
         yield
     except grpc.RpcError as error:
-        raise _of(error, address, timeout_s) from error
+        raise _of(error, address, timeout_s, tls) from error
     except ValueError as error:
         raise ForeignServiceError(
             f"{address}: what answers there is of another contract ({error}); check the address", field="url"
@@ -43,7 +50,7 @@ def refused_in_batch(problem: pb.Problem) -> RefusedError:
     )  # fmt: skip
 
 
-def _of(error: grpc.RpcError, address: str, timeout_s: float) -> StreetfixError:
+def _of(error: grpc.RpcError, address: str, timeout_s: float, tls: ClientTls | None) -> StreetfixError:
     if not isinstance(error, grpc.Call):
         return UnreachableError(f"{address}: the call failed ({error}); check the address", field="url")
     code, said = error.code(), error.details() or ""
@@ -56,10 +63,13 @@ def _of(error: grpc.RpcError, address: str, timeout_s: float) -> StreetfixError:
             f"{address}: no answer within {timeout_s:g} s; ask again, or give more timeout_s", field="timeout_s"
         )
     if code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
-        return UnreachableError(
-            f"{address}: no service answers ({said}); start one with: streetfix serve BUNDLE --grpc-port PORT",
-            field="url",
-        )
+        handshake = None if tls is None else handshake_error(address, said)
+        if handshake is not None:
+            return handshake
+        remedy = "start one with: streetfix serve BUNDLE --grpc-port PORT"
+        if "socket closed" in said.lower():
+            remedy = closed_hint(speaks_tls=tls is not None, shows_certificate=tls is not None and tls.cert is not None)
+        return UnreachableError(f"{address}: no service answers ({said}); {remedy}", field="url")
     if code in (grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.UNKNOWN):
         return ForeignServiceError(
             f"{address}: what answers there is no Streetfix ({said}); check the address", field="url"

@@ -49,15 +49,17 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
             "status": pb.LocalizationStatus.Name(message.status).removeprefix(_STATUS_PREFIX),
             "confidence": message.confidence if message.HasField("confidence") else None,
             "street": _street_content(message.street) if message.HasField("street") else None,
-            "pose": _pose_content(message.pose),
+            "pose": _pose_content(message.pose) if message.HasField("pose") else None,
             "vehicle_pose": _pose_content(message.vehicle_pose) if message.HasField("vehicle_pose") else None,
             "geopose": _geopose_content(message.geopose) if message.HasField("geopose") else None,
             "hypotheses": [
                 {
-                    "pose": _pose_content(each.pose), "share": each.share, "inliers": each.inliers, "similarity": each.similarity,
+                    "confirmed": each.confirmed, "pose": _pose_content(each.pose), "share": each.share, "inliers": each.inliers,
+                    "similarity": each.similarity,
                 }
                 for each in message.hypotheses
             ],
+            "spread": _spread_content(message.spread) if message.HasField("spread") else None,
             "neighbours": [
                 {
                     "place": each.place, "distance": each.distance, "similarity": each.similarity,
@@ -119,7 +121,7 @@ def _prior(prior: schema.Prior | None) -> pb.Prior | None:
     )  # fmt: skip
 
 
-def _vector(vector: schema.Vector | None) -> pb.Vector3 | None:
+def _vector(vector: schema.Direction | None) -> pb.Vector3 | None:
     return None if vector is None else pb.Vector3(x=vector.x, y=vector.y, z=vector.z)
 
 
@@ -144,6 +146,13 @@ def _pose_content(message: pb.Pose) -> dict[str, Any]:
     return {
         "position": _xyz(message.position), "orientation": _xyzw(message.orientation), "heading_deg": message.heading_deg,
         "covariance": list(message.covariance) or None,
+    }  # fmt: skip
+
+
+def _spread_content(message: pb.Spread) -> dict[str, Any]:
+    return {
+        "mean": _xyz(message.mean), "covariance": list(message.covariance), "heading_std_deg": message.heading_std_deg,
+        "hypotheses_weight": message.hypotheses_weight,
     }  # fmt: skip
 
 

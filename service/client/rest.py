@@ -2,6 +2,7 @@
 
 import json
 import math
+import ssl
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 
 from service.client.asking import Asked
 from service.client.problems import refused
+from service.client.tls import ClientTls, closed_hint, handshake_error, ssl_reason
 from service.contract import schema
 from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, RequestError, UnreachableError
 
@@ -108,11 +110,12 @@ def geojson(body: bytes) -> dict[str, Any]:
     return found
 
 
-def settings_for(url: str, *, api_key: str | None, timeout_s: float) -> dict[str, Any]:
+def settings_for(url: str, *, api_key: str | None, timeout_s: float, tls: ClientTls) -> dict[str, Any]:
     """What both of httpx' clients are made with.
 
     Raises:
-        RequestError: the address is none, or the time is not positive.
+        RequestError: the address is none, the time is not positive, or TLS is described for an address without TLS.
+        KeysError: a file of TLS cannot be used.
     """
     if not (timeout_s > 0 and math.isfinite(timeout_s)):
         raise RequestError(f"timeout_s: {timeout_s} is no time to wait; give seconds", field="timeout_s")
@@ -122,8 +125,14 @@ def settings_for(url: str, *, api_key: str | None, timeout_s: float) -> dict[str
         raise RequestError(f"url: {url!r} is no address ({error}); give http://HOST:PORT", field="url") from error
     if address.scheme not in ("http", "https") or not address.host or "%" in address.host:
         raise RequestError(f"url: {url!r} is no address; give http://HOST:PORT", field="url")
+    if address.scheme == "http" and tls.is_argument:
+        raise RequestError(
+            f"url: {url!r} is an address without TLS, but ca, cert or key is given; give https://", field="url"
+        )
     return {
         "base_url": url.rstrip("/"), "timeout": timeout_s,
+        # Without TLS the library would still load all public authorities; this context trusts nobody.
+        "verify": tls.context() if address.scheme == "https" else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
         "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
         # A proxy named in the environment is for other machines: it could not reach this one's loopback.
         "trust_env": address.host not in _LOOPBACK,
@@ -148,10 +157,16 @@ def answer_of(call: Call[A], response: httpx.Response) -> A:
 
 
 @contextmanager
-def errors_of_httpx(url: str, timeout_s: float) -> Iterator[None]:
+def errors_of_httpx(url: str, timeout_s: float, tls: ClientTls) -> Iterator[None]:
     """Errors of the library as ours.
 
+    Args:
+        url: of the service.
+        timeout_s: that it had.
+        tls: that the client spoke, where the address is one of TLS.
+
     Raises:
+        HandshakeError: TLS failed.
         NoAnswerInTimeError: the time has ended after the service was reached.
         UnreachableError: the connection failed.
         RequestError: the request cannot be sent.
@@ -176,9 +191,14 @@ def errors_of_httpx(url: str, timeout_s: float) -> Iterator[None]:
         ) from error
     except (httpx.HTTPError, httpx.StreamError) as error:
         reason = str(error) or type(error).__name__
-        raise UnreachableError(
-            f"{url}: no service answers ({reason}); start one with: streetfix serve BUNDLE", field="url"
-        ) from error
+        told = ssl_reason(error)
+        handshake = None if told is None else handshake_error(url, told)
+        if handshake is not None:
+            raise handshake from error
+        remedy = "start one with: streetfix serve BUNDLE"
+        if not isinstance(error, httpx.ConnectError):
+            remedy = closed_hint(speaks_tls=url.startswith("https:"), shows_certificate=tls.cert is not None)
+        raise UnreachableError(f"{url}: no service answers ({reason}); {remedy}", field="url") from error
 
 
 def _problem_of(response: httpx.Response) -> RefusedError:

@@ -38,7 +38,8 @@ class Explanation:
     Attributes:
         located: the same answer as without explanation.
         pictures: PNG, by name: what could not be drawn is not among them.
-        points: of the query, where the answer puts them: x, y, z (float32, metres from ``origin_m``), red, green, blue, nothing.
+        points: of the query, where the best guess puts them; only a LOCALIZED answer confirms it. Each is x, y, z (float32, metres
+            from ``origin_m``), red, green, blue, nothing.
         origin_m: map frame.
     """
 
@@ -58,7 +59,7 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
     frame, decode_ms = engine.look_up(localizer, encoded)
     located = engine.answer(localizer, (frame,), decode_ms)
     answer, bundle = located.answer, located.bundle
-    T_map_camera = answer.T_map_camera
+    T_map_camera = answer.T_map_camera_guess
     registered = answer.candidates[0].registered if answer.candidates else None
     with engine.memory.hold() as hold:
         hold.grow(EXPLAIN_PEAK * frame.query.depth_m.size)

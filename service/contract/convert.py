@@ -23,8 +23,9 @@ from service.geometry.uncertainty import covariance_at
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
-from service.localization.rivals import behind, distinct_candidates, log_shares
+from service.localization.rivals import distinct_candidates, shares_of
 from service.localization.search import Neighbour
+from service.localization.spread import Spread
 from service.maps.reader import MapBundle
 from service.runtime.engine import EncodedQuery, Located
 from service.runtime.last_answers import LastAnswer
@@ -150,17 +151,21 @@ def fields_under(where: str) -> Iterator[None]:
 
 
 def answer_from(located: Located) -> schema.LocalizeAnswer:
-    """The answer as the contract says it."""
+    """The answer as the contract says it: without a pose, a geopose and a street unless it is LOCALIZED."""
     answer, bundle = located.answer, located.bundle
-    times = answer.timings
+    times, spread = answer.timings, answer.spread
+    localized = answer.status == "LOCALIZED"
+    T_map_camera = answer.T_map_camera_guess
+    T_map_posed = T_map_camera if answer.T_map_vehicle_guess is None else answer.T_map_vehicle_guess
     return schema.LocalizeAnswer(
         status=answer.status,
         confidence=answer.confidence,
-        street=_street(answer, bundle),
-        pose=_pose(answer.T_map_camera, heading_of_camera(answer.T_map_camera), answer.covariance),
-        vehicle_pose=_vehicle_pose(answer),
-        geopose=geopose_of(answer.T_map_camera if answer.T_map_vehicle is None else answer.T_map_vehicle, bundle),
+        street=_street(answer, bundle) if localized else None,
+        pose=_pose(T_map_camera, heading_of_camera(T_map_camera), answer.covariance) if localized else None,
+        vehicle_pose=_vehicle_pose(answer) if localized else None,
+        geopose=geopose_of(T_map_posed, bundle) if localized else None,
         hypotheses=_hypotheses(answer),
+        spread=None if spread is None else _spread(spread),
         neighbours=[_neighbour(each, bundle) for each in answer.neighbours],
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(
@@ -196,8 +201,8 @@ def last_answer_from(answer: LastAnswer) -> schema.LastAnswer:
         status=answer.status,
         confidence=answer.confidence,
         street=answer.street,
-        position=_vector(answer.position_m),
-        heading_deg=_degrees(answer.heading_rad),
+        position=None if answer.position_m is None else _vector(answer.position_m),
+        heading_deg=None if answer.heading_rad is None else _degrees(answer.heading_rad),
         frames=answer.frames,
         total_ms=answer.total_ms,
     )
@@ -239,6 +244,17 @@ def _require_supported(camera: schema.Camera) -> None:
         )
 
 
+def require_camera(camera: PinholeCamera) -> None:
+    """Hold intrinsics that came by no request against the contract's bounds.
+
+    Raises:
+        RequestError: a number makes no sense.
+    """
+    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    with fields_under("camera"):
+        checked(numbers, schema.Camera)
+
+
 def _camera(camera: schema.Camera) -> PinholeCamera:
     return PinholeCamera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
@@ -266,19 +282,26 @@ def _wgs84(prior: schema.Prior | None) -> tuple[float, float] | None:
 
 def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
     candidates = distinct_candidates(answer.candidates or ())
-    if not candidates:
-        return []
-    shares = np.exp(log_shares(behind(candidates, answer.frames)))
     return [
         schema.HypothesisOfPose(
-            pose=_pose(each.T_map_camera, heading_of_camera(each.T_map_camera), None), share=float(share),
-            inliers=each.registered.inliers, similarity=each.similarity,
+            confirmed=answer.status == "LOCALIZED" and number == 0,
+            pose=_pose(each.T_map_camera, heading_of_camera(each.T_map_camera), each.covariance),
+            share=float(share), inliers=each.registered.inliers, similarity=each.similarity,
         )
-        for each, share in zip(candidates, shares, strict=True)
+        for number, (each, share) in enumerate(zip(candidates, shares_of(candidates, answer.frames), strict=True))
     ]  # fmt: skip
 
 
-def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
+def _spread(spread: Spread) -> schema.Spread:
+    return schema.Spread(
+        mean=_vector(spread.mean_m),
+        covariance=spread.covariance.reshape(-1).tolist(),
+        heading_std_deg=math.degrees(spread.heading_std_rad),
+        hypotheses_weight=spread.hypotheses_weight,
+    )
+
+
+def _direction(vector: schema.Direction, field: str) -> NDArray[np.float64]:
     direction = np.array([vector.x, vector.y, vector.z])
     length = math.hypot(*direction)
     if not 1e-6 < length < 1e9:
@@ -288,7 +311,7 @@ def _direction(vector: schema.Vector, field: str) -> NDArray[np.float64]:
     return direction / length
 
 
-def _down(gravity: schema.Vector) -> NDArray[np.float64]:
+def _down(gravity: schema.Direction) -> NDArray[np.float64]:
     """Gravity's direction; along the optical axis it leaves no heading to localize."""
     down = _direction(gravity, "gravity")
     if abs(down[2]) > np.cos(np.deg2rad(20.0)):
@@ -330,10 +353,10 @@ def _street(answer: Answer, bundle: MapBundle) -> schema.Street | None:
 
 
 def _vehicle_pose(answer: Answer) -> schema.Pose | None:
-    T = answer.T_map_vehicle
+    T = answer.T_map_vehicle_guess
     if T is None:
         return None
-    about_camera, camera_m = answer.covariance, answer.T_map_camera[:3, 3]
+    about_camera, camera_m = answer.covariance, answer.T_map_camera_guess[:3, 3]
     covariance = None if about_camera is None else covariance_at(about_camera, camera_m, T[:3, 3])
     return _pose(T, heading_of_body(T), covariance)
 

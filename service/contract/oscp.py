@@ -10,8 +10,9 @@ Facts after github.com/OpenArCloud/oscp-geopose-protocol (README, November 2026)
 
 import base64
 import binascii
+import sys
 from math import atan2, degrees
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -32,6 +33,16 @@ _SAME_VIEW = 0.01  # of the picture's size
 #: Of a prior pose whose accuracy was not told, or told too well: its sender has moved since.
 _LEAST_STD_M, _MOST_STD_M, _HEADING_STD_DEG = 5.0, 1e5, 30.0
 
+#: Bounds of what clients send. What our own contract bounds more narrowly is refused there, by its name there.
+_Pixels = Annotated[float, Field(ge=-schema.MOST_COMPONENT, le=schema.MOST_COMPONENT)]
+_Side = Annotated[float, Field(ge=0, le=schema.MOST_SIDE)]
+_Metres = Annotated[float, Field(ge=0, le=1e5)]
+_Component = Annotated[float, Field(ge=-schema.MOST_COMPONENT, le=schema.MOST_COMPONENT)]
+#: -1 is iOS' word for not known, the largest float that of the clients' own structures.
+_Deviation = Annotated[float, Field(ge=-1, le=sys.float_info.max)]
+_Latitude = Annotated[float, Field(ge=-90, le=90)]
+_Longitude = Annotated[float, Field(ge=-180, le=180)]
+
 
 class _Lenient(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
@@ -41,15 +52,15 @@ class CameraParams(_Lenient):
     """Intrinsics."""
 
     model: str | None = None
-    modelParams: list[float] | None = Field(None, max_length=32)
-    minMaxDepth: list[float] | None = Field(None, max_length=2)
+    modelParams: list[_Pixels] | None = Field(None, max_length=32)
+    minMaxDepth: list[_Metres] | None = Field(None, max_length=2)
 
 
 class ImageOrientation(_Lenient):
     """How the picture lies in its bytes."""
 
     mirrored: bool | None = None
-    rotation: float | None = None
+    rotation: float | None = Field(None, ge=-360, le=360, description="degrees")
 
 
 class CameraReading(_Lenient):
@@ -59,7 +70,7 @@ class CameraReading(_Lenient):
     imageFormat: str | None = Field(
         None, description="RGBA32, JPG or GRAY8 for colour, whatever the file's own format; DEPTH for depth"
     )
-    size: list[float] | None = Field(None, max_length=2, description="width, height")
+    size: list[_Side] | None = Field(None, max_length=2, description="width, height")
     imageBytes: str | None = Field(None, description="base64 of an encoded picture, with or without a data: prefix")
     imageOrientation: ImageOrientation | None = None
     params: CameraParams | None = None
@@ -68,17 +79,17 @@ class CameraReading(_Lenient):
 class GeolocationReading(_Lenient):
     """What a satellite receiver says."""
 
-    latitude: float | None = None
-    longitude: float | None = None
-    accuracy: float | None = None
+    latitude: _Latitude | None = None
+    longitude: _Longitude | None = None
+    accuracy: _Deviation | None = None
 
 
 class AccelerometerReading(_Lenient):
     """Specific force."""
 
-    x: float | None = None
-    y: float | None = None
-    z: float | None = None
+    x: _Component | None = None
+    y: _Component | None = None
+    z: _Component | None = None
 
 
 class SensorReadings(_Lenient):
@@ -96,18 +107,42 @@ class Accuracy(_Lenient):
     orientation: float | None = None
 
 
+class EarlierAccuracy(_Lenient):
+    """Of an earlier answer, as ``Accuracy``."""
+
+    position: _Deviation | None = None
+    orientation: _Deviation | None = None
+
+
+class EarlierPosition(_Lenient):
+    """Of an earlier answer, on the WGS-84 ellipsoid."""
+
+    lat: _Latitude = Field(description="degrees")
+    lon: _Longitude = Field(description="degrees")
+    h: float = Field(ge=-1e5, le=1e5, description="metres above the ellipsoid")
+
+
+class EarlierGeoPose(_Lenient):
+    """An earlier answer's pose."""
+
+    position: EarlierPosition
+    quaternion: schema.Quaternion
+
+
 class PriorPose(_Lenient):
     """An earlier answer."""
 
-    accuracy: Accuracy | None = None
-    geopose: schema.GeoPose | None = None
+    accuracy: EarlierAccuracy | None = None
+    geopose: EarlierGeoPose | None = None
 
 
 class GeoPoseRequest(_Lenient):
     """A request."""
 
     id: str | None = Field(None, max_length=256)
-    timestamp: float | None = None
+    timestamp: float | None = Field(
+        None, ge=0, le=1e19, description="Unix ms; finer units pass, since nothing reads it"
+    )
     type: str | None = None
     sensorReadings: SensorReadings | None = None
     priorPoses: list[PriorPose] | None = Field(None, max_length=_MOST_READINGS)

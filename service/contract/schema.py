@@ -1,14 +1,20 @@
 """The contract as REST says it in JSON and gRPC in messages: requests and answers. Degrees here, radians inside."""
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from service.localization.query import MOST_NEIGHBOURS
+from service.errors import NotLocalizedError, RequestError
+from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS
 
-#: Of a focal length, in widths or heights of the picture: 175 degrees of view. What is less was given in another unit than pixels.
-LEAST_FOCAL = 0.02
+#: Of a focal length, in widths or heights of the picture: 175 and 0.6 degrees of view. What is less or more was given in another unit
+#: than pixels.
+LEAST_FOCAL, MOST_FOCAL = 0.02, 100.0
+#: Sides of a picture, pixels, and how many times longer than the other one of them may be: memory goes with the longer one.
+LEAST_SIDE, MOST_SIDE, MOST_ASPECT = 2, 32768, 16
+#: Components of a vector whose length does not matter: an accelerometer may count in m/s2, in thousandths of g or in its own steps.
+MOST_COMPONENT = 1e6
 
 
 class _Strict(BaseModel):
@@ -23,13 +29,21 @@ class Vector(_Strict):
     z: float
 
 
+class Direction(_Strict):
+    """Three numbers of which only the direction counts."""
+
+    x: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
+    y: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
+    z: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
+
+
 class Quaternion(_Strict):
     """A rotation; of any length but zero when sent, of length 1 when answered."""
 
-    x: float
-    y: float
-    z: float
-    w: float
+    x: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
+    y: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
+    z: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
+    w: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
 
 
 class Position(_Strict):
@@ -50,27 +64,56 @@ class RigidTransform(_Strict):
 class Camera(_Strict):
     """Intrinsics of the rectified colour picture, pixels; the centre of the first pixel is (0, 0)."""
 
-    model: Literal["PINHOLE"] = "PINHOLE"
-    width: int = Field(ge=2, le=32768)
-    height: int = Field(ge=2, le=32768)
-    fx: float = Field(gt=0, le=1e6, description=f"pixels, at least {LEAST_FOCAL} of the width")
-    fy: float = Field(gt=0, le=1e6, description=f"pixels, at least {LEAST_FOCAL} of the height")
-    cx: float = Field(ge=-1e6, le=1e6)
-    cy: float = Field(ge=-1e6, le=1e6)
-    distortion: list[float] = Field(
-        default_factory=list, max_length=14, description="must be empty or zero: send rectified pictures"
+    model: Literal["PINHOLE"] = Field(
+        "PINHOLE", description="what the pictures are after rectification; any other model is refused, not misread"
     )
+    width: int = Field(ge=LEAST_SIDE, le=MOST_SIDE)
+    height: int = Field(
+        ge=LEAST_SIDE, le=MOST_SIDE, description=f"neither side is longer than {MOST_ASPECT} times the other"
+    )
+    fx: float = Field(
+        ge=LEAST_FOCAL * LEAST_SIDE, le=MOST_FOCAL * MOST_SIDE,
+        description=f"pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} of the width",
+    )  # fmt: skip
+    fy: float = Field(
+        ge=LEAST_FOCAL * LEAST_SIDE, le=MOST_FOCAL * MOST_SIDE,
+        description=f"pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} of the height",
+    )  # fmt: skip
+    cx: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
+    cy: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
+    distortion: list[Annotated[float, Field(ge=-1e3, le=1e3)]] = Field(
+        default_factory=list,
+        max_length=14,
+        description="of the pictures as sent: empty or zero; others are refused, not misread: rectify first",
+    )
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _is_rectified(cls, model: object) -> object:
+        if model != "PINHOLE":
+            raise ValueError("only PINHOLE is read; rectify both pictures and send the rectified pictures' intrinsics")
+        return model
 
     @field_validator("fx", "fy")
     @classmethod
     def _is_in_pixels(cls, focal: float, info: ValidationInfo) -> float:
         side = info.data.get("width" if info.field_name == "fx" else "height")  # None: refused itself
-        if side is not None and focal < LEAST_FOCAL * side:
+        if side is not None and not LEAST_FOCAL * side <= focal <= MOST_FOCAL * side:
             seen_deg = 2 * math.degrees(math.atan(0.5 * side / focal))
             raise ValueError(
-                f"{focal:g} px for a side of {side} px would see {seen_deg:.0f} degrees; give it in pixels"
+                f"{focal:g} px for a side of {side} px would see {seen_deg:.3g} degrees; give it in pixels"
             )
         return focal
+
+    @field_validator("height")
+    @classmethod
+    def _is_no_strip(cls, height: int, info: ValidationInfo) -> int:
+        width = info.data.get("width")  # None: refused itself
+        if width is not None and max(width, height) > MOST_ASPECT * min(width, height):
+            raise ValueError(
+                f"a picture of {width} x {height} px is a strip; no side may be more than {MOST_ASPECT} times the other"
+            )
+        return height
 
 
 class Depth(_Strict):
@@ -78,7 +121,7 @@ class Depth(_Strict):
 
     scale_m: float | None = Field(
         None,
-        gt=0,
+        ge=1e-6,
         le=1e4,
         description="metres for each stored unit (disparity: pixels); default 0.001 for integers, 1 for floats",
     )
@@ -89,9 +132,9 @@ class Depth(_Strict):
         "auto",
         description="carla: depth in the 24 bits of a colour PNG; compressed_depth: data of a ROS compressedDepth message, PNG or RVL",
     )
-    max_range_m: float | None = Field(None, gt=0, le=1e5, description="what lies beyond is no measurement")
+    max_range_m: float | None = Field(None, ge=0.01, le=1e5, description="what lies beyond is no measurement")
     baseline_m: float | None = Field(
-        None, gt=0, le=100, description="of the stereo rig; needed for disparity; the rig's disparity offset is then estimated too"
+        None, ge=1e-3, le=100, description="of the stereo rig; needed for disparity; the rig's disparity offset is then estimated too"
     )  # fmt: skip
 
 
@@ -100,7 +143,7 @@ class PriorPosition(_Strict):
 
     x: float = Field(ge=-1e7, le=1e7)
     y: float = Field(ge=-1e7, le=1e7)
-    std_m: float = Field(20.0, gt=0, le=1e6, description="standard deviation of each coordinate")
+    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each coordinate")
 
 
 class PriorWgs84(_Strict):
@@ -108,7 +151,7 @@ class PriorWgs84(_Strict):
 
     latitude_deg: float = Field(ge=-90, le=90)
     longitude_deg: float = Field(ge=-180, le=180)
-    std_m: float = Field(20.0, gt=0, le=1e6, description="standard deviation of each horizontal coordinate")
+    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each horizontal coordinate")
 
 
 class Prior(_Strict):
@@ -119,7 +162,7 @@ class Prior(_Strict):
     heading_deg: float | None = Field(
         None, ge=-360, le=360, description="of the optical axis, counter-clockwise from map x"
     )
-    heading_std_deg: float = Field(20.0, gt=0, le=360)
+    heading_std_deg: float = Field(20.0, ge=1e-3, le=360)
 
 
 class Options(_Strict):
@@ -131,7 +174,7 @@ class Options(_Strict):
         description="register the depth picture on the map's cloud; false: the pose of retrieval alone, covariance and confidence null",
     )
     false_accept_rate: float | None = Field(
-        None, gt=0, lt=1,
+        None, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
         description="share of the queries taken outside the map that one can live with being LOCALIZED; less than the map's calibration "
         "measured is refused; default: the service's setting",
     )  # fmt: skip
@@ -167,7 +210,7 @@ class LocalizeRequest(_Strict):
     map: str | None = Field(None, max_length=64, description="optional where one map is mounted")
     camera: Camera
     depth: Depth = Depth()
-    gravity: Vector | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
+    gravity: Direction | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
     T_vehicle_camera: RigidTransform | None = Field(
         None, description="where the camera sits: the vehicle's pose is answered too"
     )
@@ -189,7 +232,7 @@ class SequenceFrame(_Strict):
 
     camera: Camera
     depth: Depth = Depth()
-    gravity: Vector | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
+    gravity: Direction | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
     T_reference_camera: RigidTransform | None = Field(
         None, description="where this camera stood against the first frame's; null in the first frame"
     )
@@ -265,12 +308,33 @@ class Neighbour(BaseModel):
 class HypothesisOfPose(BaseModel):
     """A place where the pictures may have been taken."""
 
-    pose: Pose = Field(description="T_map_camera")
+    confirmed: bool = Field(
+        description="true for the first hypothesis of a LOCALIZED answer alone: it is the answer's pose. false: do not use it as a pose"
+    )
+    pose: Pose = Field(
+        description="T_map_camera; its covariance holds only if this hypothesis is right, and is null for the others of a LOCALIZED answer"
+    )
     share: float = Field(
         description="of the support of all hypotheses, 0 to 1; LOCALIZED needs more than a half for the first"
     )
     inliers: float = Field(description="share of the depth's weight that lies on the map, 0 to 1")
     similarity: float = Field(description="of the pictures to the places around, cosine")
+
+
+class Spread(BaseModel):
+    """Where the camera may be, over all hypotheses and the rest of the map. It is not a pose: its mean is usually between the hypotheses.
+
+    Each hypothesis counts with the probability that it is right, the whole map with the rest. The covariance is that of the mixture
+    (law of total covariance): hypotheses that are metres apart give metres, and a single hypothesis that is probably wrong gives the
+    size of the map. Of an OUT_OF_MAP answer the camera may be outside the map as well, which no covariance can say.
+    """
+
+    mean: Vector = Field(description="metres, map frame; not a position of the camera")
+    covariance: list[float] = Field(description="3x3, row by row, of the position, map axes, m^2")
+    heading_std_deg: float = Field(
+        description="circular standard deviation of the heading; 103.9 where nothing is known of it"
+    )
+    hypotheses_weight: float = Field(description="probability that one of the hypotheses is right, 0 to 1")
 
 
 class MapVersion(BaseModel):
@@ -292,27 +356,81 @@ class TimingsMs(BaseModel):
 
 
 class LocalizeAnswer(BaseModel):
-    """An answer that is not LOCALIZED is still an answer."""
+    """Where the pictures were taken. Only a LOCALIZED answer has a pose, a vehicle's pose, a geopose and a street.
+
+    An answer that is not LOCALIZED says in `hypotheses` and `spread` where the camera may be. None of that is confirmed.
+    """
 
     status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"] = Field(
         description="LOCALIZED: act on it; AMBIGUOUS: in the map, but not sure where; OUT_OF_MAP: the map does not show what "
         "the pictures do. Always LOCALIZED where confidence is null"
     )
     confidence: float | None = Field(
-        description="probability that the position is within 1 m; null: not calibrated, or nothing was to be registered"
+        description="probability that the position of the first hypothesis is within 1 m; null: not calibrated, or nothing was to be "
+        "registered"
     )
-    street: Street | None = Field(description="null where the map has no streets, or the neighbours lie in none")
-    pose: Pose = Field(description="T_map_camera")
-    vehicle_pose: Pose | None = Field(description="T_map_vehicle, where T_vehicle_camera was sent")
+    street: Street | None = Field(
+        description="null unless LOCALIZED, and where the map has no streets or the position lies in none"
+    )
+    pose: Pose | None = Field(description="T_map_camera; null unless LOCALIZED")
+    vehicle_pose: Pose | None = Field(
+        description="T_map_vehicle, where T_vehicle_camera was sent; null unless LOCALIZED"
+    )
     geopose: GeoPose | None = Field(
-        description="the vehicle's where T_vehicle_camera was sent, else the camera's; null where the map is not georeferenced"
+        description="the vehicle's where T_vehicle_camera was sent, else the camera's; null unless LOCALIZED, and where the map is not "
+        "georeferenced"
     )
     hypotheses: list[HypothesisOfPose] = Field(
-        description="distinct poses that were registered, the best supported first; empty without registration"
+        description="distinct poses that were registered, the best supported first; unconfirmed unless LOCALIZED; empty without "
+        "registration"
     )
+    spread: Spread | None = Field(description="where the camera may be; null for a LOCALIZED answer")
     neighbours: list[Neighbour]
     map: MapVersion
     timings_ms: TimingsMs
+
+    @model_validator(mode="after")
+    def _no_pose_unless_localized(self) -> Self:
+        """No answer of another kind can be made or read, whatever made it."""
+        localized = self.status == "LOCALIZED"
+        if localized != (self.pose is not None) or localized != (self.spread is None):
+            raise ValueError("a LOCALIZED answer has a pose and no spread, every other one a spread and no pose")
+        if not localized and (self.vehicle_pose, self.geopose, self.street) != (None, None, None):
+            raise ValueError("an answer that is not LOCALIZED has no vehicle_pose, geopose or street")
+        if any(each.confirmed != (localized and number == 0) for number, each in enumerate(self.hypotheses)):
+            raise ValueError("only the first hypothesis of a LOCALIZED answer is confirmed")
+        return self
+
+    def require_pose(self) -> Pose:
+        """The camera's pose.
+
+        Raises:
+            NotLocalizedError: the answer is not LOCALIZED; the error carries the answer.
+        """
+        if self.pose is None:
+            raise self._not_localized()
+        return self.pose
+
+    def require_vehicle_pose(self) -> Pose:
+        """The vehicle's pose.
+
+        Raises:
+            NotLocalizedError: the answer is not LOCALIZED; the error carries the answer.
+            RequestError: T_vehicle_camera was not sent.
+        """
+        if self.status != "LOCALIZED":
+            raise self._not_localized()
+        if self.vehicle_pose is None:
+            raise RequestError(
+                "vehicle_pose: the request did not say where the camera sits; send T_vehicle_camera", field="T_vehicle_camera"
+            )  # fmt: skip
+        return self.vehicle_pose
+
+    def _not_localized(self) -> NotLocalizedError:
+        return NotLocalizedError(
+            f"the answer is {self.status} (confidence {self.confidence or 0:.3f}), so it has no pose; look at its hypotheses, which "
+            "are not confirmed, send a prior or more frames, or look another way", answer=self,
+        )  # fmt: skip
 
 
 class MapEntry(BaseModel):
@@ -362,6 +480,22 @@ class Health(BaseModel):
     status: Literal["ok"] = "ok"
 
 
+class RefusedBundle(BaseModel):
+    """A bundle in a maps folder that is not mounted."""
+
+    bundle: str = Field(description="the folder's name")
+    reason: str
+
+
+class Readiness(BaseModel):
+    """The service is ready; what it could not mount all the same."""
+
+    status: Literal["ok"] = "ok"
+    refused: list[RefusedBundle] = Field(
+        description="bundles that are not mounted, as this process found them; at most 20, the log has all"
+    )
+
+
 class Truth(_Strict):
     """Where a pair of pictures was really taken: for people who compare."""
 
@@ -391,7 +525,7 @@ Base64 = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
 
 
 class QueryPointCloud(BaseModel):
-    """The query's points where the answer puts them."""
+    """The query's points where the best guess puts them: the answer's pose if it is LOCALIZED, else it is not confirmed."""
 
     origin: Vector = Field(description="map frame; the points count from it")
     count: int
@@ -412,7 +546,7 @@ class Explanation(BaseModel):
         description="the map from the most similar place, on the view grid; null without a cloud"
     )
     map_depth: Base64 | None = Field(
-        description="the map as this camera would see it from the answered pose, coloured as `depth`; null without a cloud"
+        description="the map as this camera would see it from the best guess, coloured as `depth`; null without a cloud"
     )
     points: QueryPointCloud
 
@@ -425,9 +559,9 @@ class LastAnswer(BaseModel):
     map: MapVersion
     status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
     confidence: float | None
-    street: str | None = Field(description="name of the street")
-    position: Vector
-    heading_deg: HeadingDeg
+    street: str | None = Field(description="name of the street; null unless LOCALIZED")
+    position: Vector | None = Field(description="null unless LOCALIZED")
+    heading_deg: HeadingDeg | None = Field(description="null unless LOCALIZED")
     frames: int = Field(description="picture pairs that it rests on")
     total_ms: float
 

@@ -20,6 +20,8 @@ _ENCODINGS = {
     pb.DEPTH_ENCODING_COMPRESSED_DEPTH: "compressed_depth",
 }
 _MODELS = {pb.CAMERA_MODEL_UNSPECIFIED: "PINHOLE", pb.CAMERA_MODEL_PINHOLE: "PINHOLE"}
+#: One more than the contract takes, so that more are refused, and a message of millions does not become a list of as many.
+_MOST_COEFFICIENTS = 15
 _STATUS = {
     "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED, "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
     "OUT_OF_MAP": pb.LOCALIZATION_STATUS_OUT_OF_MAP,
@@ -80,7 +82,10 @@ def _of_pair(message: pb.LocalizeRequest | pb.SequenceFrame) -> dict[str, Any]:
 
 def _camera(message: pb.Camera) -> dict[str, Any]:
     numbers = {name: getattr(message, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return numbers | {"model": _MODELS.get(message.model, message.model), "distortion": list(message.distortion)}
+    return numbers | {
+        "model": _MODELS.get(message.model, message.model),
+        "distortion": list(message.distortion[:_MOST_COEFFICIENTS]),
+    }
 
 
 def _depth(message: pb.DepthFormat) -> dict[str, Any]:
@@ -129,7 +134,7 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
         status=_STATUS[answer.status],
         confidence=answer.confidence,
         street=None if answer.street is None else _street(answer.street),
-        pose=_pose(answer.pose),
+        pose=None if answer.pose is None else _pose(answer.pose),
         vehicle_pose=None if answer.vehicle_pose is None else _pose(answer.vehicle_pose),
         geopose=None if answer.geopose is None else _geopose(answer.geopose),
         neighbours=[
@@ -145,9 +150,12 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
             register_ms=times.register_, total_ms=times.total,
         ),
         hypotheses=[
-            pb.Hypothesis(pose=_pose(each.pose), share=each.share, inliers=each.inliers, similarity=each.similarity)
+            pb.Hypothesis(
+                pose=_pose(each.pose), share=each.share, inliers=each.inliers, similarity=each.similarity, confirmed=each.confirmed
+            )
             for each in answer.hypotheses
         ],
+        spread=None if answer.spread is None else _spread(answer.spread),
     )  # fmt: skip
     return message
 
@@ -176,6 +184,13 @@ def _pose(pose: schema.Pose) -> pb.Pose:
     return pb.Pose(
         position=_vector3(pose.position), orientation=pb.Quaternion(x=q.x, y=q.y, z=q.z, w=q.w), heading_deg=pose.heading_deg,
         covariance=pose.covariance or (),
+    )  # fmt: skip
+
+
+def _spread(spread: schema.Spread) -> pb.Spread:
+    return pb.Spread(
+        mean=_vector3(spread.mean), covariance=spread.covariance, heading_std_deg=spread.heading_std_deg,
+        hypotheses_weight=spread.hypotheses_weight,
     )  # fmt: skip
 
 

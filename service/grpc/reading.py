@@ -1,16 +1,24 @@
-"""Reads a call's message in the call's own thread, in its turn, with patience, and looks at its size before it is parsed."""
+"""Reads a call's messages in the call's own thread, in its turn, with patience, and looks at their size before they are parsed.
+
+Left to gRPC, bytes that do not parse end a call with its own words, a traceback in the log, and no count in the metrics. gRPC would
+also read the messages of all calls at once, whatever memory that takes.
+"""
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import grpc
-from google.protobuf.message import DecodeError
+from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor_pool import Default
+from google.protobuf.message import Message
 
 from service.errors import RequestError, StreetfixError
+from service.grpc.call import Call
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.memory import MessageMemory, held_by_call
+from service.grpc.parsing import parsed
 from service.grpc.patience import Patience
-from service.grpc.status import refuse
 
 if TYPE_CHECKING:
     _Interceptor = grpc.ServerInterceptor[Any, Any]
@@ -18,143 +26,152 @@ else:  # generic in its stub alone
     _Interceptor = grpc.ServerInterceptor
 
 SERVICE: str = pb.DESCRIPTOR.services_by_name["LocalizationService"].full_name
-#: Fields of a message at its top, repeated ones counted each: more make no sense, and each may cost a hundred times its bytes.
-MOST_FIELDS = 64
 #: Seconds in which a message of another service (health, reflection) must be there: it is small.
 OTHERS_S = 3.0
+#: Ends a call of that name as the contract says; ``service.grpc.answering.answering`` of an engine.
+Answering = Callable[[str, grpc.ServicerContext], AbstractContextManager[Call]]
+Messages = Iterator[bytes]
 
 
 class ReadingInterceptor(_Interceptor):
-    """Takes raw bytes where gRPC would parse in its one serving thread, and ends calls that never send them."""
+    """Takes raw bytes where gRPC would parse, ends calls that never send them, and refuses what does not parse.
 
-    def __init__(
-        self,
-        patience: Patience,
-        memory: MessageMemory,
-        requested: Callable[[str, str, str, float | None], None],
-        *,
-        timeout_s: float,
-    ) -> None:
+    Args:
+        patience: ends calls.
+        memory: gives calls their turns to read.
+        timeout_s: that a call of ours may take to send its only message.
+        answering: how refused calls end.
+    """
+
+    def __init__(self, patience: Patience, memory: MessageMemory, *, timeout_s: float, answering: Answering) -> None:
         self._patience = patience
         self._memory = memory
-        self._requested = requested
         self._timeout_s = timeout_s
+        self._answering = answering
 
     def intercept_service(
         self, continuation: Callable[[grpc.HandlerCallDetails], Any], details: grpc.HandlerCallDetails
     ) -> Any:
-        """The handler of a call, in another form where its message is read here."""
+        """The handler of a call, in another form: of ours, of health and of reflection."""
         handler = continuation(details)
         if handler is None:
             return None
-        ours = details.method.startswith(f"/{SERVICE}/")
-        if handler.unary_unary is not None:
-            answer = (
-                self._answer(handler, details.method.rsplit("/", 1)[-1]) if ours else self._answer_of_others(handler)
+        service, _, method = details.method.removeprefix("/").partition("/")
+        message = Default().FindServiceByName(service).methods_by_name[method].input_type
+        serializer, ours = handler.response_serializer, service == SERVICE
+        if handler.request_streaming:
+            stream = self._our_stream if ours else self._stream_of_others
+            return grpc.stream_stream_rpc_method_handler(
+                stream(handler, message, method), response_serializer=serializer
             )
-            return grpc.stream_unary_rpc_method_handler(answer, response_serializer=handler.response_serializer)
-        if ours or handler.stream_stream is None:
-            return handler
-        return grpc.stream_stream_rpc_method_handler(
-            self._stream_of_others(handler), response_serializer=handler.response_serializer
+        if ours:
+            return grpc.stream_unary_rpc_method_handler(
+                self._our_answer(handler, message, method), response_serializer=serializer
+            )
+        if handler.response_streaming:
+            return grpc.stream_stream_rpc_method_handler(
+                self._answers_of_others(handler, message, method), response_serializer=serializer
+            )
+        return grpc.stream_unary_rpc_method_handler(
+            self._answer_of_others(handler, message, method), response_serializer=serializer
         )
 
-    def _answer(self, handler: Any, method: str) -> Callable[[Iterator[bytes], grpc.ServicerContext], Any]:
-        def answer(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
+    def _our_answer(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Any]:
+        def answer(messages: Messages, context: grpc.ServicerContext) -> Any:
             with self._memory.hold() as hold:
                 try:
                     with self._memory.turn():
-                        with self._patience.at_most(self._timeout_s, context.cancel):
-                            raw = next(messages, b"")
-                        hold.grow(len(raw))
-                    require_few_fields(raw)
+                        raw = self._next(messages, method, context, self._timeout_s)
+                    hold.grow(len(raw))
                 except StreetfixError as error:
-                    self._requested("grpc", method, error.code, None)
-                    refuse(context, error)
+                    self._end(error, method, context)
                 with self._memory.parsing(len(raw)):
-                    message = handler.request_deserializer(raw)
+                    request = self._parsed(raw, message, method, context)
                     del raw
-                held_by_call.set(hold)
-                return handler.unary_unary(message, context)
+                token = held_by_call.set(hold)
+                try:
+                    return handler.unary_unary(request, context)
+                finally:
+                    held_by_call.reset(token)
 
         return answer
 
-    def _answer_of_others(self, handler: Any) -> Callable[[Iterator[bytes], grpc.ServicerContext], Any]:
-        def answer(messages: Iterator[bytes], context: grpc.ServicerContext) -> Any:
-            try:
-                with self._memory.turn_of_others(streams=False), self._patience.at_most(OTHERS_S, context.cancel):
-                    message = handler.request_deserializer(next(messages, b""))
-            except StreetfixError as error:
-                refuse(context, error)
-            except DecodeError:
-                refuse(context, _no_message())
-            return handler.unary_unary(message, context)
+    def _our_stream(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Any]:
+        del method  # our servicer ends its streams itself
+
+        def stream(messages: Messages, context: grpc.ServicerContext) -> Any:
+            return handler.stream_stream((parsed(raw, message) for raw in messages), context)
+
+        return stream
+
+    def _answer_of_others(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Any]:
+        def answer(messages: Messages, context: grpc.ServicerContext) -> Any:
+            return handler.unary_unary(self._small(messages, message, method, context), context)
 
         return answer
 
-    def _stream_of_others(self, handler: Any) -> Callable[[Iterator[bytes], grpc.ServicerContext], Iterator[Any]]:
-        def in_turn(messages: Iterator[bytes], context: grpc.ServicerContext) -> Iterator[Any]:
+    def _answers_of_others(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Iterator[Any]]:
+        def answers(messages: Messages, context: grpc.ServicerContext) -> Iterator[Any]:
+            yield from handler.unary_stream(self._small(messages, message, method, context), context)
+
+        return answers
+
+    def _stream_of_others(
+        self, handler: Any, message: Descriptor, method: str
+    ) -> Callable[[Messages, grpc.ServicerContext], Iterator[Any]]:
+        def in_turn(messages: Messages, context: grpc.ServicerContext) -> Iterator[Message]:
             while True:
                 try:
                     with self._memory.turn_of_others(streams=True), self._patience.at_most(OTHERS_S, context.cancel):
                         raw = next(messages, None)
-                    if raw is None:
-                        return
-                    message = handler.request_deserializer(raw)
                 except StreetfixError as error:
-                    refuse(context, error)
-                except DecodeError:
-                    refuse(context, _no_message())
-                yield message
+                    self._end(error, method, context)
+                if raw is None:
+                    return
+                yield self._parsed(raw, message, method, context)
 
-        def answers(messages: Iterator[bytes], context: grpc.ServicerContext) -> Iterator[Any]:
+        def answers(messages: Messages, context: grpc.ServicerContext) -> Iterator[Any]:
             yield from handler.stream_stream(in_turn(messages, context), context)
 
         return answers
 
+    def _small(self, messages: Messages, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
+        """The only message of a call of another service."""
+        try:
+            with self._memory.turn_of_others(streams=False):
+                raw = self._next(messages, method, context, OTHERS_S)
+        except StreetfixError as error:
+            self._end(error, method, context)
+        return self._parsed(raw, message, method, context)
 
-def require_few_fields(raw: bytes, *, most: int = MOST_FIELDS) -> None:
-    """Walk over the fields of a message without looking into them.
+    def _next(self, messages: Messages, method: str, context: grpc.ServicerContext, timeout_s: float) -> bytes:
+        """The only message of a call; the call ends where none comes."""
+        try:
+            with self._patience.at_most(timeout_s, context.cancel):
+                raw = next(messages, None)
+        except grpc.RpcError as error:
+            self._end(error, method, context)
+        # gRPC says no more of a call that was cancelled meanwhile, or whose message was beyond the limit
+        if raw is None:
+            self._end(RequestError("the call ended before its message had come; send exactly one"), method, context)
+        return raw
 
-    Raises:
-        RequestError: there are more than a message of ours has, or the bytes are no message.
-    """
-    at, count = 0, 0
-    while at < len(raw):
-        count += 1
-        if count > most:
-            raise RequestError(
-                f"the message has more than {most} fields at its top; send fewer requests or frames at once"
-            )
-        tag, at = _varint(raw, at)
-        kind = tag & 7
-        if kind == 0:
-            _, at = _varint(raw, at)
-        elif kind == 1:
-            at += 8
-        elif kind == 2:
-            length, at = _varint(raw, at)
-            at += length
-        elif kind == 5:
-            at += 4
-        else:
-            raise _no_message()
-    if at != len(raw):
-        raise _no_message()
+    def _parsed(self, raw: bytes, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
+        """A message of a call; the call ends where the bytes are none."""
+        try:
+            return parsed(raw, message)
+        except RequestError as error:
+            self._end(error, method, context)
 
-
-def _varint(raw: bytes, at: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        if at >= len(raw):
-            break
-        byte = raw[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, at
-    raise _no_message()
-
-
-def _no_message() -> RequestError:
-    return RequestError("the bytes are no protobuf message; use the proto in this service's repository")
+    def _end(self, error: Exception, method: str, context: grpc.ServicerContext) -> NoReturn:
+        with self._answering(method, context):
+            raise error
+        raise AssertionError("a call went on after its end")

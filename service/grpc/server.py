@@ -1,6 +1,7 @@
 """The gRPC face: an engine in, a listening server out."""
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from threading import Event
 
 import grpc
@@ -8,6 +9,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from service.errors import AddressError
+from service.grpc.answering import answering
 from service.grpc.auth import AuthInterceptor
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import add_LocalizationServiceServicer_to_server
 from service.grpc.health import Health
@@ -53,7 +55,7 @@ class GrpcServer:
             engine.memory, most_bytes=settings.limits.max_request_bytes, most_streams=settings.grpc_streams
         )
         reading = ReadingInterceptor(
-            self._patience, memory, engine.metrics.requested, timeout_s=settings.request_timeout_s
+            self._patience, memory, timeout_s=settings.request_timeout_s, answering=partial(answering, engine)
         )
         # A thread waits for each call; the work itself is the engine's workers'. A stream holds its thread while it lives.
         most = engine.admission.capacity + settings.grpc_streams + _SPARE

@@ -1,10 +1,8 @@
 """The calls of LocalizationService, on the same engine and the same admission as REST."""
 
-import re
-import uuid
 from collections.abc import Iterator
-from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from time import perf_counter
 
 import grpc
@@ -13,20 +11,17 @@ from service.contract.convert import answer_from, fields_under, map_entry_from, 
 from service.contract.coverage import coverage_geojson
 from service.contract.schema import MOST_FRAMES
 from service.errors import BusyError, DeadlineError, RequestError, StreetfixError
+from service.grpc.answering import answering
 from service.grpc.call import Call
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceServicer
-from service.grpc.memory import MessageMemory, held_by_call
+from service.grpc.memory import MessageMemory
 from service.grpc.messages import answer_message, map_message, request_from, sequence_request_from, transform_from
 from service.grpc.patience import Patience
-from service.grpc.status import fail, problem_message, refuse
+from service.grpc.status import problem_message
 from service.runtime.engine import Engine, Located
-from service.runtime.logs import log_request
 from service.runtime.stream import Stream
 from service.runtime.tracing import RequestSpan
-
-REQUEST_ID = "x-request-id"
-_ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 class Servicer(LocalizationServiceServicer):
@@ -77,7 +72,7 @@ class Servicer(LocalizationServiceServicer):
         # A stream holds a thread, and memory for its next frame, as long as it lives.
         with self._answering("LocalizeStream", context, lives_long=True) as call, self._memory.stream():
             stream, number = Stream(self._engine), 0
-            while (request := self._next_frame(request_iterator, context)) is not None:
+            while (request := self._next_frame(number, request_iterator, context)) is not None:
                 yield self._next_of(stream, number, request, call)
                 number += 1
                 del request  # before the next one is read: memory is reserved for one
@@ -120,10 +115,22 @@ class Servicer(LocalizationServiceServicer):
             return refused
 
     def _next_frame(
-        self, requests: Iterator[pb.LocalizeStreamRequest], context: grpc.ServicerContext
+        self, number: int, requests: Iterator[pb.LocalizeStreamRequest], context: grpc.ServicerContext
     ) -> pb.LocalizeStreamRequest | None:
-        with self._patience.at_most(self._engine.settings.grpc_idle_s, context.cancel):
-            return next(requests, None)
+        """The next message; None at the end.
+
+        Raises:
+            RequestError: its bytes do not parse.
+        """
+        with fields_under(f"frame {number}"):
+            try:
+                with self._patience.at_most(self._engine.settings.grpc_idle_s, context.cancel):
+                    return next(requests, None)
+            except RequestError as error:
+                error.field = error.field.removeprefix(
+                    "frame."
+                )  # as errors of a frame that does parse name their fields
+                raise
 
     def _next_of(
         self, stream: Stream, number: int, request: pb.LocalizeStreamRequest, call: Call
@@ -157,37 +164,10 @@ class Servicer(LocalizationServiceServicer):
         finally:
             self._engine.metrics.requested("grpc", "LocalizeStream.frame", code, perf_counter() - began)
 
-    @contextmanager
-    def _answering(self, method: str, context: grpc.ServicerContext, *, lives_long: bool = False) -> Iterator[Call]:
-        """Whatever is raised inside ends the call as the contract says, and is counted."""
-        metadata = {name: value for name, value in context.invocation_metadata() if isinstance(value, str)}
-        given = metadata.get(REQUEST_ID, "")
-        request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
-        context.send_initial_metadata(((REQUEST_ID, request_id),))
-        began, code = perf_counter(), "OK"
-        span = self._engine.tracing.begin("grpc", metadata.get("traceparent"))
-        try:
-            yield Call(
-                self._engine.admission, context, span, timeout_s=self._engine.settings.request_timeout_s,
-                hold=None if lives_long else held_by_call.get(),
-            )  # fmt: skip
-        except StreetfixError as error:
-            code = error.code
-            refuse(context, error)
-        except (GeneratorExit, grpc.RpcError, CancelledError):  # the client has gone
-            code = "CANCELLED"
-            raise
-        except Exception as error:
-            code = "INTERNAL"
-            fail(context, error, request_id)
-        finally:
-            seconds = perf_counter() - began
-            self._engine.metrics.requested("grpc", method, code, None if lives_long else seconds)
-            span.end(method, code, failed=code in ("INTERNAL", "deadline"))
-            log_request(
-                face="grpc", method=method, code=code, seconds=seconds, request_id=request_id,
-                traceparent=metadata.get("traceparent"),
-            )  # fmt: skip
+    def _answering(
+        self, method: str, context: grpc.ServicerContext, *, lives_long: bool = False
+    ) -> AbstractContextManager[Call]:
+        return answering(self._engine, method, context, lives_long=lives_long)
 
 
 def _outcome(call: Call, number: int, begun: Future[pb.LocalizeResponse]) -> pb.Outcome:

@@ -36,13 +36,13 @@ def sure_geopose(answer: LocalizeAnswer) -> GeoPose:
         NoPoseError: the answer is not LOCALIZED.
         NotGeoreferencedError: the map does not say where on the Earth it lies.
     """
-    if answer.geopose is None:
-        raise NotGeoreferencedError(
-            f"the map {answer.map.name!r} is not georeferenced, so its poses have no place on the Earth; ask for application/json"
-        )
     if answer.status != "LOCALIZED":
         raise NoPoseError(
             f"the answer is {answer.status} (confidence {answer.confidence or 0:.3f}), and GeoPose cannot say so; ask for "
             "application/json to see its hypotheses, send a prior or more frames, or look another way"
+        )
+    if answer.geopose is None:
+        raise NotGeoreferencedError(
+            f"the map {answer.map.name!r} is not georeferenced, so its poses have no place on the Earth; ask for application/json"
         )
     return answer.geopose

@@ -1,6 +1,10 @@
 """Which parts a multipart body must have, and the pictures among them."""
 
+from service.contract.schema import MOST_FRAMES
 from service.errors import RequestError
+
+#: Of any body of ours: a pair of pictures for each frame of the longest sequence, and the JSON.
+MOST_PARTS = 2 * MOST_FRAMES + 1
 
 
 def require_parts(parts: dict[str, bytes], names: tuple[str, ...]) -> None:

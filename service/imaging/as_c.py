@@ -9,7 +9,7 @@ from service.geometry.camera import PinholeCamera
 
 
 class CPicture(Structure):
-    """``Picture`` of ``gather.c`` and ``level.c``."""
+    """``Picture`` of ``picture.h``."""
 
     _fields_ = [("height", c_int64), ("width", c_int64), *((name, c_double) for name in ("fx", "fy", "cx", "cy"))]
 

@@ -8,12 +8,16 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "picture.h"
+
 enum { SAMPLES = 9, BLOCK = 128 };
 
-typedef struct {
-    int64_t height, width;
-    double fx, fy, cx, cy;
-} Picture;
+/* Compared with Python's structures when the library is loaded. */
+const LayoutEntry streetfix_layout[] = {
+    PICTURE_LAYOUT,
+    LAYOUT_CONSTANT(SAMPLES),
+    LAYOUT_END,
+};
 
 /* Where each ray of a block meets a picture: flat index of the pixel, -1 outside. Rounds half to even, as rint does. */
 static void pixels(const float *x, const float *y, const float *z, int64_t count, const Picture *p, int32_t *index) {

@@ -28,7 +28,7 @@ def finest_rad(grid: ViewGrid) -> float:
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY)
+    library = load(LIBRARY, {"Picture": CPicture}, {"SAMPLES": SUB_RAYS**2})
     library.streetfix_gather.argtypes = [
         c_void_p, c_int64, c_void_p, c_void_p, POINTER(CPicture), c_void_p, POINTER(CPicture), c_double, c_double, c_int64,
         c_void_p, c_void_p, c_void_p,

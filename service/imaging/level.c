@@ -5,10 +5,7 @@
 #include <math.h>
 #include <stdint.h>
 
-typedef struct {
-    int64_t height, width;
-    double fx, fy, cx, cy;
-} Picture;
+#include "picture.h"
 
 typedef struct {
     double near_m, reach_m, below_m;                /* of z along the axis; a ground point lies below -below_m */
@@ -19,6 +16,17 @@ typedef struct {
 typedef struct {
     double x, y, z, reach, certainty;
 } Point;
+
+/* Compared with Python's structures when the library is loaded. */
+const LayoutEntry streetfix_layout[] = {
+    PICTURE_LAYOUT,
+    LAYOUT_STRUCT(Ground), LAYOUT_FIELD(Ground, near_m), LAYOUT_FIELD(Ground, reach_m), LAYOUT_FIELD(Ground, below_m),
+    LAYOUT_FIELD(Ground, height_m), LAYOUT_FIELD(Ground, tilt_prior), LAYOUT_FIELD(Ground, height_prior_m),
+    LAYOUT_FIELD(Ground, noise_m), LAYOUT_FIELD(Ground, noise_per_m), LAYOUT_FIELD(Ground, correlated),
+    LAYOUT_STRUCT(Point), LAYOUT_FIELD(Point, x), LAYOUT_FIELD(Point, y), LAYOUT_FIELD(Point, z),
+    LAYOUT_FIELD(Point, reach), LAYOUT_FIELD(Point, certainty),
+    LAYOUT_END,
+};
 
 /* Solves the symmetric, positive definite H s = g. */
 static void solve(double H[3][3], const double g[3], double s[3]) {

@@ -88,9 +88,13 @@ class _Ground(Structure):
     )]  # fmt: skip
 
 
+#: Room for one ground point: position in the nominal level frame, horizontal distance (m), weight (1/m^2).
+_POINT = np.dtype([(name, "<f8") for name in ("x", "y", "z", "reach", "certainty")])
+
+
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY)
+    library = load(LIBRARY, {"Picture": CPicture, "Ground": _Ground, "Point": _POINT})
     library.streetfix_fit_ground.argtypes = [
         c_void_p, POINTER(CPicture), c_int64, c_void_p, POINTER(_Ground), c_void_p, c_int64, c_void_p, c_void_p,
     ]  # fmt: skip
@@ -107,7 +111,7 @@ def _fit_ground(
     if R.shape != (3, 3):
         raise ValueError(f"R {R.shape} is no rotation")
     step = max(1, width // STEP_PIXELS)
-    found, points = np.empty(3), np.empty((-(-height // step) * -(-width // step), 5))
+    found, points = np.empty(3), np.empty(-(-height // step) * -(-width // step), _POINT)
     _library().streetfix_fit_ground(
         depth_m.ctypes.data, byref(c_picture(camera, depth_m)), step, R.ctypes.data,
         byref(_Ground(

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform, transform_from
@@ -63,6 +64,7 @@ class Candidate:
         place_m: how far those places are, mean over the frames.
         agreement: with the map as drawn at the pose, mean over the frames.
         support: logarithm, against the other candidates.
+        covariance: of ``T_map_camera`` if the candidate is right, translation first, map axes, about the camera; None: not computed.
     """
 
     T_map_camera: Transform
@@ -71,6 +73,7 @@ class Candidate:
     place_m: float
     agreement: Agreement
     support: float
+    covariance: Float64[NDArray[np.float64], "6 6"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,15 +9,18 @@ from service.errors import BundleError, RequestError
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews, query_views
 from service.imaging.view_grid import ViewGrid
-from service.localization.answer import Answer, Timings
+from service.localization.answer import Answer, Timings, require_finite
 from service.localization.decide import decide
 from service.localization.encoder import Encoder, Provider
 from service.localization.evidence import evidence_of
 from service.localization.frames import Frame
 from service.localization.hypotheses import ClusterSettings, Hypothesis, believed, cluster
+from service.localization.judge import Candidate
 from service.localization.query import Query
 from service.localization.refine import RefineSettings, refine
+from service.localization.rivals import distinct_candidates, shares_of
 from service.localization.search import distinct_places, search_views
+from service.localization.spread import Extent, Spread, spread_of
 from service.localization.street_vote import vote
 from service.maps.reader import MapBundle
 from service.registration.points import inverse_depth_noise
@@ -58,6 +61,7 @@ class Localizer:
         self.clusters = clusters or ClusterSettings()
         self.refining = refining or RefineSettings()
         self.turns = turns_on(bundle.grid)
+        self.extent = Extent.of_places(bundle.T_map_place[:, :3, 3], bundle.manifest.spacing_m)
 
     @classmethod
     def open(cls, bundle: MapBundle, *, provider: Provider = "cpu") -> "Localizer":
@@ -109,7 +113,8 @@ class Localizer:
         matches = search_views(
             self.bundle, descriptors, turns_rad=views.turns_rad, places=_places_of(query), fewest=self.clusters.views
         )
-        noise = inverse_depth_noise(query.depth_m) if query.refine else np.nan  # only registration asks
+        # Without registration nobody asks for it, but a later frame of a stream may be registered together with this one.
+        noise = inverse_depth_noise(query.depth_m)
         return Frame(
             query, np.eye(4), views, descriptors, matches, noise,
             fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,
@@ -123,6 +128,7 @@ class Localizer:
 
         Raises:
             RequestError: fewer false accepts are wanted than the map's calibration can promise.
+            NotFiniteError: a number of the answer is not finite, by a defect of ours or of the map.
         """
         started = perf_counter()
         query, matches = frames[0].query, frames[0].matches
@@ -148,22 +154,29 @@ class Localizer:
         decision = None
         if registers and self.bundle.calibration is not None:
             decision = decide(self.bundle.calibration, evidence, query.false_accept_rate)
+        candidates, spread = None if refined is None else refined.candidates, None
+        if decision is not None and decision.status != "LOCALIZED":
+            candidates = None if refined is None else refined.with_covariances()
+            spread = self._spread_of(candidates or (), len(frames), decision.confidence)
         done = perf_counter()
         fused, encoded, searched = (
             sum(getattr(frame, name) for frame in frames) for name in ("fuse_s", "encode_s", "search_s")
         )
         T_map_camera = self._pose_of(hypotheses[0], frames[0].views) if refined is None else refined.best.T_map_camera
-        return Answer(
+        answer = Answer(
             status="LOCALIZED" if decision is None else decision.status,
             confidence=None if decision is None else decision.confidence,
             street=self._street_of(T_map_camera, hypotheses[0], registered=refined is not None),
             vote=streets,
-            T_map_camera=T_map_camera,
+            T_map_camera_guess=T_map_camera,
             covariance=None if refined is None else refined.covariance,
-            candidates=None if refined is None else refined.candidates,
+            candidates=candidates,
+            spread=spread,
             frames=len(frames),
             evidence=evidence,
-            T_map_vehicle=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
+            T_map_vehicle_guess=None
+            if query.T_vehicle_camera is None
+            else T_map_camera @ inverse(query.T_vehicle_camera),
             neighbours=neighbours[: max(query.neighbours, query.ranked)],
             hypotheses=hypotheses,
             measured_share=frames[0].views.measured_share,
@@ -176,6 +189,16 @@ class Localizer:
                 total_ms=1e3 * (done - started + fused + encoded + searched),
             ),
         )
+        require_finite(answer)
+        return answer
+
+    def _spread_of(self, candidates: tuple[Candidate, ...], frames: int, confidence: float) -> Spread:
+        distinct = distinct_candidates(candidates)
+        covariances = [each.covariance for each in distinct if each.covariance is not None]
+        return spread_of(
+            [each.T_map_camera for each in distinct], covariances, shares_of(distinct, frames),
+            confidence=confidence, extent=self.extent,
+        )  # fmt: skip
 
     def _require_promise(self, query: Query) -> None:
         calibration = self.bundle.calibration

@@ -13,6 +13,8 @@ from service.localization.prior import Prior
 MOST_NEIGHBOURS = 50
 #: Of calibration's strangers, every kind weighing alike (decision log).
 FALSE_ACCEPT_RATE = 0.02
+#: Least that may be asked for; no calibration could measure less.
+LEAST_FALSE_ACCEPT_RATE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

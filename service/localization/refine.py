@@ -1,5 +1,6 @@
 """From similar views to a metric pose: register the depth from every distinct start and keep the best supported."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from service.geometry.rigid import heading_of_camera, transform_from
 from service.localization.frames import Frame
 from service.localization.judge import Candidate, Judge, NearWeights, SupportWeights
 from service.localization.prior import Prior
+from service.localization.rivals import distinct_candidates
 from service.localization.similar import similarities_at
 from service.localization.starts import Likeness, StartSettings, level_from, starts_from
 from service.maps.reader import MapBundle
@@ -72,17 +74,32 @@ class Refined:
         covariance: of the best, translation first, map axes, about the camera.
         points: that were used.
         disagreement: how many times more than their noise says the picture's patches disagree about the best pose, as a variance.
+        covariance_at: computes the covariance of a candidate that was not adjusted along its rays, as all but the best.
     """
 
     candidates: tuple[Candidate, ...]
     covariance: Float64[NDArray[np.float64], "6 6"]
     points: int
     disagreement: float
+    covariance_at: Callable[[Candidate], Float64[NDArray[np.float64], "6 6"]]
 
     @property
     def best(self) -> Candidate:
         """The best supported."""
         return self.candidates[0]
+
+    def with_covariances(self) -> tuple[Candidate, ...]:
+        """All candidates; those that exclude each other have their covariances.
+
+        It costs about half a millisecond for each of those, so only answers that are not LOCALIZED ask for it.
+        """
+        distinct = {id(each) for each in distinct_candidates(self.candidates)}
+        return tuple(
+            replace(each, covariance=self.covariance_at(each))
+            if id(each) in distinct and each.covariance is None
+            else each
+            for each in self.candidates
+        )
 
 
 def refine(
@@ -135,7 +152,14 @@ def refine(
         candidates[0] = replace(candidates[0], T_map_camera=T_map_camera, registered=best)
     heading = heading_of_camera(candidates[0].T_map_camera)
     covariance = covariance_of(best.information, scatter, noise, heading, model)
-    return Refined(tuple(candidates), covariance, len(merged), disagreement(best.information, scatter))
+    candidates[0] = replace(candidates[0], covariance=covariance)
+
+    def covariance_at(candidate: Candidate) -> Float64[NDArray[np.float64], "6 6"]:
+        pose = candidate.registered
+        pulled = scatter_of(cloud, merged, pose, settings.registration)
+        return covariance_of(pose.information, pulled, noise, heading_of_camera(candidate.T_map_camera), OF_POINTS)
+
+    return Refined(tuple(candidates), covariance, len(merged), disagreement(best.information, scatter), covariance_at)
 
 
 def _points(frame: Frame, blocks: DepthBlocks, settings: RefineSettings) -> QueryPoints:

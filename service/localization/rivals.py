@@ -48,3 +48,16 @@ def log_shares(less: Float64[NDArray[np.float64], " C"]) -> Float64[NDArray[np.f
     """
     shares: Float64[NDArray[np.float64], " C"] = -less - np.log(np.exp(-less).sum())
     return shares
+
+
+def shares_of(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:
+    """Each one's share of the support of all, 0 to 1.
+
+    Args:
+        distinct: candidates that exclude each other, the best supported first; may be empty.
+        frames: that were asked together.
+    """
+    if not distinct:
+        return np.zeros(0)
+    shares: Float64[NDArray[np.float64], " C"] = np.exp(log_shares(behind(distinct, frames)))
+    return shares

@@ -38,6 +38,8 @@ class MapBundle:
     views: NDArray[Any]
     view_index: ViewIndex
     streets: Streets | None
+    #: The streets' GeoJSON, in memory: the bundle's folder may go while the map still serves.
+    streets_document: bytes | None
     calibration: Calibration | None
     cloud: SurfelMap | None
     #: Where the places lie on the ground, in memory: x of all, y of all.
@@ -59,6 +61,7 @@ class MapBundle:
         """
         manifest = read_manifest(path)
         _require_files(path, manifest, verify=verify)
+        document = _read(path / streets.FILE) if streets.FILE in manifest.files else None
         bundle = cls(
             path=path,
             manifest=manifest,
@@ -67,10 +70,9 @@ class MapBundle:
             places=_load(path / parts.PLACES_FILE, expected=parts.PLACE),
             views=_load(path / parts.VIEWS_FILE, expected=parts.VIEW),
             view_index=ViewIndex.open(path / index.FILE),
-            streets=_streets(path, manifest),
-            calibration=read_calibration(
-                (path / parts.CALIBRATION_FILE).read_bytes(), path=str(path / parts.CALIBRATION_FILE)
-            ),
+            streets=None if document is None else Streets.from_geojson(_json_object(document, path / streets.FILE)),
+            streets_document=document,
+            calibration=read_calibration(_read(path / parts.CALIBRATION_FILE), path=str(path / parts.CALIBRATION_FILE)),
             cloud=_cloud(path, manifest, verify=verify),
         )
         _require_consistent(bundle)
@@ -112,14 +114,18 @@ class MapBundle:
         return None if georeference is None else Georeference(**georeference)
 
     def encoder_bytes(self) -> bytes:
-        """The encoder that made the descriptors."""
-        return (self.path / parts.ENCODER_FILE).read_bytes()
+        """The encoder that made the descriptors.
+
+        Raises:
+            BundleError: the file has gone since the bundle was opened.
+        """
+        return _read(self.path / parts.ENCODER_FILE)
 
     def streets_geojson(self) -> bytes:
         """The streets as they were given; an empty collection where the map has none."""
-        if self.streets is None:
+        if self.streets_document is None:
             return b'{"type": "FeatureCollection", "features": []}\n'
-        return (self.path / streets.FILE).read_bytes()
+        return self.streets_document
 
 
 def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
@@ -130,13 +136,24 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
         file = path / name
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
             raise _defect(file, "it is missing, or lies outside the bundle")
-        size = file.stat().st_size
+        try:
+            size = file.stat().st_size
+            found = sha256_of(file) if verify and size == entry.size else entry.sha256
+        except OSError as error:  # as when the bundle is being removed
+            raise _defect(file, f"it cannot be read ({error.strerror})") from error
         if size != entry.size:
             raise _defect(file, f"it has {size} bytes instead of {entry.size}")
-        if verify and sha256_of(file) != entry.sha256:
+        if found != entry.sha256:
             raise _defect(file, "its content is not what the manifest says")
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
         raise _defect(path / parts.ENCODER_FILE, "it is not the encoder that made the descriptors")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:  # as when the bundle is being removed
+        raise _defect(path, f"it cannot be read ({error.strerror})") from error
 
 
 def _load(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
@@ -149,20 +166,14 @@ def _load(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
     return array  # type: ignore[no-any-return]  # np.load is not typed for one array
 
 
-def _json_object(path: Path) -> dict[str, Any]:
+def _json_object(content: bytes, path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_bytes())
+        document = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise _defect(path, "it is no JSON") from error
     if not isinstance(document, dict):
         raise _defect(path, "it is no JSON object")
     return document
-
-
-def _streets(path: Path, manifest: Manifest) -> Streets | None:
-    if streets.FILE not in manifest.files:
-        return None
-    return Streets.from_geojson(_json_object(path / streets.FILE))
 
 
 def _cloud(path: Path, manifest: Manifest, *, verify: bool) -> SurfelMap | None:

@@ -45,8 +45,8 @@ typedef struct {
 typedef struct {
     double R[9], t[3], log_scale, offset;
     double anchor[3], up[3]; /* where the priors expect the camera, and the normal of the ground there */
-    double H[UNKNOWNS * UNKNOWNS];
-    double inliers, seen, cost;
+    double information[UNKNOWNS * UNKNOWNS];
+    double inliers, seen, weight;
 } State;
 
 #define HEIGHT 60.0 /* m */
@@ -193,9 +193,9 @@ static inline void tell(const Query *q, const Options *o, const State *s, double
             n[2][k] = thickness[k] = 1; /* so that no variance is 0 */
             continue;
         }
-        n[0][k] = m->nx, n[1][k] = m->ny, n[2][k] = m->nz;
-        off[0][k] = b->at[0][k] - m->x, off[1][k] = b->at[1][k] - m->y, off[2][k] = b->at[2][k] - m->z;
-        thickness[k] = m->thickness;
+        n[0][k] = m->normal[0], n[1][k] = m->normal[1], n[2][k] = m->normal[2];
+        off[0][k] = b->at[0][k] - m->xyz[0], off[1][k] = b->at[1][k] - m->xyz[1], off[2][k] = b->at[2][k] - m->xyz[2];
+        thickness[k] = m->thickness_m;
     }
     const float *rx = q->ray[0] + first, *ry = q->ray[1] + first, *rz = q->ray[2] + first;
     const float *sigma = q->sigma + first, *weight = q->weight + first, *depth = q->q + first;
@@ -271,7 +271,7 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
             b[a] = 0;
             for (int l = 0; l < LANES; l++) b[a] -= sums[a][UNKNOWNS][l];
         }
-        for (int a = 0; a < UNKNOWNS; a++) memcpy(s->H + a * UNKNOWNS, H[a], sizeof H[a]);
+        for (int a = 0; a < UNKNOWNS; a++) memcpy(s->information + a * UNKNOWNS, H[a], sizeof H[a]);
         s->seen = total;
         add_priors(o, s, known, H, b);
         if (!solve(H, b)) return;
@@ -300,17 +300,17 @@ static inline void score_one(const Grid *g, const Surfel *surfels, const Query *
             total += w;
             const Surfel *m = batch.found[k];
             if (!m) continue;
-            double dx = batch.at[0][k] - m->x, dy = batch.at[1][k] - m->y, dz = batch.at[2][k] - m->z;
+            double dx = batch.at[0][k] - m->xyz[0], dy = batch.at[1][k] - m->xyz[1], dz = batch.at[2][k] - m->xyz[2];
             if (dx * dx + dy * dy + dz * dz > 1.0 + 4 * sigma * sigma) continue;
-            double r = m->nx * dx + m->ny * dy + m->nz * dz, c = 0;
+            double r = m->normal[0] * dx + m->normal[1] * dy + m->normal[2] * dz, c = 0;
             for (int a = 0; a < 3; a++)
-                c += (&m->nx)[a] * (s->R[3 * a] * q->ray[0][i] + s->R[3 * a + 1] * q->ray[1][i] + s->R[3 * a + 2] * q->ray[2][i]);
+                c += m->normal[a] * (s->R[3 * a] * q->ray[0][i] + s->R[3 * a + 1] * q->ray[1][i] + s->R[3 * a + 2] * q->ray[2][i]);
             double variance = sigma * sigma * c * c + tolerance * tolerance;
             inliers += w * exp(-0.5 * r * r / variance);
         }
     }
     s->inliers = total > 0 ? inliers / total : 0;
-    s->cost = total;
+    s->weight = total;
 }
 
 WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, double tolerance,
@@ -342,7 +342,7 @@ void streetfix_mark(const Grid *g, const Surfel *surfels, int64_t count, double 
 {
     double edge = g->cell * BLOCK;
     for (int64_t i = 0; i < count; i++) {
-        const float *p = &surfels[i].x;
+        const float *p = surfels[i].xyz;
         const double o[3] = {g->ox, g->oy, g->oz};
         int64_t low[3], high[3];
         for (int k = 0; k < 3; k++) {
@@ -360,7 +360,7 @@ void streetfix_fill(const Grid *g, const Surfel *surfels, int64_t count, double 
 {
     const double o[3] = {g->ox, g->oy, g->oz};
     for (int64_t i = 0; i < count; i++) {
-        const float *p = &surfels[i].x;
+        const float *p = surfels[i].xyz;
         int64_t low[3], high[3];
         for (int k = 0; k < 3; k++) {
             low[k] = (int64_t)ceil((p[k] - reach - o[k]) / g->cell - 0.5);
@@ -406,7 +406,7 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
             left * ahead - beside > hypot(1, left) * fmax(half, wide)) continue;
         const Surfel *m = surfels + (int64_t)tile[2], *end = m + (int64_t)tile[3];
         for (; m < end; m++) {
-            float dx = m->x - tx, dy = m->y - ty, dz = m->z - tz;
+            float dx = m->xyz[0] - tx, dy = m->xyz[1] - ty, dz = m->xyz[2] - tz;
             float z = r[2] * dx + r[5] * dy + r[8] * dz;
             if (z < 0.5f || z > far) continue;
             float x = r[0] * dx + r[3] * dy + r[6] * dz, y = r[1] * dx + r[4] * dy + r[7] * dz;
@@ -428,11 +428,11 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
 }
 
 typedef struct {
-    double hit, fresh, gone, any;  /* shares of the beam model */
-    double rough, span;            /* m */
-    double certain, margin;        /* standard deviations, m */
-    double nothing;                /* m: how far an empty pixel is taken to be */
-    double scale, offset;          /* of the pose */
+    double hit, new, gone, any;  /* shares of the beam model */
+    double rough_m, span_m;
+    double certain, margin_m;    /* standard deviations, m */
+    double nothing_m;            /* how far an empty pixel is taken to be */
+    double scale, offset;        /* of the pose */
 } Beam;
 
 /* How points of a query agree with a picture of the map: at: pixel of each; z, sigma: depth along the axis and its deviation; q: as in
@@ -448,17 +448,17 @@ void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t 
         float low = INFINITY, high = 0;
         for (int64_t v = top; v <= bottom; v++)
             for (int64_t u = left; u <= right; u++) {
-                const float d = drawn[v * width + u] > 0 ? drawn[v * width + u] : (float)o->nothing;
+                const float d = drawn[v * width + u] > 0 ? drawn[v * width + u] : (float)o->nothing_m;
                 low = d < low ? d : low;
                 high = d > high ? d : high;
             }
-        const double mapped = drawn[at[i]] > 0 ? (double)drawn[at[i]] : o->nothing;
-        const double seen = z[i] * o->scale / (1.0 + o->offset * q[i]), spread = sqrt(sigma[i] * sigma[i] + o->rough * o->rough);
+        const double mapped = drawn[at[i]] > 0 ? (double)drawn[at[i]] : o->nothing_m;
+        const double seen = z[i] * o->scale / (1.0 + o->offset * q[i]), spread = sqrt(sigma[i] * sigma[i] + o->rough_m * o->rough_m);
         const double off = (seen - mapped) / spread, hit = exp(-0.5 * off * off) / (2.5066282746310002 * spread);
-        const double fresh = seen < mapped ? o->fresh / (mapped > 2.0 ? mapped : 2.0) : 0.0;
-        likelihood += log(o->hit * hit + fresh + ((seen > mapped ? o->gone : 0.0) + o->any) / o->span);
-        const double beyond = o->certain * sigma[i] + o->margin;
-        if (low >= (float)o->nothing) unmapped++;
+        const double fresh = seen < mapped ? o->new / (mapped > 2.0 ? mapped : 2.0) : 0.0;
+        likelihood += log(o->hit * hit + fresh + ((seen > mapped ? o->gone : 0.0) + o->any) / o->span_m);
+        const double beyond = o->certain * sigma[i] + o->margin_m;
+        if (low >= (float)o->nothing_m) unmapped++;
         else if (seen > (double)high + beyond) through++;
         else if (seen < (double)low - beyond) front++;
     }
@@ -467,3 +467,27 @@ void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t 
     found[2] = front;
     found[3] = unmapped;
 }
+
+/* Compared with Python's structures when the library is loaded. */
+const LayoutEntry streetfix_layout[] = {
+    SURFEL_LAYOUT,
+    LAYOUT_STRUCT(Grid), LAYOUT_FIELD(Grid, ox), LAYOUT_FIELD(Grid, oy), LAYOUT_FIELD(Grid, oz),
+    LAYOUT_FIELD(Grid, cell), LAYOUT_FIELD(Grid, bx), LAYOUT_FIELD(Grid, by), LAYOUT_FIELD(Grid, bz),
+    LAYOUT_FIELD(Grid, block), LAYOUT_FIELD(Grid, nearest),
+    LAYOUT_STRUCT(Query), LAYOUT_FIELD(Query, count), LAYOUT_FIELD(Query, xyz), LAYOUT_FIELD(Query, ray),
+    LAYOUT_FIELD(Query, sigma), LAYOUT_FIELD(Query, weight), LAYOUT_FIELD(Query, q),
+    LAYOUT_STRUCT(Options), LAYOUT_FIELD(Options, iterations), LAYOUT_FIELD(Options, reach),
+    LAYOUT_FIELD(Options, robust_first), LAYOUT_FIELD(Options, robust_last), LAYOUT_FIELD(Options, surface),
+    LAYOUT_FIELD(Options, prior_weight), LAYOUT_FIELD(Options, tilt), LAYOUT_FIELD(Options, height),
+    LAYOUT_FIELD(Options, position), LAYOUT_FIELD(Options, scale), LAYOUT_FIELD(Options, offset),
+    LAYOUT_FIELD(Options, free_scale), LAYOUT_FIELD(Options, free_offset),
+    LAYOUT_STRUCT(State), LAYOUT_FIELD(State, R), LAYOUT_FIELD(State, t), LAYOUT_FIELD(State, log_scale),
+    LAYOUT_FIELD(State, offset), LAYOUT_FIELD(State, anchor), LAYOUT_FIELD(State, up),
+    LAYOUT_FIELD(State, information), LAYOUT_FIELD(State, inliers), LAYOUT_FIELD(State, seen),
+    LAYOUT_FIELD(State, weight),
+    LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, gone),
+    LAYOUT_FIELD(Beam, any), LAYOUT_FIELD(Beam, rough_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, certain),
+    LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, nothing_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
+    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(AHEAD),
+    LAYOUT_END,
+};

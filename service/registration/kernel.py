@@ -97,7 +97,11 @@ class _Beam(Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY)
+    library = load(
+        LIBRARY,
+        {"Surfel": SURFEL, "Grid": _Grid, "Query": _Query, "Options": _Options, "State": STATE, "Beam": _Beam},
+        {"UNKNOWNS": UNKNOWNS, "BLOCK": BLOCK, "AHEAD": AHEAD},
+    )
     library.streetfix_align.argtypes = [
         POINTER(_Grid), c_void_p, POINTER(_Query), POINTER(_Options), c_double, c_double, c_int64, c_void_p,
     ]  # fmt: skip

@@ -6,6 +6,8 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "../layout.h"
+
 enum { LANES = 64, MOST_SAMPLES = 64, MOST_STEPS = 1024 };
 
 /* Sorts any number of values by the same exchanges (merge exchange: Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M),
@@ -39,6 +41,14 @@ typedef struct {
     int64_t rows, columns; /* of blocks */
     double edge, noise, reach;
 } Blocks;
+
+/* Compared with Python's structures when the library is loaded. */
+const LayoutEntry streetfix_layout[] = {
+    LAYOUT_STRUCT(Blocks), LAYOUT_FIELD(Blocks, width), LAYOUT_FIELD(Blocks, size), LAYOUT_FIELD(Blocks, skip),
+    LAYOUT_FIELD(Blocks, rows), LAYOUT_FIELD(Blocks, columns), LAYOUT_FIELD(Blocks, edge), LAYOUT_FIELD(Blocks, noise),
+    LAYOUT_FIELD(Blocks, reach),
+    LAYOUT_END,
+};
 
 /* z: of each block the depth whose inverse is the median; 0 where too few pixels are measured, on an edge, or beyond the reach. */
 void streetfix_blocks(const float *depth, const Blocks *b, float *z)

@@ -25,9 +25,9 @@ typedef struct {
 
 /* A surfel in the camera's axes, and the pixels that it may cover; room for as many as may be in view is given by whoever calls. */
 typedef struct {
-    float x, y, z, nx, ny, nz;
+    float xyz[3], normal[3];
     int32_t number;
-    int32_t left, right, top, bottom;
+    int32_t left, right, top, bottom; /* pixels, both ends included */
 } Disc;
 
 /* From the least whole number that is not below a number, and not below 0. */
@@ -78,7 +78,7 @@ static inline int in_sight(const Surfel *surfels, int count, const Sides *s, con
     int32_t seen[CHUNK];
     for (int i = 0; i < count; i++) {
         const Surfel *m = surfels + i;
-        const float dx = m->x - s->t[0], dy = m->y - s->t[1], dz = m->z - s->t[2];
+        const float dx = m->xyz[0] - s->t[0], dy = m->xyz[1] - s->t[1], dz = m->xyz[2] - s->t[2];
         const float z = r[2] * dx + r[5] * dy + r[8] * dz, x = r[0] * dx + r[3] * dy + r[6] * dz, y = r[1] * dx + r[4] * dy + r[7] * dz;
         const float slack = near_m + near_rad * sqrtf(dx * dx + dy * dy + dz * dz);
         const float beside = (radius + slack) * wide, above = (radius + slack) * tall;
@@ -147,7 +147,7 @@ static inline int64_t discs_of(const Ahead *m, const Sides *s, const View *v, co
     }
     int64_t count = 0;
     for (int i = 0; i < m->count; i++) {
-        const Disc disc = {m->x[i], m->y[i], m->z[i], nx[i], ny[i], nz[i], m->number[i], left[i], right[i], top[i], bottom[i]};
+        const Disc disc = {{m->x[i], m->y[i], m->z[i]}, {nx[i], ny[i], nz[i]}, m->number[i], left[i], right[i], top[i], bottom[i]};
         seen[count] = disc;
         count += shown[i];
     }
@@ -175,10 +175,10 @@ WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t 
         ahead.count = in_sight(surfels + k, chunk_of(surfel_count - k), &s, o, 0, 0, places);
         for (int i = 0; i < ahead.count; i++) {
             const Surfel *m = surfels + k + places[i];
-            const float dx = m->x - s.t[0], dy = m->y - s.t[1], dz = m->z - s.t[2];
+            const float dx = m->xyz[0] - s.t[0], dy = m->xyz[1] - s.t[1], dz = m->xyz[2] - s.t[2];
             ahead.x[i] = r[0] * dx + r[3] * dy + r[6] * dz, ahead.y[i] = r[1] * dx + r[4] * dy + r[7] * dz;
             ahead.z[i] = r[2] * dx + r[5] * dy + r[8] * dz;
-            ahead.nx[i] = m->nx, ahead.ny[i] = m->ny, ahead.nz[i] = m->nz;
+            ahead.nx[i] = m->normal[0], ahead.ny[i] = m->normal[1], ahead.nz[i] = m->normal[2];
             ahead.number[i] = numbers[k + places[i]];
         }
         count += discs_of(&ahead, &s, v, o, seen + count);
@@ -188,13 +188,13 @@ WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t 
      * no number or an infinite one, which nothing is nearer than. */
     for (int64_t i = 0; i < count; i++) {
         const Disc *d = seen + i;
-        const float off = d->nx * d->x + d->ny * d->y + d->nz * d->z;
+        const float off = d->normal[0] * d->xyz[0] + d->normal[1] * d->xyz[1] + d->normal[2] * d->xyz[2];
         for (int64_t b = d->top; b <= d->bottom; b++) {
-            const float ry = ((float)b - cy) * ify, lean = d->ny * ry + d->nz;
+            const float ry = ((float)b - cy) * ify, lean = d->normal[1] * ry + d->normal[2];
             float *row = first + b * v->width;
             for (int64_t a = d->left; a <= d->right; a++) {
-                const float rx = ((float)a - cx) * ifx, z = off / (d->nx * rx + lean);
-                const float ex = rx * z - d->x, ey = ry * z - d->y, ez = z - d->z, apart = ex * ex + ey * ey + ez * ez;
+                const float rx = ((float)a - cx) * ifx, z = off / (d->normal[0] * rx + lean);
+                const float ex = rx * z - d->xyz[0], ey = ry * z - d->xyz[1], ez = z - d->xyz[2], apart = ex * ex + ey * ey + ez * ez;
                 const float near = apart <= radius2 ? z : INFINITY;
                 row[a] = near < row[a] ? near : row[a];
             }
@@ -202,13 +202,13 @@ WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t 
     }
     for (int64_t i = 0; i < count; i++) {
         const Disc *d = seen + i;
-        const float off = d->nx * d->x + d->ny * d->y + d->nz * d->z;
+        const float off = d->normal[0] * d->xyz[0] + d->normal[1] * d->xyz[1] + d->normal[2] * d->xyz[2];
         for (int64_t b = d->top; b <= d->bottom; b++) {
-            const float ry = ((float)b - cy) * ify, lean = d->ny * ry + d->nz;
+            const float ry = ((float)b - cy) * ify, lean = d->normal[1] * ry + d->normal[2];
             for (int64_t a = d->left; a <= d->right; a++) {
                 const int64_t at = b * v->width + a;
-                const float rx = ((float)a - cx) * ifx, z = off / (d->nx * rx + lean);
-                const float ex = rx * z - d->x, ey = ry * z - d->y, ez = z - d->z, apart = ex * ex + ey * ey + ez * ez;
+                const float rx = ((float)a - cx) * ifx, z = off / (d->normal[0] * rx + lean);
+                const float ex = rx * z - d->xyz[0], ey = ry * z - d->xyz[1], ez = z - d->xyz[2], apart = ex * ex + ey * ey + ez * ez;
                 const int better = (apart <= radius2) & (z <= first[at] + behind) & (apart < middle[at]);
                 middle[at] = better ? apart : middle[at];
                 met[at] = better ? d->number : met[at];
@@ -233,25 +233,43 @@ typedef struct {
 
 /* One pixel: what its residual does with the unknowns (0 .. 7), the residual (8), by how much its patch's own error, of
  * deviation 1, is felt in it (9). */
-enum { RESIDUAL = UNKNOWNS, OWN, ROWS, LANES = 8, MOST = 256 };
+enum { RESIDUAL = UNKNOWNS, OWN, ROWS, LANES = 8, MOST_PIXELS = 256 };
+
+/* Compared with Python's structures when the library is loaded. */
+const LayoutEntry streetfix_layout[] = {
+    SURFEL_LAYOUT,
+    LAYOUT_STRUCT(View), LAYOUT_FIELD(View, R), LAYOUT_FIELD(View, t), LAYOUT_FIELD(View, fx), LAYOUT_FIELD(View, fy),
+    LAYOUT_FIELD(View, cx), LAYOUT_FIELD(View, cy), LAYOUT_FIELD(View, width), LAYOUT_FIELD(View, height),
+    LAYOUT_STRUCT(Discs), LAYOUT_FIELD(Discs, radius), LAYOUT_FIELD(Discs, nearest), LAYOUT_FIELD(Discs, reach),
+    LAYOUT_FIELD(Discs, behind), LAYOUT_FIELD(Discs, grazing),
+    LAYOUT_STRUCT(Disc), LAYOUT_FIELD(Disc, xyz), LAYOUT_FIELD(Disc, normal), LAYOUT_FIELD(Disc, number),
+    LAYOUT_FIELD(Disc, left), LAYOUT_FIELD(Disc, right), LAYOUT_FIELD(Disc, top), LAYOUT_FIELD(Disc, bottom),
+    LAYOUT_STRUCT(Asked), LAYOUT_FIELD(Asked, about), LAYOUT_FIELD(Asked, scale), LAYOUT_FIELD(Asked, offset),
+    LAYOUT_FIELD(Asked, unit), LAYOUT_FIELD(Asked, noise), LAYOUT_FIELD(Asked, surface), LAYOUT_FIELD(Asked, robust),
+    LAYOUT_FIELD(Asked, shared), LAYOUT_FIELD(Asked, moved), LAYOUT_FIELD(Asked, nearest), LAYOUT_FIELD(Asked, reach),
+    LAYOUT_FIELD(Asked, grazing), LAYOUT_FIELD(Asked, patch),
+    LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(MOST_PIXELS),
+    LAYOUT_END,
+};
 
 /* A patch's pixels side by side, as many as there are and zeros up to whole lanes. */
 typedef struct {
-    double rows[ROWS][MOST], weighted[ROWS][MOST];
+    double rows[ROWS][MOST_PIXELS], weighted[ROWS][MOST_PIXELS];
 } Batch;
 
 static inline void add_pixel(const Surfel *m, const View *v, const Asked *q, double x, double y, double inverse, Batch *batch, int *count)
 {
     const double rx = (x - v->cx) / v->fx, ry = (y - v->cy) / v->fy, *R = v->R;
     const double ray[3] = {R[0] * rx + R[1] * ry + R[2], R[3] * rx + R[4] * ry + R[5], R[6] * rx + R[7] * ry + R[8]};
-    const double along = m->nx * ray[0] + m->ny * ray[1] + m->nz * ray[2];
-    const double off = m->nx * (m->x - v->t[0]) + m->ny * (m->y - v->t[1]) + m->nz * (m->z - v->t[2]), z = off / along;
+    const double nx = m->normal[0], ny = m->normal[1], nz = m->normal[2];
+    const double along = nx * ray[0] + ny * ray[1] + nz * ray[2];
+    const double off = nx * (m->xyz[0] - v->t[0]) + ny * (m->xyz[1] - v->t[1]) + nz * (m->xyz[2] - v->t[2]), z = off / along;
     if (!(fabs(along) >= q->grazing) || !(z >= q->nearest && z <= q->reach)) return;
     const double near = along / off, k = q->scale * near * near / along;
     const double arm[3] = {v->t[0] + z * ray[0] - q->about[0], v->t[1] + z * ray[1] - q->about[1], v->t[2] + z * ray[2] - q->about[2]};
     const double r = inverse - (q->scale * near - q->offset * q->unit);
-    const double g[ROWS] = {k * m->nx, k * m->ny, k * m->nz, k * (arm[1] * m->nz - arm[2] * m->ny), k * (arm[2] * m->nx - arm[0] * m->nz),
-                            k * (arm[0] * m->ny - arm[1] * m->nx), q->scale * near, -q->unit, r, 1.0};
+    const double g[ROWS] = {k * nx, k * ny, k * nz, k * (arm[1] * nz - arm[2] * ny), k * (arm[2] * nx - arm[0] * nz),
+                            k * (arm[0] * ny - arm[1] * nx), q->scale * near, -q->unit, r, 1.0};
     const double rough = q->surface * near * near, variance = q->noise * q->noise + rough * rough;
     const double k2 = q->robust * q->robust * variance, damp = k2 / (k2 + r * r), w = damp * damp / variance;
     for (int a = 0; a < ROWS; a++) {
@@ -272,7 +290,7 @@ static inline double product(const double *one, const double *other, int count)
 
 /* H (8, 8) and b (8) of the normal equations of one picture, added to what is there, and the pull of each patch (patches, 8): sums of
  * gradients by residuals. Each patch's own common error is taken out, as one unknown a patch under a prior, by Schur's complement.
- * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST pixels. Returns how many pixels took part. */
+ * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST_PIXELS pixels. Returns how many pixels took part. */
 WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t *met, const float *inverse, const uint8_t *movable, const Asked *q,
                             double *H, double *b, double *pulls)
 {

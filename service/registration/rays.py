@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from service.compiled import load
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, Transform, transform_from
-from service.registration.kernel import UNKNOWNS
+from service.registration.kernel import SURFEL, UNKNOWNS
 from service.registration.points import DepthBlocks
 from service.registration.register import Registered
 from service.registration.sight import LIBRARY, DiscSettings, Sights, View
@@ -112,7 +112,11 @@ class _Asked(Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY)
+    library = load(
+        LIBRARY,
+        {"Surfel": SURFEL, "View": View, "Asked": _Asked},
+        {"UNKNOWNS": UNKNOWNS, "MOST_PIXELS": MOST_PATCH**2},
+    )
     library.streetfix_pull.argtypes = [
         c_void_p, POINTER(View), c_void_p, c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p
     ]  # fmt: skip

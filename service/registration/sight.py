@@ -51,7 +51,9 @@ class DiscSettings:
 
 
 #: Room for one surfel in the camera's axes: position, normal, number, the pixels that it may cover.
-_DISC = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("number", "<i4"), ("box", "<i4", (4,))])
+_DISC = np.dtype(
+    [("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), *((name, "<i4") for name in ("number", "left", "right", "top", "bottom"))]
+)  # fmt: skip
 
 
 class View(Structure):
@@ -75,7 +77,7 @@ class _Discs(Structure):
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = load(LIBRARY)
+    library = load(LIBRARY, {"Surfel": SURFEL, "View": View, "Discs": _Discs, "Disc": _DISC})
     library.streetfix_gather.argtypes = [
         c_void_p, c_void_p, c_int64, POINTER(View), POINTER(_Discs), c_double, c_double, c_void_p, c_void_p
     ]  # fmt: skip

@@ -1,30 +1,28 @@
 """The composition root: settings in, a running engine out; every face calls this and nothing below it."""
 
-import logging
-import os
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import RequestError, StreetfixError, UnknownMapError
+from service.errors import BundleError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
-from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
-from service.imaging.gather import finest_rad
+from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits
 from service.imaging.view_grid import ViewGrid
 from service.localization.answer import Answer
+from service.localization.decoding import DepthFormat, decoded_query
 from service.localization.frames import Frame
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
 from service.localization.query import Query
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
-from service.runtime.choices import Choices
 from service.runtime.last_answers import LastAnswers
 from service.runtime.map_registry import MapRegistry
+from service.runtime.map_watcher import MapWatcher
 from service.runtime.memory import (
     DEPTH_KEPT,
     DEPTH_PEAK,
@@ -33,11 +31,10 @@ from service.runtime.memory import (
     budget_of,
 )
 from service.runtime.metrics import Metrics
+from service.runtime.serving_table import ServingTable
 from service.runtime.settings import Settings
 from service.runtime.threads import limit_pools, usable_cores
 from service.runtime.tracing import Tracing
-
-_log = logging.getLogger("streetfix.engine")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,13 +80,13 @@ class Engine:
     Args:
         registry: of the maps.
         settings: checked.
-        choices: shared with other processes that serve the same maps; None where there are none.
+        watcher: of the folders that the maps came from; None makes one.
     """
 
-    def __init__(self, registry: MapRegistry, settings: Settings, choices: Choices | None = None) -> None:
+    def __init__(self, registry: MapRegistry, settings: Settings, watcher: MapWatcher | None = None) -> None:
         self.registry = registry
         self.settings = settings
-        self._choices = choices
+        self.watcher = watcher or MapWatcher(registry, settings.maps, warm=partial(warm_up, settings.false_accept_rate))
         self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
         self.memory = budget_of(settings, threads=self.threads, maps_bytes=_files_bytes(registry))
@@ -99,38 +96,30 @@ class Engine:
         self.is_draining = False
 
     @classmethod
-    def open(cls, settings: Settings, choices: Choices | None = None) -> "Engine":
-        """Open all maps of the settings.
+    def open(cls, settings: Settings, table: ServingTable | None = None) -> "Engine":
+        """Open the maps of the settings; those that cannot be opened are in ``registry.refused``.
 
         Args:
             settings: checked.
-            choices: as of the engine.
+            table: what serves, shared with other workers of the same service; None if there are none. The engine then opens what
+                serves in them, and waits until it can.
 
         Raises:
-            BundleError: a map is missing, damaged or mismatched.
+            StreetfixError: there are bundles, but none can be mounted; with the setting ``strict``, any cannot or there is none.
         """
         limit_pools()
-        return cls(MapRegistry.open(settings.maps, provider=settings.provider), settings, choices)
+        registry = MapRegistry(provider=settings.provider, table=table)
+        watcher = MapWatcher(registry, settings.maps, warm=partial(warm_up, settings.false_accept_rate))
+        watcher.open_first(strict=settings.strict)
+        return cls(registry, settings, watcher)
 
     def serve_version(self, name: str, version: str) -> Localizer:
-        """Let another open version of a map serve, in every worker.
+        """Let another mounted version of a map serve, in every worker.
 
         Raises:
-            UnknownMapError: no such map or version is open.
+            UnknownMapError: no such map or version is mounted.
         """
-        served = self.registry.serve(name, version)
-        if self._choices is not None:
-            self._choices.choose(name, version)
-            os.kill(os.getppid(), signal.SIGHUP)  # the parent passes it on, and every worker looks
-        return served
-
-    def follow_choices(self) -> None:
-        """Let those versions serve that were chosen in other workers."""
-        for name, version in () if self._choices is None else self._choices.news():
-            try:
-                self.registry.serve(name, version)
-            except UnknownMapError:  # taken out meanwhile
-                _log.warning("choice_not_open name=%s version=%s", name, version)
+        return self.registry.serve(name, version)
 
     @property
     def is_ready(self) -> bool:
@@ -204,15 +193,6 @@ class Engine:
         decoded = perf_counter()
         return localizer.look_up(query), 1e3 * (decoded - started)
 
-    def warm(self, localizer: Localizer) -> None:
-        """Ask a map once, in the caller's thread, so that its encoder and the first of its pages are in memory."""
-        limit_pools()
-        camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
-        rng = np.random.default_rng(0)
-        rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
-        depth_m = rng.uniform(2.0, 20.0, (48, 64)).astype(np.float32)
-        localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera))
-
     def close(self) -> None:
         """Let running work end and drop what waits."""
         self.admission.close()
@@ -231,29 +211,44 @@ class Engine:
     def _decoded(self, encoded: EncodedQuery, grid: ViewGrid, reserve: Callable[[str, int], None]) -> Query:
         limits = self.settings.limits
         image_limits = ImageLimits(max_bytes=limits.max_part_bytes, max_pixels=limits.max_pixels, reserve=reserve)
-        rgb = decode_rgb(encoded.rgb, limits=image_limits, camera=encoded.camera, finest_rad=finest_rad(grid))
-        depth_m = decode_depth(
-            encoded.depth,
-            camera=encoded.camera,
-            encoding=encoded.depth_encoding,
-            scale_m=encoded.scale_m,
-            kind=encoded.depth_kind,
-            baseline_m=encoded.baseline_m,
+        depth_format = DepthFormat(
+            encoding=encoded.depth_encoding, kind=encoded.depth_kind, scale_m=encoded.scale_m, baseline_m=encoded.baseline_m,
             max_range_m=encoded.max_range_m,
-            limits=image_limits,
-        )
-        require_sizes(rgb, depth_m, encoded.camera)
-        return Query(
-            rgb=rgb,
-            depth_m=depth_m,
-            camera=encoded.camera,
+        )  # fmt: skip
+        return replace(
+            decoded_query(encoded.rgb, encoded.depth, encoded.camera, depth_format, grid=grid, limits=image_limits),
             down_camera=encoded.down_camera,
             T_vehicle_camera=encoded.T_vehicle_camera,
             neighbours=encoded.neighbours,
             refine=encoded.refine,
-            baseline_m=encoded.baseline_m,
             false_accept_rate=encoded.false_accept_rate or self.settings.false_accept_rate,
         )
+
+
+def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
+    """Ask a map once, in the caller's thread, so that its encoder and the first of its pages are in memory.
+
+    Args:
+        false_accept_rate: the service's setting, which holds for requests that name none.
+        localizer: of the map.
+
+    Raises:
+        BundleError: the map's calibration cannot promise that rate, so it would refuse those requests.
+        StreetfixError: the map cannot answer.
+    """
+    limit_pools()
+    bundle = localizer.bundle
+    if bundle.calibration is not None and false_accept_rate < (least := bundle.calibration.least_false_accept_rate):
+        raise BundleError(
+            f"{bundle.path}: the setting false_accept_rate is {false_accept_rate:g}, less than the {least:g} that this map's "
+            f"calibration can promise, so every request would be refused; set STREETFIX_FALSE_ACCEPT_RATE to {least:g} or more",
+            field="false_accept_rate",
+        )
+    camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
+    depth_m = rng.uniform(2.0, 20.0, (48, 64)).astype(np.float32)
+    localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera, false_accept_rate=false_accept_rate))
 
 
 def _files_bytes(registry: MapRegistry) -> int:

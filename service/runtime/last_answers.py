@@ -18,7 +18,7 @@ MOST = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LastAnswer:
-    """What is kept of an answer; ``number`` counts since the process started."""
+    """What is kept of an answer; ``number`` counts since the process started. Street, position and heading are None unless LOCALIZED."""
 
     number: int
     at: datetime
@@ -27,8 +27,8 @@ class LastAnswer:
     status: Status
     confidence: float | None
     street: str | None
-    position_m: Float64[NDArray[np.float64], "3"]
-    heading_rad: float
+    position_m: Float64[NDArray[np.float64], "3"] | None
+    heading_rad: float | None
     frames: int
     total_ms: float
 
@@ -42,13 +42,15 @@ class LastAnswers:
 
     def add(self, answer: Answer, bundle: MapBundle, *, frames: int) -> None:
         """Keep an answer's figures."""
-        has_street = bundle.streets is not None and answer.street >= 0
+        localized, T_map_camera = answer.status == "LOCALIZED", answer.T_map_camera_guess
+        has_street = localized and bundle.streets is not None and answer.street >= 0
         self._kept.append(
             LastAnswer(
                 number=next(self._numbers), at=datetime.now(UTC), map_name=bundle.name, map_version=bundle.manifest.version,
                 status=answer.status, confidence=answer.confidence,
                 street=bundle.streets[answer.street].name if has_street and bundle.streets is not None else None,
-                position_m=answer.T_map_camera[:3, 3].copy(), heading_rad=heading_of_camera(answer.T_map_camera), frames=frames,
+                position_m=T_map_camera[:3, 3].copy() if localized else None,
+                heading_rad=heading_of_camera(T_map_camera) if localized else None, frames=frames,
                 total_ms=answer.timings.total_ms,
             )
         )  # fmt: skip

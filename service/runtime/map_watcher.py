@@ -1,79 +1,113 @@
-"""Sees new bundles in the mounted folders, opens and warms them, and only then lets them serve."""
+"""Sees new bundles in the maps folders, opens and warms them, and only then lets them serve; at start and as long as the service runs."""
 
 import logging
 import os
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from service.errors import StreetfixError
+from service.errors import BundleError, StreetfixError
 from service.localization.localizer import Localizer
+from service.maps.manifest import Manifest, read_manifest
 from service.maps.reader import MapBundle
-from service.runtime.map_registry import MapRegistry, bundle_paths
+from service.runtime.map_registry import MapRegistry, Refused, bundle_paths, twin_error, version_of
+from service.runtime.serving_table import Key, MapVersion
+from service.runtime.wakeup import Wakeup
 
 _log = logging.getLogger("streetfix.maps")
 #: Name, size and time of every file: what tells one content of a folder from another without reading it.
 Stamp = tuple[tuple[str, int, int], ...]
+#: How often a worker looks whether other workers have found something, in seconds; it costs the comparison of two numbers.
+_POLL_S = 0.25
+#: How often a worker that cannot open what serves in the others looks again, in seconds; and after how many times it tries files that
+#: have not changed.
+_RETRY_S, _ROUNDS_UNTIL_ANEW = 1.0, 30
+
+
+@dataclass(frozen=True, slots=True)
+class _Bundle:
+    """A bundle in a maps folder; its manifest was read, no other file."""
+
+    path: Path
+    stamp: Stamp
+    manifest: Manifest
+
+    @property
+    def version(self) -> MapVersion:
+        return version_of(self.manifest)
 
 
 class MapWatcher:
-    """Looks at folders every so often, and at once when it is told to.
+    """Looks at folders every so often, at once when it is told to, and when another worker has found something.
 
     Args:
         registry: where bundles are mounted.
         paths: bundles, or folders that hold some, as the service was started with.
-        warm: called with every new map before it serves, so that its first request is no slower than the next.
-        after: called after every look.
+        warm: called with every new map before it serves, so that its first request is no slower than the next. What it raises says why
+            the map cannot serve.
     """
 
-    def __init__(
-        self,
-        registry: MapRegistry,
-        paths: Sequence[Path],
-        *,
-        warm: Callable[[Localizer], None],
-        after: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, registry: MapRegistry, paths: Sequence[Path], *, warm: Callable[[Localizer], None]) -> None:
         self._registry = registry
         self._paths = tuple(paths)
         self._warm = warm
-        self._after = after
-        self._stop, self._told = threading.Event(), threading.Event()
+        self._stop, self._told = threading.Event(), Wakeup()
         self._thread: threading.Thread | None = None
-        self._seen: dict[Path, Stamp] = {}
-        self._failed: dict[Path, Stamp] = {}
-        self._holds: dict[Path, tuple[str, str]] = {}  # name and version that were seen at a path
-        for version in [each for localizer in registry for each in registry.versions(localizer.bundle.name)]:
-            self._saw(version, stamp_of(version.bundle.path))
+        self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
+        self._failed: dict[Path, tuple[Stamp, StreetfixError]] = {}
+        self._due: set[Key] = set()  # versions that are to be taken out
+
+    def open_first(self, *, strict: bool = False, wait: Callable[[float], object] = time.sleep) -> None:
+        """Mount what the folders hold when the service starts; what cannot be opened is in ``MapRegistry.refused``.
+
+        A worker that joins others opens what is mounted there. It returns when it has all that serves.
+
+        Args:
+            strict: fail if any bundle cannot be mounted, or if there is none.
+            wait: called with seconds.
+
+        Raises:
+            StreetfixError: there are bundles, but none can be mounted; or as ``strict`` says. A worker that joins others never fails so.
+        """
+        table = self._registry.table
+        if not (table.is_shared and table.read().started):
+            self.scan()
+            self._require(strict=strict)
+        rounds = 0
+        while lacking := self._registry.join():
+            if (
+                rounds % _ROUNDS_UNTIL_ANEW == 0
+            ):  # to read a damaged map again and again would take time from those who answer
+                self._failed.clear()
+            given_up = self._open_lacking(lacking)
+            if not self._registry.join(given_up):
+                return
+            if given_up and rounds == 0:
+                versions = " ".join(f"{name}@{version}" for name, version in sorted(given_up))
+                _log.error("worker_waits reason=other workers serve what it cannot open: %s", versions)
+            rounds += 1
+            wait(_RETRY_S)
 
     def scan(self, *, drop_missing: bool = False) -> list[str]:
         """Mount what is new; what happened, for people.
 
+        Of each map the newest bundles are opened first, and none that would not stay mounted.
+
         Args:
-            drop_missing: take out what lies in no folder any more; else it stays, since a folder that is being replaced is missing
-                for a moment.
+            drop_missing: take out versions whose folder is gone, and try again what was refused. Otherwise they stay, since a folder
+                that is being replaced is missing for a moment.
         """
-        told = []
-        present = self._bundles()
-        for path in present:
-            stamp = stamp_of(path)
-            if self._seen.get(path) == stamp or self._failed.get(path) == stamp:
-                continue
-            try:
-                localizer = Localizer.open(MapBundle.open(path), provider=self._registry.provider)
-                self._warm(localizer)
-            except Exception as error:  # whatever it is, this bundle does not serve, and the others are looked at
-                self._failed[path] = stamp
-                told.append(f"{path} is not mounted: {error}")
-                _log.warning("map_refused path=%s reason=%s", path, error)
-                continue
-            self._saw(localizer, stamp)
-            self._registry.mount(localizer)
-            manifest = localizer.bundle.manifest
-            told.append(f"mounted {manifest.name} {manifest.version}")
-            _log.warning("map_mounted name=%s version=%s", manifest.name, manifest.version)
-        if drop_missing and (dropped := self._drop(present)):
-            told += dropped + self.scan()
+        if drop_missing:
+            self._failed.clear()
+        bundles = self._bundles()
+        if drop_missing:
+            self._due = self._missing()
+        told = self._mount_new(bundles)
+        if dropped := self._drop():
+            told += dropped + self._mount_new(bundles)  # older versions may have found room
+        self._tell_refused()
         return told
 
     def start(self, interval_s: float) -> None:
@@ -93,44 +127,172 @@ class MapWatcher:
             self._thread.join(timeout=5.0)  # a map that is being opened must not keep the service from leaving
 
     def _run(self, interval_s: float) -> None:
+        table = self._registry.table
+        # A worker that joined others has opened what serves; what is new beside it comes now.
+        next_look, seen = time.monotonic() + (0.0 if table.is_shared else interval_s), table.read()
         while True:
-            told = self._told.wait(interval_s)
+            patience_s = min(max(0.0, next_look - time.monotonic()), threading.TIMEOUT_MAX)
+            told = self._told.wait(min(patience_s, _POLL_S) if table.is_shared else patience_s)
             if self._stop.is_set():
                 return
-            self._told.clear()
+            if told:
+                self._told.clear()
             try:
-                self.scan(drop_missing=told)
-                self._after()
+                before, seen = seen, table.read()
+                is_news = seen is not before and bool(self._due or table.others_offer())
+                if told or is_news or time.monotonic() >= next_look:
+                    self.scan(drop_missing=told)
+                    next_look = time.monotonic() + interval_s
+                if table.is_shared and any(seen.offers.values()):
+                    table.settle()  # a worker that all wait for may have ended
             except Exception:  # a defect here must not end the watching, nor the service
                 _log.exception("map_scan_failed")
 
-    def _bundles(self) -> list[Path]:
+    def _mount_new(self, bundles: Iterable[_Bundle]) -> list[str]:
+        told = []
+        for each in sorted(bundles, key=lambda bundle: bundle.version.made_at, reverse=True):
+            if self._is_refused(each.path, each.stamp) or not self._registry.wants(each.version):
+                continue
+            name, version = each.version.key
+            if (error := self._mount(each)) is None:
+                told.append(f"mounted {name} {version}")
+                # At start the command line says what serves; later only the log does.
+                level = logging.INFO if self._thread is None else logging.WARNING
+                _log.log(level, "map_mounted name=%s version=%s", name, version)
+            else:
+                told.append(f"{each.path} is not mounted: {error}")
+        return told
+
+    def _mount(self, bundle: _Bundle) -> StreetfixError | None:
+        """Open, warm and mount a bundle; or say why not."""
+        try:
+            localizer = Localizer.open(MapBundle.open(bundle.path), provider=self._registry.provider)
+            self._warm(localizer)
+            self._registry.mount(localizer)
+        except StreetfixError as error:
+            return self._refuse(bundle.path, bundle.stamp, error)
+        except Exception as error:  # whatever it is, this bundle does not serve, and the others are looked at
+            _log.exception("map_failed path=%s", bundle.path)
+            what = f"{bundle.path}: it cannot be opened ({type(error).__name__}); the service's log says more"
+            return self._refuse(bundle.path, bundle.stamp, BundleError(what))
+        self._failed.pop(bundle.path, None)
+        return None
+
+    def _open_lacking(self, lacking: Iterable[MapVersion]) -> frozenset[Key]:
+        """Open versions that are mounted in other workers; those that cannot be opened."""
+        wanted = {each.key for each in lacking}
+        for each in self._bundles():
+            key = each.version.key
+            if key in wanted and not self._is_refused(each.path, each.stamp) and self._mount(each) is None:
+                wanted.remove(key)
+        self._tell_refused()
+        return frozenset(wanted)
+
+    def _bundles(self) -> list[_Bundle]:
+        """The bundles that lie in the folders now."""
+        found = []
+        present = self._present()
+        self._manifests = {path: known for path, known in self._manifests.items() if path in present}
+        for path in present:
+            stamp = stamp_of(path)
+            if path in self._failed and self._failed[path][0] != stamp:
+                del self._failed[path]
+            known = self._manifests.get(path)
+            if known is None or known[0] != stamp:
+                try:
+                    known = self._manifests[path] = stamp, read_manifest(path)
+                except StreetfixError as error:  # what was known of the folder before holds on
+                    if not self._is_refused(path, stamp):
+                        self._refuse(path, stamp, error)
+                    continue
+            found.append(_Bundle(path, *known))
+        return found
+
+    def _present(self) -> list[Path]:
         found: list[Path] = []
         for path in self._paths:
             try:
                 found += bundle_paths(path)
-            except StreetfixError:  # empty for the moment
-                continue
+                if self._is_refused(path, ()):
+                    del self._failed[path]
+            except StreetfixError as error:
+                if not self._is_refused(path, ()):
+                    self._refuse(path, (), error)
+        for gone in set(self._failed) - set(found) - set(self._paths):
+            del self._failed[gone]
         return found
 
-    def _saw(self, localizer: Localizer, stamp: Stamp) -> None:
-        path, manifest = localizer.bundle.path, localizer.bundle.manifest
-        self._seen[path], self._holds[path] = stamp, (manifest.name, manifest.version)
+    def _missing(self) -> set[Key]:
+        """Mounted versions whose folder is gone. One that was replaced in its folder is not: it can be rolled back to."""
+        present = set(self._present())
+        held = {manifest_key(manifest) for path, (_, manifest) in self._manifests.items() if path in present}
+        unread = [path for path, (_, error) in self._failed.items() if _is_unreadable(error)]
+        open_here = [v.bundle for each in self._registry for v in self._registry.versions(each.bundle.name)]
+        return {
+            manifest_key(bundle.manifest) for bundle in open_here
+            if not (bundle.path in present or manifest_key(bundle.manifest) in held or any(map(bundle.path.is_relative_to, unread)))
+        }  # fmt: skip
 
-    def _drop(self, present: list[Path]) -> list[str]:
-        told = []
-        for path in set(self._seen) - set(present):
-            del self._seen[path]
-            gone = self._holds.pop(path)
-            for twin in [each for each, holds in self._holds.items() if holds == gone]:
-                self._seen.pop(twin, None)  # it was not mounted beside its twin, and is looked at again
-            for localizer in [v for each in self._registry for v in self._registry.versions(each.bundle.name)]:
-                bundle = localizer.bundle
-                if bundle.path == path:
-                    self._registry.unmount(bundle.name, bundle.manifest.version)
-                    told.append(f"unmounted {bundle.name} {bundle.manifest.version}")
-                    _log.warning("map_unmounted name=%s version=%s", bundle.name, bundle.manifest.version)
-        return told
+    def _drop(self) -> list[str]:
+        """Take out what is due and still missing. What serves stays until other workers have what is to serve instead."""
+        if not self._due:
+            return []
+        self._due &= self._missing()
+        table, waits = self._registry.table.read(), set[Key]()
+        for name, known in table.maps.items():
+            left = [each.made_at for each in known.versions if each.key not in self._due]
+            offers = [each.made_at for each in table.offers.get(self._registry.table.number, ()) if each.name == name]
+            if offers and (not left or max(offers) > max(left)):
+                waits.add((name, known.serving))
+        gone, self._due = self._due - waits, self._due & waits
+        # In one change: the next one to serve must not be one that is gone as well.
+        self._registry.table.remove(gone)
+        for name, version in sorted(gone):
+            _log.warning("map_unmounted name=%s version=%s", name, version)
+        return [f"unmounted {name} {version}" for name, version in sorted(gone)]
+
+    def _require(self, *, strict: bool) -> None:
+        """Raise what keeps the service from its first start."""
+        errors = [error for _, error in self._failed.values()]
+        if errors and (strict or not self._registry.has_open):
+            raise errors[0]
+        if strict:
+            self._require_no_twins()
+            if not self._registry.has_open:
+                raise BundleError(f"there is no map bundle in {', '.join(map(str, self._paths))}; build-map writes one")
+
+    def _require_no_twins(self) -> None:
+        seen: dict[Key, Path] = {}
+        for path, (_, manifest) in self._manifests.items():
+            other = seen.setdefault(manifest_key(manifest), path)
+            if other != path:
+                raise twin_error(path, other, manifest)
+
+    def _is_refused(self, path: Path, stamp: Stamp) -> bool:
+        return path in self._failed and self._failed[path][0] == stamp
+
+    def _refuse(self, path: Path, stamp: Stamp, error: StreetfixError) -> StreetfixError:
+        self._failed[path] = stamp, error
+        _log.warning("map_refused path=%s reason=%s", path, error.message)
+        return error
+
+    def _tell_refused(self) -> None:
+        """Let the faces say what is refused: by the folder's own name, as a probe needs no key."""
+        self._registry.refused = tuple(
+            Refused(path.name or str(path), error.message.replace(f"{path.parent}{os.sep}", ""))
+            for path, (_, error) in sorted(self._failed.items())
+        )
+
+
+def manifest_key(manifest: Manifest) -> Key:
+    """What requests call it."""
+    return manifest.name, manifest.version
+
+
+def _is_unreadable(error: StreetfixError) -> bool:
+    """Whether a folder is there and cannot be read: nothing can be said of what lies in it."""
+    cause = error.__cause__
+    return isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError | NotADirectoryError)
 
 
 def stamp_of(path: Path) -> Stamp:

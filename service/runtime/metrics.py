@@ -18,7 +18,7 @@ from prometheus_client.registry import Collector
 from service.localization.answer import Answer, Timings
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
-from service.runtime.map_registry import MapRegistry
+from service.runtime.map_registry import MOST_REFUSED, MapRegistry
 from service.runtime.memory import MemoryBudget
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -169,7 +169,7 @@ class _Maps(Collector):
         self._maps = maps
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        """The version that serves of each map."""
+        """The version that serves of each map, and what is not mounted."""
         maps = GaugeMetricFamily(
             "streetfix_map", "Mounted maps; the value is their number of places.", labels=["map", "version"]
         )
@@ -177,6 +177,18 @@ class _Maps(Collector):
             manifest = localizer.bundle.manifest
             maps.add_metric([manifest.name, manifest.version], manifest.counts.places)
         yield maps
+        refused = self._maps.refused
+        yield GaugeMetricFamily(
+            "streetfix_bundles_refused", "Bundles in the maps folders that are not mounted.", value=len(refused)
+        )
+        named = GaugeMetricFamily(
+            "streetfix_bundle_refused",
+            f"1 for each bundle that is not mounted; at most {MOST_REFUSED} are named.",
+            labels=["bundle"],
+        )
+        for name in sorted({each.bundle[:200] for each in refused[:MOST_REFUSED]}):
+            named.add_metric([name], 1)
+        yield named
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
         """Nothing that could clash."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from service.errors import StreetfixError
+from service.runtime.wakeup import Wakeup
 
 _log = logging.getLogger("streetfix.reload")
 
@@ -27,7 +28,7 @@ class Reloader:
 
     def __init__(self) -> None:
         self._watched: list[_Watched] = []
-        self._wake = threading.Event()
+        self._wake = Wakeup()
         self._stopping = False
         self._thread: threading.Thread | None = None
 

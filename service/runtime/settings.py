@@ -18,7 +18,7 @@ from pydantic_settings import (
 from service.errors import RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.localization.encoder import Provider
-from service.localization.query import FALSE_ACCEPT_RATE
+from service.localization.query import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
 from service.runtime.environment import CLIENT_KEY, CONFIG, did_you_mean, require_known, setting_names
 from service.runtime.hosts import require_host_pattern
 from service.runtime.readable import why_unreadable
@@ -29,10 +29,10 @@ class Limits(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_request_bytes: int = Field(40 * 2**20, ge=1024, description="whole body of a request")
-    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, description="one picture, encoded")
-    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, description="one picture, decoded")
-    max_parts: int = Field(8, ge=3, description="parts of a multipart body")
+    # gRPC takes the length of a message in 32 bits.
+    max_request_bytes: int = Field(40 * 2**20, ge=1024, le=2**31 - 1, description="whole body of a request")
+    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, le=2**31 - 1, description="one picture, encoded")
+    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, le=2**30, description="one picture, decoded")
 
 
 class Settings(BaseSettings):
@@ -43,6 +43,10 @@ class Settings(BaseSettings):
     )
 
     maps: Annotated[tuple[Path, ...], NoDecode] = Field((), description="map bundles, or folders of them; ':' between")
+    strict: bool = Field(
+        False,
+        description="do not start if any bundle cannot be mounted, or if there is none; else those that can be serve",
+    )
     host: str = Field("127.0.0.1", description="address to listen on; loopback unless told otherwise")
     port: int = Field(8000, ge=0, le=65535, description="0 lets the system choose")
     grpc_port: int | None = Field(
@@ -110,11 +114,12 @@ class Settings(BaseSettings):
     request_memory_mib: int | None = Field(
         None,
         ge=1,
+        le=2**24,
         description="memory for requests in all processes together; default: what the container's limit leaves",
     )
-    request_timeout_s: float = Field(30.0, gt=0, description="from a request's first byte to its answer")
+    request_timeout_s: float = Field(30.0, gt=0, le=86400, description="from a request's first byte to its answer")
     false_accept_rate: float = Field(
-        FALSE_ACCEPT_RATE, gt=0, lt=1,
+        FALSE_ACCEPT_RATE, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
         description="share of the queries taken outside the map that one can live with being answered LOCALIZED",
     )  # fmt: skip
     console: bool = Field(True, description="serve the browser console at /console, and what it asks for")

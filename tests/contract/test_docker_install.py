@@ -14,6 +14,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 MOST_BYTES = 700 * 2**20
+#: As .dockerignore has them.
+IGNORED = ("__pycache__", "*.so", "node_modules", "web", "CMakeFiles", "CMakeCache.txt")
 
 
 def instructions() -> list[list[tuple[str, str]]]:
@@ -59,7 +61,7 @@ def tools(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         "1",
         "--timeout",
         "10",
-        "hatchling",
+        "scikit-build-core",
     ]
     reached = subprocess.run(
         asked, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=60
@@ -79,19 +81,15 @@ def installed(tools: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -
         if name == "COPY":
             *froms, to = shlex.split(rest)
             for each in froms:
-                destination = source / to / each if to.endswith("./") else source / to
+                destination = source / to / Path(each).name if to.endswith("/") else source / to
                 destination.parent.mkdir(parents=True, exist_ok=True)
                 if (ROOT / each).is_dir():
-                    shutil.copytree(ROOT / each, destination, ignore=shutil.ignore_patterns("__pycache__"))
+                    shutil.copytree(ROOT / each, destination, ignore=shutil.ignore_patterns(*IGNORED))
                 else:
-                    shutil.copyfile(ROOT / each, destination)
+                    shutil.copy(ROOT / each, destination)
         elif name == "RUN":
             # Packages may come from pip's cache here; nothing else differs from the image.
-            step = (
-                rest.replace("--no-cache-dir ", "")
-                .replace("/opt/streetfix", str(target))
-                .replace("/wheels", str(wheels))
-            )
+            step = rest.replace("--no-cache-dir ", "").replace("/opt/", f"{place}/").replace("/wheels", str(wheels))
             done = subprocess.run(
                 ["bash", "-euc", step], cwd=source, env=tools, capture_output=True, text=True, check=False, timeout=600
             )
@@ -112,10 +110,25 @@ def test_the_command_is_there_and_the_size_is_known(
     assert size < MOST_BYTES
 
 
-@pytest.mark.parametrize("package", ["torch", "embreex", "scipy", "pip", "setuptools", "pytest"])
+@pytest.mark.parametrize(
+    "package", ["model_training", "torch", "embreex", "scipy", "pip", "setuptools", "pytest", "ziglang", "cmake"]
+)
 def test_what_the_service_does_not_need_is_not_there(installed: Path, tmp_path: Path, package: str) -> None:
     done = run([str(installed / "bin" / "python"), "-c", f"import {package}"], tmp_path)
     assert f"No module named '{package}'" in done.stderr
+
+
+def test_no_encoder_and_no_source_of_c_is_there(installed: Path) -> None:
+    assert not [
+        path for pattern in ("*.onnx", "*.c", "*.h") for path in (installed / "lib").glob(f"*/*/service/**/{pattern}")
+    ]
+    assert len(list((installed / "lib").glob("*/*/service/*/_*.so"))) == len(list((ROOT / "service").rglob("*.c")))
+
+
+def test_commands_that_are_not_there_are_not_listed(installed: Path, tmp_path: Path) -> None:
+    told = run([str(installed / "bin" / "streetfix"), "--help"], tmp_path).stdout
+    listed = re.findall(r"^  ([a-z-]+)  ", told.partition("Commands:")[2], re.MULTILINE)
+    assert sorted(listed) == ["bridge", "health", "keys", "localize", "serve"]
 
 
 @pytest.mark.parametrize(
@@ -123,15 +136,17 @@ def test_what_the_service_does_not_need_is_not_there(installed: Path, tmp_path: 
     [
         (["simulate", "--out", "city"], "mapping"),
         (["demo", "--once"], "mapping"),
+        (["map", "info", "city"], "mapping"),
         (["train", "--run", "run"], "training"),
         (["export", "run", "--out", "encoder.onnx"], "training"),
     ],
 )  # fmt: skip
-def test_a_command_whose_extra_is_missing_names_it(
+def test_a_command_that_is_not_there_says_what_to_install(
     installed: Path, tmp_path: Path, arguments: list[str], extra: str
 ) -> None:
     done = run([str(installed / "bin" / "streetfix"), *arguments], tmp_path)
     assert done.returncode == 1
+    assert f"the command '{arguments[0]}' is not part of this installation" in done.stderr
     assert f'pip install "streetfix[{extra}]"' in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
@@ -139,15 +154,18 @@ def test_a_command_whose_extra_is_missing_names_it(
 
 @pytest.fixture
 def port(installed: Path, bundle_path: Path, tmp_path: Path) -> Iterator[str]:
-    """Of the service, started as the image starts it but on loopback."""
+    """Where the service tells its health; it is started as the image starts it but on loopback."""
     process = subprocess.Popen(
         [installed / "bin" / "streetfix", "serve", "--host", "127.0.0.1"],
-        cwd=tmp_path, env={"PATH": "/usr/bin:/bin", "STREETFIX_MAPS": str(bundle_path), "STREETFIX_PORT": "0"},
+        cwd=tmp_path, env={"PATH": "/usr/bin:/bin", "STREETFIX_MAPS": str(bundle_path), "STREETFIX_PORT": "0",
+                           "STREETFIX_HEALTH_PORT": "0"},
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
         lines = iter(process.stdout or ())
-        yield next(found[1] for line in lines if (found := re.search(r"serving at http://127.0.0.1:(\d+)", line)))
+        health = next(found[1] for line in lines if (found := re.search(r"health at http://127.0.0.1:(\d+)", line)))
+        next(line for line in lines if "serving at" in line)
+        yield health
     finally:
         process.terminate()
         process.communicate(timeout=60)
@@ -156,10 +174,12 @@ def port(installed: Path, bundle_path: Path, tmp_path: Path) -> Iterator[str]:
 def test_it_serves_a_mounted_map_and_the_health_check_says_so(installed: Path, tmp_path: Path, port: str) -> None:
     health = next(rest for name, rest in instructions()[-1] if name == "HEALTHCHECK")
     program, *arguments = json.loads(health[health.index("CMD ") + 4 :])
-    done = run([str(installed / "bin" / program), *arguments], tmp_path, STREETFIX_PORT=port)
+    command = [str(installed / "bin" / program), *arguments]
+    done = run(command, tmp_path, STREETFIX_HEALTH_PORT=port)
     assert (done.returncode, done.stderr) == (0, "")
-    off = run([str(installed / "bin" / program), *arguments], tmp_path, STREETFIX_PORT="1")
-    assert off.returncode != 0
+    everywhere = run(command, tmp_path, STREETFIX_HEALTH_PORT=port, STREETFIX_HOST="0.0.0.0")  # noqa: S104
+    assert (everywhere.returncode, everywhere.stderr) == (0, "")
+    assert run(command, tmp_path, STREETFIX_HEALTH_PORT="1").returncode != 0
 
 
 def test_the_images_environment_keeps_onnx_runtime_from_reporting_usage(installed: Path, tmp_path: Path) -> None:

@@ -45,10 +45,39 @@ def test_what_is_copied_exists_and_is_not_ignored(source: str) -> None:
     assert source in kept
 
 
-def test_there_are_two_stages_on_slim_images() -> None:
+def test_nothing_is_let_in_that_is_not_copied() -> None:
+    kept = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
+    assert {name for name in kept if not name.startswith("native/")} == set(sources())
+
+
+def test_both_images_are_pinned_by_digest_and_are_of_one_python() -> None:
     images = [values(stage, "FROM")[0].split()[0] for stage in stages()]
-    assert len(images) == 2
-    assert all(re.fullmatch(r"python:3\.\d+-slim\S*", image) for image in images)
+    found = [re.fullmatch(r"python:(3\.\d+\.\d+)(-slim)?-([a-z]+)@sha256:[0-9a-f]{64}", image) for image in images]
+    assert [each[2] for each in found if each] == [None, "-slim"]
+    # One interpreter and one C library: what the first builds runs on the last.
+    assert len({(each[1], each[3]) for each in found if each}) == 1
+
+
+@pytest.mark.parametrize("lock", ["service", "build"])
+def test_every_locked_package_has_its_hashes(lock: str) -> None:
+    told = (ROOT / "locks" / f"{lock}.txt").read_text()
+    entries = re.split(r"^(?=[A-Za-z0-9])", told, flags=re.MULTILINE)[1:]
+    assert entries
+    for entry in entries:
+        assert re.match(r"[A-Za-z0-9._-]+(\[[^\]]*\])?==\S+", entry), entry
+        assert "--hash=sha256:" in entry, entry
+
+
+def test_every_package_that_the_build_fetches_is_locked() -> None:
+    for step in values(stages()[0], "RUN"):
+        for command in step.split("&&"):
+            if re.search(r"\bpip\b.*\b(install|wheel)\b", command):
+                assert "--require-hashes" in command or "--no-index" in command, command
+
+
+def test_the_wheel_is_of_the_service_alone() -> None:
+    assert "--config-settings wheel.packages=service " in " ".join(values(stages()[0], "RUN"))
+    assert not any("model_training" in source for source in sources())
 
 
 def test_the_last_stage_copies_from_the_first_only() -> None:
@@ -83,13 +112,25 @@ def test_nothing_is_written_at_run_time() -> None:
     assert values(stages()[-1], "WORKDIR") == ["/tmp"]  # noqa: S108  # the one folder that may be written
 
 
-def test_health_is_asked_at_the_port_that_is_exposed() -> None:
+def test_the_ports_are_those_of_the_settings_and_health_has_its_own() -> None:
     stage = stages()[-1]
     rest, grpc = values(stage, "EXPOSE")[0].split()
     assert f"STREETFIX_PORT={rest}" in values(stage, "ENV")[0]
     assert f"STREETFIX_GRPC_PORT={grpc}" in values(stage, "ENV")[0]
     health = values(stage, "HEALTHCHECK")[0]
-    assert json.loads(health[health.index("CMD ") + 4 :]) == ["streetfix", "health"]
+    assert json.loads(health[health.index("CMD ") + 4 :]) == ["streetfix-ready"]
+    # Inside the container alone: the health port is not one of those that are published.
+    assert re.search(r"STREETFIX_HEALTH_PORT=\d+", values(stage, "ENV")[0])
+
+
+def test_the_health_check_starts_no_python() -> None:
+    assert "install -m 755 docker/ready /opt/streetfix/bin/streetfix-ready" in " ".join(values(stages()[0], "RUN"))
+    lines = (ROOT / "docker" / "ready").read_text().splitlines()
+    assert lines[0] == "#!/bin/bash"
+    # Without a health port, which the image sets, there may be TLS: Python can speak that.
+    assert [line.strip() for line in lines if "streetfix" in line and not line.startswith("#")] == [
+        "exec streetfix health"
+    ]
 
 
 def test_the_command_serves_the_mounted_maps_on_all_addresses_of_the_container() -> None:

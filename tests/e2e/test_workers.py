@@ -1,12 +1,16 @@
 """Several processes on the same ports: one falls, the others answer; what one is told, all do; what all count is one number."""
 
 import os
+import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from benchmarks.serving.agreement import Named, Switch, disagreements
 from model_training.loadtest.processes import descendants
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
@@ -30,7 +35,7 @@ class Service:
     def __init__(self, folder: Path) -> None:
         self.process = subprocess.Popen(
             [*COMMAND, str(folder), "--workers", str(WORKERS), "--port", "0", "--grpc-port", "0"], text=True,
-            env={"PATH": ""}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            env={"PATH": "", "STREETFIX_WATCH_S": "0.2"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
         found: dict[str, str] = {}
         for line in self.process.stdout or ():
@@ -42,7 +47,13 @@ class Service:
         until = time.monotonic() + 60
         while len(self.workers) < WORKERS:
             assert time.monotonic() < until
-        self.until(lambda: self.metric("streetfix_capacity") == WORKERS * (1 + 64))
+        self.until(lambda: self.listening == WORKERS)
+
+    @property
+    def listening(self) -> int:
+        """Sockets that listen on the port: one of each worker that answers."""
+        port, rows = f"{httpx.URL(self.url).port:04X}", Path("/proc/net/tcp").read_text().splitlines()[1:]
+        return sum(row.split()[1].endswith(f":{port}") and row.split()[3] == "0A" for row in rows)
 
     @property
     def workers(self) -> set[int]:
@@ -87,9 +98,11 @@ def test_a_worker_that_falls_is_started_again_and_the_others_answer_meanwhile(
 ) -> None:
     before = service.workers
     os.kill(min(before), signal.SIGKILL)
+    service.until(lambda: service.listening == WORKERS - 1)
     assert {post(service.url, parts_of()).status_code for _ in range(6)} == {200}
     service.until(lambda: len(service.workers) == WORKERS and service.workers != before)
-    service.until(lambda: service.metric("streetfix_capacity") == WORKERS * (1 + 64))
+    service.until(lambda: service.listening == WORKERS)
+    assert service.metric("streetfix_capacity") == WORKERS * (1 + 64)
     assert post(service.url, parts_of()).status_code == 200
     service.process.send_signal(signal.SIGTERM)
     _, told = service.process.communicate(timeout=60)
@@ -141,6 +154,146 @@ def test_a_version_that_an_operator_chooses_serves_in_every_worker(
     done = httpx.put(f"{service.url}/v1/maps/{old['name']}/serving", json={"version": old["version"]}, timeout=30)
     assert done.status_code == 200
     service.until(lambda: all(entry()["version"] == old["version"] for _ in range(12)))
+
+
+def test_all_answers_name_one_version_while_workers_are_killed_and_versions_come_are_chosen_and_go(
+    service: Service, folder: Path, content_of: Callable[..., BundleContent], parts_of: Parts
+) -> None:
+    """Both workers are asked all the time; the unit test of the serving table does the same a thousand times quicker."""
+    parts, stop, answers = parts_of(), threading.Event(), list[Named]()
+
+    def ask(client: httpx.Client) -> str:
+        return str(client.get("/v1/maps").raise_for_status().json()["maps"][0]["version"])
+
+    def localize(client: httpx.Client) -> str:
+        files = {name: (name, data) for name, data in parts.items()}
+        return str(client.post("/v1/localize", files=files).raise_for_status().json()["map"]["version"])
+
+    def keep_asking(what: Callable[[httpx.Client], str]) -> None:
+        while not stop.is_set():
+            asked = time.monotonic()
+            try:
+                with httpx.Client(
+                    base_url=service.url, timeout=30
+                ) as client:  # a new connection may come to either worker
+                    answers.append(Named(what(client), asked, time.monotonic()))
+            except httpx.TransportError:  # of a worker that was killed
+                continue
+
+    def serving() -> tuple[str, list[str]]:
+        (entry,) = httpx.get(f"{service.url}/v1/maps", timeout=30).json()["maps"]
+        return entry["version"], entry["versions"]
+
+    def switched(act: Callable[[], object], version: str | None = None) -> str:
+        """What serves after an act, and that it does."""
+        (before, _), begun = serving(), time.monotonic()
+        act()
+        service.until(lambda: serving()[0] == version if version else serving()[0] != before)
+        switches.append(Switch(serving()[0], begun, time.monotonic()))
+        return switches[-1].version
+
+    def choose(version: str) -> None:
+        switched(
+            lambda: httpx.put(
+                f"{service.url}/v1/maps/tiny/serving", json={"version": version}, timeout=30
+            ).raise_for_status(),
+            version,
+        )
+
+    def write(seed: int) -> str:
+        return switched(lambda: write_bundle(folder / f"v{seed}", content_of(seed=seed)))
+
+    def kill() -> None:
+        """One worker; the other one goes on."""
+        before = service.workers
+        os.kill(random.choice(sorted(before)), signal.SIGKILL)  # noqa: S311  # no secret
+        service.until(lambda: len(service.workers) == WORKERS and service.workers != before)
+
+    def all_answer() -> bool:
+        return service.listening == WORKERS
+
+    first, switches = serving()[0], list[Switch]()
+    with ThreadPoolExecutor(3) as pool:
+        asking = [pool.submit(keep_asking, each) for each in (ask, ask, localize)]
+        try:
+            second = write(1)
+            kill()
+            choose(first)  # while one worker starts
+            service.until(all_answer)
+            third = write(2)
+            kill()
+            service.until(all_answer)
+            assert serving() == (third, [third, second, first])
+            shutil.rmtree(folder / "v0")
+            choose(first)  # its folder is gone: it holds
+            time.sleep(0.5)  # several looks at the folders
+            assert serving()[0] == first
+            kill()  # what is started again cannot open it, and waits
+            assert serving()[0] == first
+            assert service.listening == 1
+            switched(lambda: service.process.send_signal(signal.SIGHUP), third)
+            service.until(all_answer)
+            write(3)
+        finally:
+            stop.set()
+            for each in asking:
+                each.result(60)
+    assert len(answers) > 50
+    assert disagreements(first, switches, answers) == []
+
+
+def test_sigterm_during_the_start_ends_all_processes(folder: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, str(folder), "--workers", "8", "--port", "0"], env={"PATH": ""}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    until = time.monotonic() + 60
+    while len(descendants(process.pid)) < 3:  # itself and two workers, while it forks the others
+        assert time.monotonic() < until
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=60)  # ends when nobody has the pipes open any more
+    assert process.returncode == 0
+
+
+def test_workers_of_an_empty_maps_folder_become_ready_when_a_bundle_comes(
+    tmp_path: Path, content_of: Callable[..., BundleContent], monkeypatch: pytest.MonkeyPatch, parts_of: Parts
+) -> None:
+    (tmp_path / "maps").mkdir()
+    service = Service(tmp_path / "maps")
+    try:
+        ready = httpx.get(f"{service.url}/readyz", timeout=30)
+        assert (ready.status_code, ready.json()["code"]) == (503, "not-ready")
+        assert post(service.url, parts_of()).json()["code"] == "not-ready"
+        write_bundle(tmp_path / "maps" / "v0", content_of(seed=0))
+        service.until(lambda: all(httpx.get(f"{service.url}/readyz", timeout=30).status_code == 200 for _ in range(8)))
+        assert {post(service.url, parts_of()).status_code for _ in range(6)} == {200}
+    finally:
+        service.process.send_signal(signal.SIGTERM)
+        service.process.communicate(timeout=60)
+
+
+def test_a_damaged_bundle_beside_a_good_one_is_reported_and_nobody_is_kept_from_an_answer(
+    folder: Path, content_of: Callable[..., BundleContent], parts_of: Parts
+) -> None:
+    write_bundle(folder / "bad", content_of(name="west"))
+    (folder / "bad" / "views.faiss").write_bytes(b"short")
+    service = Service(folder)
+    try:
+        (refused,) = httpx.get(f"{service.url}/readyz", timeout=30).json()["refused"]
+        assert refused["bundle"] == "bad"
+        assert refused["reason"].startswith("bad/views.faiss: it has 5 bytes")
+        assert service.metric("streetfix_bundle_refused", bundle="bad") == 1
+        assert post(service.url, parts_of()).status_code == 200
+    finally:
+        service.process.send_signal(signal.SIGTERM)
+        _, told = service.process.communicate(timeout=60)
+    assert "map_refused" in told
+    strict = subprocess.run(
+        [*COMMAND, str(folder), "--workers", "2", "--port", "0", "--strict"], env={"PATH": ""}, capture_output=True, text=True,
+        timeout=60, check=False,
+    )  # fmt: skip
+    assert strict.returncode == 1
+    assert "views.faiss" in strict.stderr
 
 
 def test_workers_leave_with_their_parent(service: Service) -> None:

@@ -83,6 +83,27 @@ def calibration_of() -> Callable[..., Calibration]:
     return lambda **changed: Calibration.model_validate(calibration_document(**changed))
 
 
+def refused_answer(answer: dict[str, Any], status: str = "AMBIGUOUS", **changed: Any) -> dict[str, Any]:
+    """A LOCALIZED answer of the contract as it would be if it were not: its pose is one of two hypotheses, 60 m apart."""
+    pose = answer["pose"]
+    elsewhere = pose | {"position": pose["position"] | {"y": pose["position"]["y"] + 60.0}}
+    hypotheses = [
+        {"confirmed": False, "pose": each, "share": 0.5, "inliers": 0.5, "similarity": 0.25}
+        for each in (pose, elsewhere)
+    ]
+    spread = {
+        "mean": pose["position"] | {"y": pose["position"]["y"] + 30.0}, "covariance": [1.0, 0, 0, 0, 900.0, 0, 0, 0, 1.0],
+        "heading_std_deg": 20.0, "hypotheses_weight": 0.75,
+    }  # fmt: skip
+    gone = {"pose": None, "vehicle_pose": None, "geopose": None, "street": None}
+    return answer | gone | {"status": status, "hypotheses": hypotheses, "spread": spread} | changed
+
+
+@pytest.fixture(scope="session")
+def refused_of() -> Callable[..., dict[str, Any]]:
+    return refused_answer
+
+
 @pytest.fixture(scope="session")
 def bundle_at(
     content_of: Callable[..., BundleContent], tmp_path_factory: pytest.TempPathFactory
@@ -174,7 +195,9 @@ def small_map(small_dataset: Any, encoder_file: Path, tmp_path_factory: pytest.T
     from model_training.mapping.build import BuildSettings, build_map
 
     out: Path = tmp_path_factory.mktemp("maps") / "small"
-    settings = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False)
+    settings = BuildSettings(
+        name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False, traffic_vote=False
+    )
     build_map(small_dataset, encoder_file, out, settings, threads=1)
     return out
 

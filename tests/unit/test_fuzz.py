@@ -9,7 +9,7 @@ from benchmarks.fuzz.targets import survives, targets
 
 INPUTS = 4000
 NAMES = (
-    "http", "multipart", "request_json", "sequence_json", "oscp_json", "grpc_request", "depth", "depth_png_rows", "colour", "bundle",
+    "http", "multipart", "request_json", "sequence_json", "oscp_json", "grpc", "depth", "depth_png_rows", "colour", "bundle",
     "pictures",
 )  # fmt: skip
 

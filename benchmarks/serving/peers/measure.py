@@ -141,7 +141,8 @@ def require_same(own: list[dict[str, Any]], told: list[dict[str, Any]]) -> None:
         for name in ("status", "street"):
             if (_without_vote(a[name]), name) != (_without_vote(b[name]), name):
                 raise PeerError(f"request {number}: it answers {name} {b[name]}, Streetfix {a[name]}")
-        apart_m = np.linalg.norm([a["pose"]["position"][axis] - b["pose"]["position"][axis] for axis in "xyz"])
+        at, other = (each["pose"]["position"] if each["pose"] else each["spread"]["mean"] for each in (a, b))
+        apart_m = np.linalg.norm([at[axis] - other[axis] for axis in "xyz"])
         if not apart_m <= SAME_M:
             raise PeerError(f"request {number}: its position is {apart_m:.3g} m from Streetfix's")
 

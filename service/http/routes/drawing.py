@@ -25,7 +25,7 @@ _PLACES: dict[int | str, dict[str, Any]] = {
         "heading (float32; metres, radians) and the number of its street (int32, -1 for none). Little-endian.",
         "content": _BINARY,
     },
-    **problems(404, 422),
+    **problems(404, 422, 503),
 }
 
 

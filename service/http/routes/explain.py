@@ -10,7 +10,7 @@ from service.contract import schema
 from service.contract.convert import parsed, query_from
 from service.http.asking import Asking
 from service.http.body import Body
-from service.http.parts import require_parts
+from service.http.parts import MOST_PARTS, require_parts
 from service.http.routes.localize import LOCALIZE_BODY, problems
 
 
@@ -34,7 +34,7 @@ def router_for(asking: Asking) -> APIRouter:
             content_type = request.headers.get("content-type", "")
 
             def work() -> bytes:
-                parts = body.split(content_type, max_parts=engine.settings.limits.max_parts)
+                parts = body.split(content_type, max_parts=MOST_PARTS)
                 require_parts(parts, ("rgb", "depth", "request"))
                 asked = parsed(parts["request"], schema.LocalizeRequest)
                 explanation = explain(engine, query_from(asked, rgb=parts["rgb"], depth=parts["depth"]))

@@ -7,6 +7,7 @@ from service.contract import schema
 from service.errors import NotReadyError
 from service.http.routes.localize import problems
 from service.runtime.engine import Engine
+from service.runtime.map_registry import MOST_REFUSED, NO_MAP
 from service.runtime.metrics import CONTENT_TYPE
 from service.runtime.threads import pools, usable_cores
 
@@ -22,11 +23,21 @@ def router_for(engine: Engine, version: str) -> APIRouter:
     @router.get(
         "/readyz", operation_id="getReadiness", summary="Whether a map is open to answer from", responses=problems(503)
     )
-    async def readyz() -> schema.Health:
+    async def readyz() -> schema.Readiness:
+        """200 as soon as one map is mounted.
+
+        Bundles that are damaged do not change that; they are in `refused`. 503 without a map, as with a maps folder that is still
+        empty, and while the service is leaving.
+        """
+        refused = engine.registry.refused[:MOST_REFUSED]
+        if engine.is_draining:
+            raise NotReadyError("the service is leaving; ask another one")
         if not engine.is_ready:
-            what = "the service is leaving" if engine.is_draining else "no map is mounted; mount a map bundle"
-            raise NotReadyError(what)
-        return schema.Health()
+            reasons = "".join(f"; {each.bundle} is not mounted: {each.reason}" for each in refused)
+            raise NotReadyError(f"{NO_MAP}{reasons}")
+        return schema.Readiness(
+            refused=[schema.RefusedBundle(bundle=each.bundle, reason=each.reason) for each in refused]
+        )
 
     @router.get(
         "/metrics",

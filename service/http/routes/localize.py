@@ -17,7 +17,7 @@ from service.http.asking import Asking
 from service.http.body import Body
 from service.http.geopose import GEOPOSE, sure_geopose, wants_geopose
 from service.http.outcome import BatchAnswer, Outcome
-from service.http.parts import document_of, numbered_pictures, require_parts
+from service.http.parts import MOST_PARTS, document_of, numbered_pictures, require_parts
 from service.http.problems import MEDIA_TYPE, problem_of
 from service.runtime.engine import Engine, Located
 from service.runtime.tracing import RequestSpan
@@ -147,9 +147,9 @@ class Given:
     span: RequestSpan
     geopose_alone: bool = False
 
-    def parts(self, most: int) -> dict[str, bytes]:
+    def parts(self) -> dict[str, bytes]:
         """Its parts."""
-        return self.body.split(self.content_type, max_parts=most)
+        return self.body.split(self.content_type, max_parts=MOST_PARTS)
 
 
 Work = Callable[[Engine, Given], Awaitable[bytes]]
@@ -157,7 +157,7 @@ Work = Callable[[Engine, Given], Awaitable[bytes]]
 
 async def _single(engine: Engine, given: Given) -> bytes:
     def work() -> bytes:
-        parts = given.parts(engine.settings.limits.max_parts)
+        parts = given.parts()
         require_parts(parts, ("rgb", "depth", "request"))
         request = parsed(parts["request"], schema.LocalizeRequest)
         return _written(engine.localize(query_from(request, rgb=parts["rgb"], depth=parts["depth"])), given)
@@ -167,7 +167,7 @@ async def _single(engine: Engine, given: Given) -> bytes:
 
 async def _sequence(engine: Engine, given: Given) -> bytes:
     def work() -> bytes:
-        parts = given.parts(2 * schema.MOST_FRAMES + 1)
+        parts = given.parts()
         request = parsed(document_of(parts), schema.SequenceRequest)
         queries, transforms = sequence_from(request, numbered_pictures(parts, len(request.frames)))
         return _written(engine.localize_sequence(queries, transforms), given)
@@ -179,7 +179,7 @@ async def _batch(engine: Engine, given: Given) -> bytes:
     """Requests of a batch take workers one by one, as if each had come alone; those beyond the queue get their own problem."""
 
     def split() -> list[tuple[schema.LocalizeRequest, bytes, bytes]]:
-        parts = given.parts(2 * schema.MOST_FRAMES + 1)
+        parts = given.parts()
         requests = parsed(document_of(parts), schema.BatchRequest).requests
         pictures = numbered_pictures(parts, len(requests))
         return [(request, *pair) for request, pair in zip(requests, pictures, strict=True)]

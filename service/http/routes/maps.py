@@ -21,7 +21,7 @@ _STREETS: dict[int | str, dict[str, Any]] = {
         "description": "A GeoJSON FeatureCollection of polygons; empty where the map has no streets.",
         "content": {GEOJSON: {"schema": {"type": "object"}}},
     },
-    **problems(404, 422),
+    **problems(404, 422, 503),
 }
 
 _MOST_BYTES = 4096
@@ -58,8 +58,10 @@ def router_for(engine: Engine) -> APIRouter:
     async def serve_version(map: str, request: Request) -> schema.MapEntry:  # noqa: A002
         """Roll back, or forward again, at once and whole; requests that run end on the version they began with.
 
-        It needs an operator's key (`streetfix keys --operator`), or a service on loopback without keys. A new bundle in the maps folder
-        takes over again, and a restart serves the newest: to keep an old version, take the new one out of the folder.
+        With several workers all change at once: as soon as any of them has answered from the chosen version, none answers from the
+        one before. The choice holds, also if a worker is started again, until a version that is newer than all open ones is mounted
+        or the chosen one is taken out. A restart of the service serves the newest: to keep an old version for good, take the new
+        one out of the folder. It needs an operator's key (`streetfix keys --operator`), or a service on loopback without keys.
         """
         require_operator(request, engine.settings)
         with engine.memory.hold() as hold:

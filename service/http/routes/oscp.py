@@ -57,9 +57,10 @@ def router_for(asking: Asking) -> APIRouter:
             def work() -> bytes:
                 asked = parsed(body.whole(copies=_COPIES), GeoPoseRequest)
                 located = answer_from(engine.localize(query_of(asked, map)))
+                geopose = sure_geopose(located)  # refuses an answer that is not LOCALIZED
                 told = GeoPoseAnswer(
                     id=asked.id or uuid.uuid4().hex, timestamp=time.time_ns() // 1_000_000,
-                    accuracy=accuracy_of(located.pose.covariance), geopose=sure_geopose(located),
+                    accuracy=accuracy_of(located.require_pose().covariance), geopose=geopose,
                 )  # fmt: skip
                 return told.model_dump_json().encode()
 

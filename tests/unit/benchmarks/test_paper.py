@@ -15,6 +15,7 @@ from benchmarks.paper.ours import config_as_paper, config_within
 from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import METHODS, PAPER_IMAGES, all_rows, errors_of, figures_of, minutes_for_paper_images
 from benchmarks.paper.tables import PAPER_MED_M, PAPER_MEDIAN, PAPER_MSE, TABLE_II
+from benchmarks.provenance import Run
 from benchmarks.report import Report
 from model_training.baselines.answers import PlaceAnswers
 from model_training.baselines.learning import CurvePoint
@@ -36,6 +37,7 @@ def pairs_at(xy: list[list[float]], street: list[int]) -> Pairs:
     )  # fmt: skip
 
 
+RUN = Run(commit="abc", dirty=False, date="2026-01-02T03:04:05+00:00", machine="a machine", command="make paper")
 TESTS = {split: pairs_at([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]], [0, 1, 2]) for split in ("same_drive", "other_drive")}
 
 
@@ -46,7 +48,15 @@ def answers(dx: float, street: list[int]) -> PlaceAnswers:
 def result(method: str, dx: float, street: list[int], *, training_s: float = 0.0, images: int = 0) -> MethodResult:
     each = {split: answers(dx, street) for split in TESTS}
     return MethodResult(
-        method, each, training_s, images, 54_341, "budget", [CurvePoint(10, 1.0, 0.5, 0.2)], {"k": 5}, "abc"
+        method,
+        each,
+        training_s,
+        images,
+        54_341,
+        "budget",
+        [CurvePoint(10, 1.0, 0.5, 0.2)],
+        {"k": 5},
+        RUN,
     )
 
 
@@ -79,9 +89,7 @@ def test_training_is_compared_at_the_same_number_of_images() -> None:
 
 
 def test_training_times_are_those_of_one_run_in_turn_where_there_was_one(tmp_path: Path) -> None:
-    pace = Pace(
-        {"cnn_one_space": [1.0, 9.0, 2.0], "googlenet": [4.0], "streetfix": [0.5]}, (1.0, 1.1), "a machine", "abc"
-    )
+    pace = Pace({"cnn_one_space": [1.0, 9.0, 2.0], "googlenet": [4.0], "streetfix": [0.5]}, (1.0, 1.1), RUN)
     pace.save(tmp_path / "pace.json")
     assert Pace.read(tmp_path / "pace.json") == pace
     assert Pace.read(tmp_path / "none.json") is None
@@ -140,7 +148,7 @@ def test_what_a_method_answered_is_kept_whole(tmp_path: Path) -> None:
     assert np.allclose(again.answers["other_drive"].xy, [[1.235, 2.0], [np.nan, np.nan], [0.0, 0.0]], equal_nan=True)
     assert again.answers["other_drive"].street.tolist() == [0, -1, 2]
     assert again.curve == first.curve
-    assert again.commit == "abc"
+    assert again.run == first.run
     assert "NaN" not in (tmp_path / "raw_range.json").read_text()
     json.loads((tmp_path / "raw_range.json").read_text(), parse_constant=pytest.fail)
     assert MethodResult.load(tmp_path, "nothing") is None

@@ -4,6 +4,15 @@ pytest.importorskip("matplotlib")
 
 from benchmarks import render
 
+RUN = {
+    "commit": "c" * 40,
+    "dirty": False,
+    "date": "2026-01-01T00:00:00+00:00",
+    "machine": "one core",
+    "command": "make it",
+    "minutes": 2.5,
+}
+
 
 def test_conditions_stand_beside_the_clear_day_with_the_stage_that_loses_most():
     head = "full.condition."
@@ -29,3 +38,47 @@ def test_a_curve_of_each_kind_of_stranger_is_drawn(tmp_path, monkeypatch):
     picture = render._accepts("any", {"sky.precise": points, "sky.stereo": points, "noise.stereo": points})
     assert picture == tmp_path / "any_accepts.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def section(*rows, runs=None):
+    told = {
+        "stale_as_of": "f" * 40,
+        "runs": runs or {"r": RUN},
+        "rows": [{"run": "r", "unit": "m", "value": 1.0} | row for row in rows],
+    }
+    return render._section("mine", told)
+
+
+def test_every_run_is_listed_with_its_machine_and_its_rows_and_every_row_names_its_run():
+    kept = RUN | {
+        "commit": "d" * 40,
+        "date": None,
+        "before": "2025-12-31T00:00:00+00:00",
+        "machine": None,
+        "dirty": True,
+        "minutes": None,
+    }
+    lines = section({"id": "a.x"}, {"id": "a.y"}, {"id": "b.x", "run": "s"}, runs={"r": RUN, "s": kept})
+    assert "| 1 | a 2 | `make it` | 2026-01-01 | `cccccccccc` | one core | 2.5 |" in lines
+    assert (
+        "| 2 | b 1 | `make it` | before 2025-12-31 | `dddddddddd`, with changes that were not committed | not kept |  |"
+        in lines
+    )
+    assert [line.split("|")[-3].strip() for line in lines if line.startswith(("| `a", "| `b"))] == ["1", "1", "2"]
+
+
+def test_stale_rows_are_marked_and_counted():
+    lines = section({"id": "a", "stale": True}, {"id": "b", "stale": "unknown"}, {"id": "c"})
+    marks = {line.split("|")[1].strip(): line.split("|")[-2].strip() for line in lines if line.startswith("| `")}
+    assert marks == {"`a`": "**stale**", "`b`": "age unknown", "`c`": ""}
+    assert "Of 3 rows 1 are stale and 1 of unknown age, as of commit `ffffffffff`." in lines
+
+
+def test_a_reason_for_another_value_is_not_shown():
+    missed = {"bar": 2.0, "better": "higher", "holds": False}
+    lines = section(
+        {"id": "a", **missed, "why": "of 3 minutes", "reason": {"explains": 1.0, "text": "a wall"}},
+        {"id": "b", **missed, "reason": {"explains": 1.5, "outdated": True}},
+    )
+    assert "- `a`: of 3 minutes; a wall" in lines
+    assert "- `b`: reason outdated, value changed (it explained 1.5)" in lines

@@ -5,7 +5,9 @@ import pytest
 
 from benchmarks import render
 from benchmarks import report as module
+from benchmarks.provenance import Run
 from benchmarks.report import Report
+from benchmarks.why_missed import WHY_MISSED, Reason
 
 
 @pytest.fixture
@@ -63,9 +65,9 @@ def test_a_bar_of_two_numbers_is_a_range_with_its_ends(report, value, holds, cap
 def test_a_range_is_rendered_as_one(report):
     report.row("a", 0.95, "share", bar=(0.9, 0.98))
     report.row("b", 0.97, "share", bar=0.98, better="lower")
-    lines = [render._line(row) for row in report.rows]
-    assert lines[0].endswith("| 0.9 to 0.98 | holds |")
-    assert lines[1].endswith("| at most 0.98 | holds |")
+    lines = [render._line(row, 3) for row in report.rows]
+    assert lines[0].endswith("| 0.9 to 0.98 | holds | 3 |  |")
+    assert lines[1].endswith("| at most 0.98 | holds | 3 |  |")
 
 
 def test_a_row_of_the_same_name_replaces_the_last(report):
@@ -79,28 +81,82 @@ def written(name="mine"):
     return json.loads((module.REPORTS / f"{name}.json").read_text())
 
 
-def test_the_rows_of_the_last_run_are_kept_with_the_commit_that_they_were_measured_at(report, monkeypatch):
-    report._commit = "first"
+def made(row_id, name="mine"):
+    """The run that measured a row, as the file has it."""
+    told = written(name)
+    return told["runs"][next(row["run"] for row in told["rows"] if row["id"] == row_id)]
+
+
+def on(monkeypatch, machine):
+    monkeypatch.setattr(module, "machine", lambda: machine)
+
+
+def test_the_rows_of_the_last_run_are_kept_with_all_that_is_known_of_that_run(report, monkeypatch):
+    """Machine, date and command of the last run once stood for rows that it had only kept."""
+    on(monkeypatch, "slow")
+    report._commit, report._dirty, report._date = "first", True, "2026-01-01T00:00:00+00:00"
     report.row("old", 1.0, "m")
     report.row("both", 1.0, "m")
     report.notes["run"] = "slow machine"
     report.write()
-    later = Report("mine", "make mine", _commit="second")
+    before = made("old")
+    on(monkeypatch, "fast")
+    later = Report("mine", "make mine ARGS=--only", _commit="second", _dirty=False, _date="2026-01-02T00:00:00+00:00")
     later.keep_others()
     later.row("both", 2.0, "m")
     later.row("new", 3.0, "m")
     later.write()
-    rows = {row["id"]: (row.get("commit"), row["value"]) for row in written()["rows"]}
-    assert rows == {"old": ("first", 1.0), "both": (None, 2.0), "new": (None, 3.0)}
-    assert (written()["made"]["commit"], written()["notes"]) == ("second", {"run": "slow machine"})
-    third = Report("mine", "make mine", _commit="third")
-    third.keep_others()
-    third.write()
-    assert {row["id"]: row["commit"] for row in written()["rows"]} == {
-        "old": "first",
-        "both": "second",
-        "new": "second",
-    }
+    assert {row["id"]: row["value"] for row in written()["rows"]} == {"old": 1.0, "both": 2.0, "new": 3.0}
+    assert made("old") == before
+    assert {name: before[name] for name in ("commit", "dirty", "date", "machine", "command")} == {
+        "commit": "first", "dirty": True, "date": "2026-01-01T00:00:00+00:00", "machine": "slow", "command": "make mine",
+    }  # fmt: skip
+    for row_id in ("both", "new"):
+        assert (made(row_id)["commit"], made(row_id)["dirty"], made(row_id)["machine"]) == ("second", False, "fast")
+        assert made(row_id)["command"] == "make mine ARGS=--only"
+    assert written()["notes"] == {"run": "slow machine"}
+
+
+def test_a_run_that_writes_after_every_part_is_one_run(report):
+    report.keep_others()
+    for row_id in ("a", "b"):
+        report.row(row_id, 1.0, "m")
+        report.write()
+    assert len(written()["runs"]) == 1
+
+
+def test_a_run_of_which_no_row_is_left_is_dropped(report):
+    report._date = "2026-01-01T00:00:00+00:00"
+    report.row("a", 1.0, "m")
+    report.write()
+    later = Report("mine", "make mine", _date="2026-01-02T00:00:00+00:00")
+    later.keep_others()
+    later.row("a", 2.0, "m")
+    later.write()
+    assert [run["date"] for run in written()["runs"].values()] == ["2026-01-02T00:00:00+00:00"]
+
+
+def test_two_runs_of_one_second_and_commit_stay_apart(report):
+    parts = [
+        Report("mine", f"make mine --only {part}", _commit="c", _date="2026-01-01T00:00:00+00:00") for part in "ab"
+    ]
+    for part, row_id in zip(parts, "ab", strict=True):
+        part.keep_others()
+        part.row(row_id, 1.0, "m")
+        part.write()
+    assert (made("a")["command"], made("b")["command"]) == ("make mine --only a", "make mine --only b")
+
+
+def test_rows_of_kept_results_name_the_run_that_gave_them(report, monkeypatch):
+    on(monkeypatch, "here")
+    there = Run(commit="theirs", before="2026-01-01T00:00:00+00:00", machine="there")
+    with report.made_by(there):
+        report.row("kept", 1.0, "m")
+    report.row("own", 1.0, "m")
+    report.write()
+    assert (made("kept")["commit"], made("kept")["machine"], made("kept")["date"]) == ("theirs", "there", None)
+    assert made("kept")["before"] == "2026-01-01T00:00:00+00:00"
+    assert made("own")["machine"] == "here"
 
 
 def test_without_a_last_run_there_is_nothing_to_keep(report):
@@ -128,8 +184,7 @@ def test_parts_that_are_measured_at_once_keep_each_others_rows(report):
     path = second.write()
     rows = {row["id"]: row for row in json.loads(path.read_text())["rows"]}
     assert {row_id: row["value"] for row_id, row in rows.items()} == {"old": 3.0, "a": 2.0, "b": 2.0}
-    assert "commit" in rows["a"]
-    assert "commit" not in rows["b"]
+    assert (made("a")["command"], made("b")["command"]) == ("make mine --only a", "make mine --only b")
 
 
 def test_a_note_that_no_longer_speaks_of_the_rows_is_dropped(report):
@@ -140,3 +195,42 @@ def test_a_note_that_no_longer_speaks_of_the_rows_is_dropped(report):
     again.keep_others()
     again.notes["run"] = None
     assert json.loads(again.write().read_text())["notes"] == {"map": "a city"}
+
+
+def test_a_reason_stands_by_the_value_that_it_explains_and_by_no_other(report, monkeypatch):
+    monkeypatch.setitem(WHY_MISSED, "a", Reason(0.94026, "look-alike streets"))
+    report.row("a", 0.9402555910543131, "share", bar=0.99)
+    report.write()
+    assert written()["rows"][0]["reason"] == {"explains": 0.94026, "text": "look-alike streets"}
+    report.row("a", 0.94185, "share", bar=0.99)
+    report.write()
+    assert written()["rows"][0]["reason"] == {"explains": 0.94026, "outdated": True}
+    report.row("a", 0.995, "share", bar=0.99)
+    report.write()
+    assert "reason" not in written()["rows"][0]
+
+
+def test_a_kept_rows_reason_is_looked_up_anew_at_every_writing(report, monkeypatch):
+    report.row("a", 0.5, "share", bar=0.99, why="of 3 minutes only")
+    report.write()
+    monkeypatch.setitem(WHY_MISSED, "a", Reason(0.5, "found out later"))
+    later = Report("mine", "make mine")
+    later.keep_others()
+    later.write()
+    row = written()["rows"][0]
+    assert (row["reason"]["text"], row["why"]) == ("found out later", "of 3 minutes only")
+
+
+def test_one_query_of_three_thousand_makes_another_value():
+    reason = Reason(round(2950 / 3130, 6), "")
+    assert reason.fits(2950 / 3130)
+    assert not reason.fits(2951 / 3130)
+    assert Reason(None, "").fits(None)
+    assert not Reason(None, "").fits(0.5)
+    assert not Reason(0.5, "").fits(None)
+
+
+def test_every_typed_reason_names_the_value_that_it_explains():
+    for row_id, reason in WHY_MISSED.items():
+        assert isinstance(reason, Reason), row_id
+        assert reason.text, row_id

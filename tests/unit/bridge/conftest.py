@@ -45,8 +45,8 @@ def info_of() -> Callable[..., Any]:
 
 
 @pytest.fixture(scope="session")
-def answer_of() -> Callable[..., LocalizeAnswer]:
-    """A sure answer: a camera at (10, 20, 1.5) that looks along map x."""
+def answer_of(refused_of: Callable[..., dict[str, Any]]) -> Callable[..., LocalizeAnswer]:
+    """A sure answer: a camera at (10, 20, 1.5) that looks along map x; without its pose where another status is given."""
 
     def made(**changed: Any) -> LocalizeAnswer:
         position = {"x": 10.0, "y": 20.0, "z": 1.5}
@@ -57,10 +57,12 @@ def answer_of() -> Callable[..., LocalizeAnswer]:
         content = {
             "status": "LOCALIZED", "confidence": 0.95,
             "street": {"id": "s2", "name": "End", "street": "4", "section": "end", "class_index": 6, "vote": 0.5},
-            "pose": pose, "vehicle_pose": None, "geopose": None, "hypotheses": [], "neighbours": [],
+            "pose": pose, "vehicle_pose": None, "geopose": None, "hypotheses": [], "spread": None, "neighbours": [],
             "map": {"name": "tiny", "version": "abc"},
             "timings_ms": {"decode": 1, "fuse": 1, "encode": 1, "search": 1, "register": 1, "total": 5},
         }  # fmt: skip
+        if changed.get("status", "LOCALIZED") != "LOCALIZED":
+            return LocalizeAnswer.model_validate(refused_of(content, **changed))
         return LocalizeAnswer.model_validate(content | changed)
 
     return made

@@ -112,12 +112,6 @@ def test_without_a_limit_every_pair_has_its_turn(robot: Robot) -> None:
         ({"status": "OUT_OF_MAP"}, Gate(min_confidence=0.0), "OUT_OF_MAP"),
         ({"confidence": None}, Gate(min_confidence=0.1), "no confidence: the map is not calibrated"),
         ({"confidence": None}, Gate(min_confidence=0.0), ""),
-        ({"status": "AMBIGUOUS"}, Gate(min_confidence=0.9, publish_doubtful=True), ""),
-        (
-            {"status": "AMBIGUOUS", "confidence": 0.1},
-            Gate(min_confidence=0.9, publish_doubtful=True),
-            "confidence 0.100",
-        ),
     ],
 )
 def test_only_what_passes_the_gate_goes_out_and_the_rest_is_told(
@@ -173,7 +167,7 @@ def test_lines_for_people(robot: Robot, answer_of: Answer) -> None:
     lines = []
     for answer in (
         answer_of(),
-        answer_of(status="AMBIGUOUS", street=None, confidence=None),
+        answer_of(status="AMBIGUOUS"),
         UnreachableError("nobody"),
     ):
         robot.answer = answer
@@ -183,7 +177,7 @@ def test_lines_for_people(robot: Robot, answer_of: Answer) -> None:
         lines.append(line_of(published))
     assert lines == [
         "1.000 LOCALIZED 0.950  x 10.00  y 20.00  heading 0.0  End",
-        "2.000 AMBIGUOUS  x 10.00  y 20.00  heading 0.0  (not published: AMBIGUOUS)",
+        "2.000 AMBIGUOUS 0.950  (not published: AMBIGUOUS)",
         "3.000 failed: nobody",
     ]
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+pytest.importorskip("cyclonedds", reason="it has no wheel for this Python or processor")
+
 from service.bridge import messages
 from service.bridge.diagnostics import Diagnosis, Level
 from service.bridge.pose import StampedPose

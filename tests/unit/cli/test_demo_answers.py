@@ -25,6 +25,7 @@ def answer_of(*, street: str | None = "s4", place: int = 2) -> dict[str, Any]:
         "street": None if street is None else {"id": street, "name": f"Street {street[1:]}"},
         "pose": {"position": {"x": 13.0, "y": 24.0, "z": 9.0}, "heading_deg": -175.0},
         "neighbours": [{"place": place, "similarity": 0.9}],
+        "hypotheses": [],
     }
 
 
@@ -74,13 +75,39 @@ def test_a_refused_question_is_wrong_and_its_problem_is_shown(monkeypatch: pytes
     ("status", "confidence", "wanted"),
     [
         ("LOCALIZED", 0.9871, "LOCALIZED 0.987"),
-        ("AMBIGUOUS", 0.0, "AMBIGUOUS 0.000"),
         ("LOCALIZED", None, "LOCALIZED  "),
     ],
 )
 def test_an_answers_status_and_confidence_are_shown(status: str, confidence: float | None, wanted: str) -> None:
     answer = answer_of() | {"status": status, "confidence": confidence}
     assert wanted in printed([Outcome(IN_STREET, answer, "", 0.05)])
+
+
+def test_an_answer_without_a_pose_is_neither_right_nor_wrong_and_its_guess_is_called_forced() -> None:
+    guess = {"pose": {"position": {"x": 10.0, "y": 22.0, "z": 9.0}, "heading_deg": -175.0}}
+    doubted = answer_of() | {
+        "status": "OUT_OF_MAP",
+        "confidence": 0.2,
+        "pose": None,
+        "street": None,
+        "hypotheses": [guess],
+    }
+    refused = Outcome(IN_STREET, doubted, "", 0.05)
+    assert (refused.right, refused.error_m, refused.heading_error_deg) == (None, None, None)
+    assert refused.forced_error_m == pytest.approx(2.0)
+    text = printed([outcome_of(), refused])
+    assert "no pose" in text
+    assert "(forced 2.00 m)" in text
+    assert "1 of 1 streets right\n1 of 2 answers accepted (LOCALIZED), the others have no pose" in text
+    assert "accepted answers: position off by 5.00 m (median), 5.00 m (largest); 1 of 1 over 1 m" in text
+    assert "forced, whatever the status: position off by 3.50 m (median), 5.00 m (largest); 2 of 2 over 1 m" in text
+
+
+def test_single_places_have_status_and_confidence_beside_their_error() -> None:
+    answer = answer_of() | {"confidence": 0.31, "status": "AMBIGUOUS", "pose": None}
+    text = printed([Outcome(OF_PLACE, answer, "", 0.05)], places=("a", "b", "c"))
+    assert "AMBIGUOUS 0.310" in text
+    assert "0 of 1 answers accepted" in text
 
 
 def test_the_next_command_is_one_line_with_a_pair_that_was_right() -> None:

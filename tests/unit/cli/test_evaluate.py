@@ -72,3 +72,20 @@ def test_a_report_folder_holds_page_answers_and_settings(
         "index.html", "run.json", "figures.json", "answers/drive1_precise.npz",
     }  # fmt: skip
     assert f"report: {tmp_path}/runs/one/index.html" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_forced_figures_stand_beside_accepted_ones_and_every_error_has_its_status(
+    small_dataset: Dataset, small_map: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    assert run("evaluate", small_map, small_dataset.folder, "--list", "2") == 0
+    told = capsys.readouterr().out
+    for label in (
+        "accepted, within 1 m",
+        "forced, within 1 m",
+        "accepted, over 1 m off",
+        "drive1_precise: the 2 worst of 5 queries",
+    ):
+        assert label in told
+    listed = told.split("the 2 worst of 5 queries")[1].splitlines()
+    assert sum("LOCALIZED" in line and line.rstrip().endswith("°") for line in listed) == 2

@@ -23,17 +23,31 @@ ANSWER: dict[str, Any] = {
     "vehicle_pose": None,
     "geopose": None,
     "hypotheses": [
-        {"pose": {"position": {"x": 1.234, "y": 5, "z": 1.5}, "orientation": {}, "heading_deg": 90.4, "covariance": None},
+        {"confirmed": True,
+         "pose": {"position": {"x": 1.234, "y": 5, "z": 1.5}, "orientation": {}, "heading_deg": 90.4, "covariance": None},
          "share": 0.625, "inliers": 0.5, "similarity": 0.9},
-        {"pose": {"position": {"x": 77, "y": -88, "z": 1.5}, "orientation": {}, "heading_deg": -89.6, "covariance": None},
+        {"confirmed": False,
+         "pose": {"position": {"x": 77, "y": -88, "z": 1.5}, "orientation": {}, "heading_deg": -89.6, "covariance": None},
          "share": 0.375, "inliers": 0.25, "similarity": 0.875},
     ],
+    "spread": None,
     "neighbours": [
         {"place": 8, "distance": 0.1, "similarity": 0.995, "street": None, "position": {"x": 1, "y": 2, "z": 3},
          "heading_deg": 90.0},
     ],
     "map": {"name": "tiny", "version": "0123456789abcdef"},
     "timings_ms": {"decode": 1.0, "total": 2.0},
+}  # fmt: skip
+
+
+#: What a refused answer has in their place.
+REFUSED: dict[str, Any] = {
+    "status": "AMBIGUOUS", "confidence": 0.3, "pose": None, "street": None,
+    "hypotheses": [each | {"confirmed": False} for each in ANSWER["hypotheses"]],
+    "spread": {
+        "mean": {"x": 35, "y": -40, "z": 1.5}, "covariance": [9.0, 0, 0, 0, 2025.0, 0, 0, 0, 1.0], "heading_std_deg": 70.0,
+        "hypotheses_weight": 0.6,
+    },
 }  # fmt: skip
 
 
@@ -184,14 +198,18 @@ def text_of(**changed: Any) -> str:
 
 
 def test_people_read_how_sure_an_answer_is() -> None:
-    assert "AMBIGUOUS (confidence 0.317)" in text_of(status="AMBIGUOUS", confidence=0.3171)
+    assert "AMBIGUOUS (confidence 0.317)" in text_of(**REFUSED | {"confidence": 0.3171})
     assert "confidence" not in text_of()
 
 
 @pytest.mark.parametrize("status", ["AMBIGUOUS", "OUT_OF_MAP"])
 def test_people_read_where_else_it_may_be_when_it_is_not_sure(status: str) -> None:
-    lines = text_of(status=status, confidence=0.3).splitlines()
-    start = next(k for k, line in enumerate(lines) if "where it may be" in line)
+    lines = text_of(**REFUSED | {"status": status}).splitlines()
+    assert lines[0].split() == ["status", status, "(confidence", "0.300)"]
+    assert lines[1].split() == ["pose", "none:", "the", "answer", "is", "not", "LOCALIZED"]
+    assert "+- 45.0 m (one sigma)" in lines[2]
+    start = next(k for k, line in enumerate(lines) if "where it may be (not confirmed)" in line)
+    assert not any(line.startswith(("position", "heading", "street", "vehicle")) for line in lines)
     for wanted in (
         ("0.62", "0.50", "0.900", "x 1.23  y 5.00", "90"),
         ("0.38", "0.25", "0.875", "x 77.00  y -88.00", "-90"),
@@ -201,7 +219,36 @@ def test_people_read_where_else_it_may_be_when_it_is_not_sure(status: str) -> No
 
 def test_people_are_not_told_of_other_places_when_it_is_sure_or_when_there_are_none() -> None:
     assert "where it may be" not in text_of(confidence=0.999)
-    assert "where it may be" not in text_of(status="AMBIGUOUS", confidence=0.0, hypotheses=[])
+    assert "where it may be" not in text_of(**REFUSED | {"hypotheses": []})
+
+
+@pytest.mark.parametrize("flags", [[], ["--json"]])
+@pytest.mark.parametrize(
+    ("changed", "code"),
+    [({}, 0), (REFUSED, 3), (REFUSED | {"status": "OUT_OF_MAP", "hypotheses": []}, 3)],
+)
+def test_the_exit_code_says_whether_there_is_a_pose(
+    files: dict[str, Path], answering: Callable[..., Any], capsys: pytest.CaptureFixture[str], changed: dict[str, Any],
+    code: int, flags: list[str],
+) -> None:  # fmt: skip
+    answering(httpx.Response(200, json=ANSWER | changed))
+    given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
+    with pytest.raises(SystemExit) as end:
+        main(["localize", *given, *flags])
+    assert (end.value.code or 0) == code
+    told = capsys.readouterr().out
+    if flags:
+        assert json.loads(told) == ANSWER | changed
+    else:
+        assert told.split()[:2] == ["status", (ANSWER | changed)["status"]]
+
+
+def test_an_answer_of_an_older_service_that_has_a_pose_in_doubt_is_refused(
+    files: dict[str, Path], answering: Callable[..., Any]
+) -> None:
+    answering(httpx.Response(200, json=ANSWER | {"status": "OUT_OF_MAP"}))
+    with pytest.raises(UnreachableError, match="of another contract"):
+        localize("http://x", **files)
 
 
 def test_people_read_one_standard_deviation_of_position_and_heading() -> None:

@@ -1,6 +1,9 @@
+import re
 import sys
+import tomllib
 import types
 from collections.abc import Callable
+from importlib.machinery import ModuleSpec
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +28,7 @@ def mount(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     def put(**functions: Callable[..., None] | None) -> None:
         module = types.ModuleType("fake_commands")
+        module.__spec__ = ModuleSpec("fake_commands", None)
         for name, function in functions.items():
             if function is not None:
                 setattr(module, name, function)
@@ -147,10 +151,10 @@ def test_a_missing_package_names_the_extra(
 def test_a_package_missing_at_import_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    points = [EntryPoint("train", "a_package_that_is_not_there:command", "streetfix.commands")]
+    points = [EntryPoint("train", "service.a_module_that_is_not_there:command", "streetfix.commands")]
     monkeypatch.setattr(command_line, "entry_points", lambda **_: points)
     assert run("train", "anything", "--at", "all") == 1
-    assert "'a_package_that_is_not_there'" in capsys.readouterr().err
+    assert "a_module_that_is_not_there" in capsys.readouterr().err
 
 
 def test_an_error_of_ours_is_a_message_without_a_traceback(
@@ -162,3 +166,77 @@ def test_an_error_of_ours_is_a_message_without_a_traceback(
     mount(evaluate=evaluate)
     assert run("evaluate") == 1
     assert capsys.readouterr().err == "streetfix: queries/a: poses.txt is missing; give a set with truth\n"
+
+
+@pytest.mark.parametrize(
+    "error", [FileNotFoundError(2, "No such file", "scans/7.bin"), OSError(28, "No space left on device")]
+)
+def test_what_the_system_refuses_is_a_line_and_no_traceback(
+    error: OSError, mount: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def evaluate() -> None:
+        raise error
+
+    mount(evaluate=evaluate)
+    assert run("evaluate") == 1
+    told = capsys.readouterr().err
+    assert (
+        told
+        == f"streetfix: {error.filename or 'a file'}: {error.strerror}; check the file, its folder and the disk, and start again\n"
+    )
+
+
+def test_an_error_of_a_package_that_calls_itself_an_os_error_is_seen_whole(mount: Callable[..., None]) -> None:
+    def evaluate() -> None:
+        raise OSError("a defect")
+
+    mount(evaluate=evaluate)
+    with pytest.raises(OSError, match="a defect"):
+        run("evaluate")
+
+
+@pytest.fixture
+def service_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installation without the package that builds maps, as in the container image."""
+    monkeypatch.setattr(command_line, "find_spec", lambda name: None if name == "model_training" else object())
+
+
+@pytest.mark.parametrize(("command", "extra"), [("simulate", "mapping"), ("train", "training"), ("map", "mapping")])
+def test_a_command_beside_the_service_says_where_it_is_to_be_had(
+    service_alone: None, capsys: pytest.CaptureFixture[str], command: str, extra: str
+) -> None:
+    assert run(command, "--help") == 1
+    told = capsys.readouterr().err
+    assert f"the command '{command}' is not part of this installation, which is the service alone" in told
+    assert f'pip install "streetfix[{extra}]"' in told
+
+
+def test_the_service_alone_lists_what_it_has(service_alone: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    out = capsys.readouterr().out
+    assert all(f"\n  {name} " in out for name in ("serve", "localize", "keys", "health", "bridge"))
+    assert not any(f"\n  {name} " in out for name in ("simulate", "train", "map", "demo", "evaluate"))
+
+
+@pytest.mark.parametrize("package", sorted(command_line._NOT_EVERYWHERE))
+def test_a_package_that_is_not_to_be_had_everywhere_is_said_to_be_so(
+    mount: Callable[..., None], capsys: pytest.CaptureFixture[str], package: str
+) -> None:
+    def simulate() -> None:
+        raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+
+    mount(simulate=simulate)
+    assert run("simulate") == 1
+    told = capsys.readouterr().err
+    assert f"needs the package {package!r}: it is to be had for" in told
+    assert "pip install" in told
+
+
+def test_what_is_not_to_be_had_everywhere_is_what_has_a_marker() -> None:
+    extras = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    marked = {
+        re.split(r"[><=;]", each)[0].replace("-", "_") for extra in extras.values() for each in extra if ";" in each
+    }
+    assert marked == set(command_line._NOT_EVERYWHERE)

@@ -1,11 +1,15 @@
 import gc
+import signal
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from service.cli.serve import serve
+from service.cli.serve import check_only, serve
 from service.errors import AddressError, BundleError
+from service.maps.content import BundleContent
+from service.maps.writer import write_bundle
 from service.runtime.settings import Settings
 
 
@@ -48,3 +52,51 @@ def test_garbage_collection_passes_over_what_was_imported_but_not_over_maps(
         serve(Settings(maps=(bundle_path,), port=0))
     assert frozen[0] > 50_000
     assert gc.get_freeze_count() in (0, before)
+
+
+def test_check_names_every_bundle_that_cannot_be_mounted(
+    bundle_copy: Path, content_of: Callable[..., BundleContent], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (bundle_copy / "views.faiss").write_bytes(b"short")
+    write_bundle(tmp_path / "good", content_of(name="good"))
+    with pytest.raises(BundleError, match=r"1 cannot be mounted: own/views\.faiss: it has 5 bytes"):
+        check_only(Settings(maps=(tmp_path,)))
+    assert "map good" in capsys.readouterr().out
+
+
+def test_check_refuses_a_rate_of_false_accepts_that_a_map_cannot_promise(
+    content_of: Callable[..., BundleContent], calibration_json: Callable[..., object], tmp_path: Path
+) -> None:
+    write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
+    check_only(Settings(maps=(tmp_path / "m",), false_accept_rate=0.001))
+    for act in (check_only, serve):
+        with pytest.raises(BundleError, match=r"false_accept_rate is 1e-05, less than the 0\.001"):
+            act(Settings(maps=(tmp_path / "m",), port=0, false_accept_rate=1e-5))
+
+
+def test_check_of_an_empty_maps_folder_says_that_the_service_would_wait(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check_only(Settings(maps=(tmp_path,)))
+    assert (
+        f"no map yet: not ready (/readyz answers 503) until a map bundle lies in {tmp_path}" in capsys.readouterr().out
+    )
+    with pytest.raises(BundleError, match="there is no map bundle in"):
+        check_only(Settings(maps=(tmp_path,), strict=True))
+
+
+def test_a_hangup_during_the_start_waits_until_there_is_somebody_to_handle_it(
+    bundle_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By default it would end the process."""
+    blocked: list[bool] = []
+
+    def opening(*_: object, **__: object) -> None:
+        blocked.append(signal.SIGHUP in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+        raise RuntimeError("no further")
+
+    monkeypatch.setattr("service.runtime.engine.Engine.open", opening)
+    with pytest.raises(RuntimeError, match="no further"):
+        serve(Settings(maps=(bundle_path,), port=0))
+    assert blocked == [True]
+    assert signal.SIGHUP not in signal.pthread_sigmask(signal.SIG_BLOCK, ())

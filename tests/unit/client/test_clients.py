@@ -14,9 +14,11 @@ import pytest
 
 from service.client import AsyncClient, Client, Frame, Options, PinholeCamera, Prior, PriorPosition, PriorWgs84, rest
 from service.client.retry import RetryPolicy
+from service.client.tls import ClientTls
 from service.errors import (
     ForeignServiceError,
     NoAnswerInTimeError,
+    NotLocalizedError,
     RefusedError,
     RequestError,
     StreetfixError,
@@ -116,7 +118,60 @@ def test_the_parts_are_what_the_contract_asks_for(ask: Asking, answer_json: Json
     assert document["T_vehicle_camera"]["position"] == {"x": 1, "y": 2, "z": 3}
     assert document["prior"] == {"position": {"x": 1, "y": 2}, "heading_deg": 90}
     assert document["options"] == {"neighbours": 3}
-    assert (answer.status, answer.confidence, answer.pose.position.x) == ("LOCALIZED", 0.75, 1.0)
+    assert (answer.status, answer.confidence, answer.require_pose().position.x) == ("LOCALIZED", 0.75, 1.0)
+
+
+@pytest.mark.parametrize("status", ["AMBIGUOUS", "OUT_OF_MAP"])
+def test_an_answer_that_is_not_localized_has_no_pose_to_use(
+    ask: Asking, answer_json: Json, refused_of: Json, status: str
+) -> None:
+    answer = ask(lambda _: httpx.Response(200, json=refused_of(answer_json(), status)), "localize", RGB, DEPTH, CAMERA)
+    assert (answer.status, answer.pose, answer.vehicle_pose, answer.geopose, answer.street) == (
+        status,
+        None,
+        None,
+        None,
+        None,
+    )
+    for wanted in (answer.require_pose, answer.require_vehicle_pose):
+        with pytest.raises(NotLocalizedError, match=f"the answer is {status}") as caught:
+            wanted()
+        assert caught.value.answer is answer
+    assert [each.confirmed for each in answer.hypotheses] == [False, False]
+
+
+@pytest.mark.parametrize("lie", [
+    {"status": "OUT_OF_MAP"},  # a pose all the same, as before
+    {"pose": None},
+    {"spread": {"mean": {"x": 0, "y": 0, "z": 0}, "covariance": [0.0] * 9, "heading_std_deg": 0, "hypotheses_weight": 1}},
+])  # fmt: skip
+def test_an_answer_whose_status_and_pose_contradict_each_other_is_none(
+    ask: Asking, answer_json: Json, lie: dict[str, Any]
+) -> None:
+    with pytest.raises(ForeignServiceError, match="of another contract"):
+        ask(lambda _: httpx.Response(200, json=answer_json(**lie)), "localize", RGB, DEPTH, CAMERA)
+
+
+@pytest.mark.parametrize("kept", ["street", "vehicle_pose"])
+def test_a_refused_answer_keeps_nothing_of_what_its_best_guess_would_say(
+    ask: Asking, answer_json: Json, refused_of: Json, kept: str
+) -> None:
+    was = answer_json(vehicle_pose=answer_json()["pose"])
+    with pytest.raises(ForeignServiceError):
+        ask(lambda _: httpx.Response(200, json=refused_of(was, **{kept: was[kept]})), "localize", RGB, DEPTH, CAMERA)
+
+
+def test_a_confirmed_hypothesis_of_a_refused_answer_is_none(ask: Asking, answer_json: Json, refused_of: Json) -> None:
+    content = refused_of(answer_json())
+    content["hypotheses"][0]["confirmed"] = True
+    with pytest.raises(ForeignServiceError):
+        ask(lambda _: httpx.Response(200, json=content), "localize", RGB, DEPTH, CAMERA)
+
+
+def test_a_vehicles_pose_that_was_not_asked_for_is_told_so(ask: Asking, answer_json: Json) -> None:
+    answer = ask(lambda _: httpx.Response(200, json=answer_json()), "localize", RGB, DEPTH, CAMERA)
+    with pytest.raises(RequestError, match="send T_vehicle_camera"):
+        answer.require_vehicle_pose()
 
 
 def test_a_sequence_says_where_each_camera_stood(ask: Asking, answer_json: Json) -> None:
@@ -261,7 +316,7 @@ OF_HTTPX = sorted(
 def test_every_exception_of_httpx_is_one_of_ours(kind: type[Exception]) -> None:
     error = kind.__new__(kind)
     Exception.__init__(error, "why")
-    with pytest.raises(StreetfixError) as caught, rest.errors_of_httpx("http://x", 1.0):
+    with pytest.raises(StreetfixError) as caught, rest.errors_of_httpx("http://x", 1.0, ClientTls()):
         raise error
     assert caught.value.__cause__ is error
     assert "http://x" in caught.value.message

@@ -106,7 +106,7 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
     )  # fmt: skip
     read = request_from(told.asked[0])
     assert (read.map, read.options.refine, read.depth.max_range_m, read.depth.scale_m) == ("m", False, 40.0, 0.001)
-    assert read.gravity == schema.Vector(x=0, y=1, z=0)
+    assert read.gravity == schema.Direction(x=0, y=1, z=0)
     assert read.T_vehicle_camera is not None
     assert read.T_vehicle_camera.position == schema.Position(x=1, y=2, z=3)
     assert read.prior == Prior(position=PriorPosition(x=1.0, y=2.0, std_m=3.0), heading_deg=90.0, heading_std_deg=20.0)
@@ -119,17 +119,23 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
     "changed",
     [
         {},
-        {"confidence": None, "street": None, "status": "OUT_OF_MAP"},
+        {"status": "OUT_OF_MAP"},
+        {"status": "AMBIGUOUS", "hypotheses": []},
         {"street": {"id": "s", "name": "N", "street": "1", "section": None, "class_index": 0, "vote": 1.0}},
         {"geopose": {"position": {"lat": 52.5, "lon": 13.4, "h": 70.0}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1}}},
         {"vehicle_pose": POSE},
-        {"hypotheses": [{"pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
+        {"hypotheses": [{"confirmed": True, "pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
         {"neighbours": [{"place": 3, "distance": 0.5, "similarity": 0.5, "street": None, "position": ORIGIN, "heading_deg": 0.0}]},
     ],
 )  # fmt: skip
-def test_an_answer_comes_through_the_messages_as_it_was(answer_json: Json, changed: dict[str, Any]) -> None:
-    answer = schema.LocalizeAnswer.model_validate(answer_json(**changed))
-    assert answer_of(answer_message(answer)) == answer
+def test_an_answer_comes_through_the_messages_as_it_was(
+    answer_json: Json, refused_of: Json, changed: dict[str, Any]
+) -> None:
+    content = refused_of(answer_json(), **changed) if "status" in changed else answer_json(**changed)
+    answer = schema.LocalizeAnswer.model_validate(content)
+    message = answer_message(answer)
+    assert answer_of(message) == answer
+    assert message.HasField("pose") == (answer.status == "LOCALIZED")
 
 
 def test_a_sequence_and_a_batch(client: GrpcClient, told: Told, answer_json: Json) -> None:
@@ -239,12 +245,12 @@ def test_details_that_contradict_their_call_are_no_problem_of_ours() -> None:
             return (("grpc-status-details-bin", status.SerializeToString()),)
 
     Odd.__abstractmethods__ = frozenset()  # type: ignore[attr-defined]  # the rest of a call is not asked for
-    with pytest.raises(RefusedError, match="words"), errors_of_grpc("x:1", 1.0):
+    with pytest.raises(RefusedError, match="words"), errors_of_grpc("x:1", 1.0, None):
         raise Odd
 
 
 def test_an_error_that_is_no_call_is_one_of_ours() -> None:
-    with pytest.raises(UnreachableError), errors_of_grpc("x:1", 1.0):
+    with pytest.raises(UnreachableError), errors_of_grpc("x:1", 1.0, None):
         raise grpc.RpcError("gone")
 
 

@@ -47,7 +47,7 @@ def test_the_answer_is_the_one_that_localize_gives(
     engine: Engine, explanation: Explanation, parts_of: Callable[..., dict[str, bytes]]
 ) -> None:
     alone = engine.localize(encoded(parts_of())).answer
-    assert np.array_equal(explanation.located.answer.T_map_camera, alone.T_map_camera)
+    assert np.array_equal(explanation.located.answer.T_map_camera_guess, alone.T_map_camera_guess)
     assert explanation.located.answer.confidence == alone.confidence
 
 

@@ -32,7 +32,7 @@ def test_every_query_gets_the_answer_that_the_localizer_gives(localizer, small_d
         answer = localizer.localize(
             Query(rgb=frame.rgb(), depth_m=frame.depth_m(), camera=frame.camera.pinhole(), ranked=RANKED)
         )
-        np.testing.assert_allclose(found.T_answer[k], answer.T_map_camera)
+        np.testing.assert_allclose(found.T_answer[k], answer.T_map_camera_guess)
         np.testing.assert_allclose(found.ranked_xy[k, 0], answer.neighbours[0].position_m[:2])
         assert found.street_answer[k] == answer.street
         np.testing.assert_allclose(found.evidence[k], answer.evidence)

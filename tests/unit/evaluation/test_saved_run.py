@@ -50,6 +50,10 @@ def test_answers_of_an_earlier_release_are_read_without_candidates(saved_run, tm
     assert np.isnan(old.candidates).all()
 
 
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
 @pytest.mark.parametrize(
     ("broken", "told"),
     [
@@ -57,6 +61,7 @@ def test_answers_of_an_earlier_release_are_read_without_candidates(saved_run, tm
         (lambda run: (run / "run.json").write_text("{}"), "map: Field required"),
         (lambda run: (run / "answers" / f"{SET}.npz").write_bytes(b"PK"), "no answers of ours"),
         (lambda run: (run / "answers" / f"{SET}.npz").unlink(), "no answers of ours"),
+        (lambda run: cut_off(run / "answers" / f"{SET}.npz"), "no answers of ours"),
         (lambda run: rewrite(run, queries=6), "5 answers, run.json says 6"),
         (lambda run: rewrite(run, name="../../etc"), "should match pattern"),
     ],

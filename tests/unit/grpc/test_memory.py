@@ -71,7 +71,7 @@ def test_all_is_given_back_after_an_answer_and_after_an_error(
     engine: Engine, stub: LocalizationServiceStub, message: pb.LocalizeRequest, method: str, good: bool
 ) -> None:
     if not good:
-        message.depth_format.scale_m, message.depth_format.max_range_m = 0.001, 0.001
+        message.depth_format.scale_m, message.depth_format.max_range_m = 0.001, 0.01
     requests: dict[str, Any] = {
         "Localize": message,
         "LocalizeBatch": pb.LocalizeBatchRequest(requests=[message, message]),

@@ -42,7 +42,7 @@ def client_of() -> Callable[[Engine], httpx.Client]:
 
 @pytest.fixture(scope="module")
 def engine(bundle_path: Path) -> Iterator[Engine]:
-    limits = Limits(max_request_bytes=200_000, max_part_bytes=150_000, max_pixels=10_000, max_parts=4)
+    limits = Limits(max_request_bytes=200_000, max_part_bytes=150_000, max_pixels=10_000)
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1, queue=1, limits=limits))
     yield engine
     engine.close()

@@ -8,14 +8,21 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
+import grpc
 import httpx
+import numpy as np
 import pytest
 import uvicorn
 from onnxruntime.capi.onnxruntime_pybind11_state import RuntimeException
 
+from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
+from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
+from service.grpc.server import GrpcServer
 from service.http.app import create_app
 from service.http.protocol import BoundedHttp
 from service.imaging import decode
+from service.localization import localizer
+from service.maps.calibration import FEATURES
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
 
@@ -39,19 +46,50 @@ def post(client: httpx.Client, parts: dict[str, bytes]) -> httpx.Response:
 def test_a_native_librarys_exception_ends_its_own_request_alone(
     engine: Engine, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:  # fmt: skip
-    client, (localizer,) = client_of(engine), engine.registry
-    encode = localizer.encoder.encode
+    client, (asked,) = client_of(engine), engine.registry
+    encode = asked.encoder.encode
 
     def fails(*_: object, **__: object) -> None:
         raise error
 
-    localizer.encoder = SimpleNamespace(encode=fails)
+    asked.encoder = SimpleNamespace(encode=fails)
     failed = post(client, parts_of())
-    localizer.encoder = SimpleNamespace(encode=encode)
+    asked.encoder = SimpleNamespace(encode=encode)
     assert (failed.status_code, failed.json()["code"]) == (500, "internal")
     assert str(error) not in failed.text or not str(error)
     assert post(client, parts_of()).status_code == 200
     assert (engine.admission.working, engine.admission.waiting) == (0, 0)
+
+
+def test_an_answer_that_is_not_finite_is_an_internal_error_of_both_faces(
+    engine: Engine, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    """NaN never reaches a client; the log names the number and the request."""
+    parts = parts_of()
+    message = pb.LocalizeRequest(
+        rgb=parts["rgb"], depth=parts["depth"], camera=pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5)
+    )
+    server = GrpcServer(engine, host="127.0.0.1", port=0)
+    server.start()
+    monkeypatch.setattr(localizer, "evidence_of", lambda *_: np.full(len(FEATURES), np.nan))
+    told = "evidence of the answer is not finite"
+    try:
+        failed = post(client_of(engine), parts)
+        assert (failed.status_code, failed.json()["code"]) == (500, "internal")
+        assert failed.json()["request_id"] in caplog.text
+        assert told not in failed.text
+        assert told in caplog.text
+        caplog.clear()
+        with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel, pytest.raises(grpc.RpcError) as caught:
+            LocalizationServiceStub(channel).Localize(message, metadata=(("x-request-id", "mine-9"),))
+        assert caught.value.code() == grpc.StatusCode.INTERNAL
+        assert "mine-9" in caught.value.details()
+        assert told not in caught.value.details()
+        assert told in caplog.text
+        assert "mine-9" in caplog.text
+    finally:
+        server.stop(grace_s=0)
 
 
 def test_a_stuck_request_is_told_so_and_the_others_are_answered(

@@ -213,3 +213,5 @@ def test_doubt_is_a_problem_where_the_format_has_no_word_for_it(
     assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")
     assert "AMBIGUOUS" in refused.json()["detail"]
     assert json.loads(post(client, parts_of()).content)["status"] == "AMBIGUOUS"
+    refused = client.post("/geopose", json=oscp(parts_of()), headers=ACCEPT)
+    assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")

@@ -12,7 +12,7 @@ import pytest
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
-from service.runtime.settings import Settings
+from service.runtime.settings import Limits, Settings
 
 Parts = Callable[..., dict[str, bytes]]
 
@@ -37,7 +37,8 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     answer = response.json()
     assert response.status_code == 200
     assert list(answer) == [
-        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "neighbours", "map", "timings_ms",
+        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "spread", "neighbours", "map",
+        "timings_ms",
     ]  # fmt: skip
     assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
     assert answer["street"] | {"vote": 1} == {
@@ -51,8 +52,9 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     assert answer["neighbours"][0]["street"] == "s2"
     assert len(answer["neighbours"]) == 5
     best = answer["hypotheses"][0]
-    assert list(best) == ["pose", "share", "inliers", "similarity"]
-    assert best["pose"] == answer["pose"] | {"covariance": None}
+    assert list(best) == ["confirmed", "pose", "share", "inliers", "similarity"]
+    assert best["confirmed"]
+    assert best["pose"] == answer["pose"]
     assert best["inliers"] > 0.8
 
 
@@ -146,7 +148,7 @@ def test_a_picture_of_too_many_bytes_is_refused(client: httpx.Client, parts_of: 
 
 
 def test_too_many_parts_are_refused(client: httpx.Client, parts_of: Parts) -> None:
-    require_problem(post(client, parts_of() | {"a": b"", "b": b""}), 413, "too-large", None)
+    require_problem(post(client, parts_of() | {f"part{k}": b"" for k in range(31)}), 413, "too-large", None)
 
 
 def test_an_announced_body_beyond_the_limit_is_refused_unread(client: httpx.Client) -> None:
@@ -172,8 +174,20 @@ def test_an_unknown_map_is_refused_with_the_mounted_ones(client: httpx.Client, p
     assert "mounted: tiny" in problem["detail"]
 
 
+@pytest.mark.parametrize("name", list(Limits.model_fields))
+def test_every_limit_of_the_settings_refuses_what_is_beyond_it(
+    bundle_path: Path, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, name: str
+) -> None:
+    """The same good request, whose body, pictures and pixels are beyond the least that each limit may be set to."""
+    least = {"max_request_bytes": 1024, "max_part_bytes": 1024, "max_pixels": 1}[name]
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1, limits=Limits(**{name: least})))
+    response = post(client_of(engine), parts_of())
+    engine.close()
+    assert (response.status_code, response.json()["code"]) == (413, "too-large")
+
+
 def test_no_depth_is_a_problem_of_its_own(client: httpx.Client, parts_of: Parts) -> None:
-    require_problem(post(client, parts_of(depth={"scale_m": 0.001, "max_range_m": 0.001})), 422, "no-depth", "depth")
+    require_problem(post(client, parts_of(depth={"scale_m": 0.001, "max_range_m": 0.01})), 422, "no-depth", "depth")
 
 
 ORIGIN = {"x": 0, "y": 0, "z": 0}

@@ -61,7 +61,7 @@ def numbered(parts: dict[str, bytes], document: dict[str, Any], count: int) -> d
     return pictures | {"request": json.dumps(document).encode()}
 
 
-@pytest.mark.parametrize("depth", [{}, {"scale_m": 0.001, "max_range_m": 0.001}], ids=["good", "no depth"])
+@pytest.mark.parametrize("depth", [{}, {"scale_m": 0.001, "max_range_m": 0.01}], ids=["good", "no depth"])
 @pytest.mark.parametrize("path", ["/v1/localize", "/v1/explain", "/v1/localize/sequence", "/v1/localize/batch"])
 def test_all_is_given_back_after_an_answer_and_after_an_error(
     engine: Engine, app_client: AppClient, parts_of: Parts, no_collector: None, path: str, depth: dict[str, Any]

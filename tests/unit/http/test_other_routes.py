@@ -1,11 +1,11 @@
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import httpx
 import pytest
 
 from service.runtime.engine import Engine
-from service.runtime.map_registry import MapRegistry
+from service.runtime.map_registry import MapRegistry, Refused
 from service.runtime.settings import Settings
 
 
@@ -33,18 +33,44 @@ def test_the_version_says_which_maps_are_served(client: httpx.Client) -> None:
     assert (version["api"], version["threads"], version["maps"][0]["name"]) == ("v1", 1, "tiny")
 
 
-@pytest.mark.parametrize("path", ["/livez", "/readyz"])
-def test_a_service_with_a_map_lives_and_is_ready(client: httpx.Client, path: str) -> None:
-    assert client.get(path).json() == {"status": "ok"}
+def test_a_service_with_a_map_lives_and_is_ready(client: httpx.Client) -> None:
+    assert client.get("/livez").json() == {"status": "ok"}
+    assert client.get("/readyz").json() == {"status": "ok", "refused": []}
 
 
-def test_a_service_without_a_map_lives_and_is_not_ready(client_of: Callable[[Engine], httpx.Client]) -> None:
+@pytest.fixture
+def empty(client_of: Callable[[Engine], httpx.Client]) -> Iterator[tuple[Engine, httpx.Client]]:
+    """A service without a map."""
     engine = Engine(MapRegistry(), Settings(threads=1))
-    client = client_of(engine)
-    assert client.get("/livez").status_code == 200
-    response = client.get("/readyz")
-    assert (response.status_code, response.json()["code"]) == (503, "not-ready")
+    yield engine, client_of(engine)
     engine.close()
+
+
+def test_a_service_without_a_map_lives_and_is_not_ready(
+    empty: tuple[Engine, httpx.Client], parts_of: Callable[..., dict[str, bytes]]
+) -> None:
+    _, client = empty
+    assert client.get("/livez").status_code == 200
+    assert client.get("/v1/maps").json() == {"maps": []}
+    parts = {name: (name, data) for name, data in parts_of().items()}
+    for response in (
+        client.get("/readyz"), client.post("/v1/localize", files=parts), client.get("/v1/maps/tiny/streets"),
+        client.get("/v1/maps/tiny/places"), client.get("/v1/maps/tiny/cloud"),
+    ):  # fmt: skip
+        assert (response.status_code, response.json()["code"]) == (503, "not-ready")
+        assert "no map is mounted" in response.json()["detail"]
+        assert response.headers["retry-after"]
+
+
+def test_readiness_names_bundles_that_are_not_mounted(
+    empty: tuple[Engine, httpx.Client], engine: Engine, client: httpx.Client
+) -> None:
+    refused = tuple(Refused(f"m{number}", f"m{number}/places.npy: it is damaged") for number in range(25))
+    engine.registry.refused = empty[0].registry.refused = refused
+    named = client.get("/readyz").json()["refused"]
+    assert (len(named), named[0]) == (20, {"bundle": "m0", "reason": "m0/places.npy: it is damaged"})
+    assert "m0 is not mounted: m0/places.npy: it is damaged" in empty[1].get("/readyz").json()["detail"]
+    engine.registry.refused = ()
 
 
 def test_the_contract_is_served(client: httpx.Client) -> None:

@@ -124,3 +124,15 @@ def test_as_many_poses_as_scans_are_wanted(tmp_path):
 def test_a_folder_without_scans_is_refused(tmp_path):
     with pytest.raises(DatasetError, match=r"a folder of scans is wanted \(\.bin, \.pcd"):
         open_clouds(tmp_path)
+
+
+@each_format
+def test_a_scan_that_vanishes_during_an_import_is_an_error_that_names_it(tmp_path, suffix):
+    """It ended with a traceback; to leave it out, as a damaged one, would lose a part of the map while a disk fails."""
+    for number in range(2):
+        WRITERS[suffix](tmp_path / f"{number}{suffix}")
+    events = open_clouds(tmp_path).events()
+    assert isinstance(next(events), RecordedScan)
+    (tmp_path / f"1{suffix}").unlink()
+    with pytest.raises(DatasetError, match=rf"1\{suffix}: it is missing, or vanished"):
+        next(events)

@@ -4,9 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
+from model_training.datasets.dataset import Dataset
+from model_training.datasets.layouts import SCANS_AT_REST
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.oxts import read_oxts
 from model_training.importing.recording import RecordedPicture, RecordedScan, Unusable
+from model_training.importing.spinning import KITTI_VERTICAL_DEG, raised
+from model_training.importing.take import TakeSettings, take
 from service.errors import DatasetError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z
 
@@ -105,7 +109,7 @@ def events_of(path, kind, depth="recorded"):
 
 def test_scans_and_pictures_come_with_the_mounting_of_the_calibration(drive):
     scans, pictures = events_of(drive, RecordedScan), events_of(drive, RecordedPicture)
-    np.testing.assert_array_equal(scans[2].points, scan_of(2))
+    np.testing.assert_allclose(scans[2].points, raised(scan_of(2), KITTI_VERTICAL_DEG))
     assert [p.stamp_s for p in pictures] == [s.stamp_s for s in scans]
     assert opened(drive).count() == 6
     picture = pictures[0]
@@ -120,6 +124,15 @@ def test_scans_and_pictures_come_with_the_mounting_of_the_calibration(drive):
 def test_matched_depth_is_that_of_the_wall(drive):
     depth = events_of(drive, RecordedPicture, "sgbm")[0].depth[:, 140:]
     assert abs(np.median(depth[depth > 0]) - 5.0) < 0.02
+
+
+@pytest.mark.parametrize(("depth", "baseline_m"), [("sgbm", BASELINE_M), ("stored", None)])
+def test_only_matched_depth_has_a_baseline(drive, depth, baseline_m, tmp_path):
+    recording = opened(drive, depth)
+    assert [p.baseline_m for p in events_of(drive, RecordedPicture, depth)] == [pytest.approx(baseline_m)] * 3
+    take(recording, recording.trajectory(), tmp_path / "taken", TakeSettings())
+    (camera,) = Dataset(tmp_path / "taken").description.sensors.cameras
+    assert camera.depth.baseline_m == pytest.approx(baseline_m)
 
 
 def test_depth_of_the_scans_is_left_to_who_takes_them(drive):
@@ -160,7 +173,7 @@ def test_stereo_without_the_right_cameras_calibration_is_refused(drive):
 def test_a_missing_calibration_is_named(drive):
     path = drive / "calib.txt" if (drive / "calib.txt").is_file() else drive.parent / "calib_velo_to_cam.txt"
     path.unlink()
-    with pytest.raises(DatasetError, match=rf"{path.name} cannot be read"):
+    with pytest.raises(DatasetError, match=rf"{path.name} cannot be read|there is no {path.name}"):
         opened(drive)
 
 
@@ -246,3 +259,64 @@ def test_the_days_folder_will_do_where_it_holds_one_drive(raw):
 def test_a_folder_of_something_else_is_refused(tmp_path, kind, why):
     with pytest.raises(DatasetError, match=why):
         open_recording(kind, tmp_path, OpenSettings())
+
+
+def test_a_scan_that_vanishes_during_an_import_is_an_error_and_a_picture_is_left_out(raw):
+    recording = open_recording("kitti-raw", raw, OpenSettings(depth="stored"))
+    events = recording.events()
+    assert [type(next(events)) for _ in range(2)] == [RecordedScan, RecordedPicture]
+    frame = recording.frames[1]
+    frame.left.unlink()
+    assert isinstance(next(events), RecordedScan)
+    left_out = next(events)
+    assert isinstance(left_out, Unusable)
+    assert "it is missing, or vanished" in left_out.why
+    recording.frames[2].scan.unlink()
+    with pytest.raises(DatasetError, match=r"0000000002\.bin: it is missing, or vanished"):
+        next(events)
+
+
+def test_points_of_a_raw_drive_have_times_by_azimuth_and_those_of_a_sequence_have_none(drive):
+    """A tenth of a second a turn: the rear first, the front at the stamp."""
+    offsets = events_of(drive, RecordedScan)[1].offsets_s
+    if "sync" not in drive.name:  # KITTI's odometry scans are compensated already
+        assert offsets is None
+        return
+    azimuth = np.arctan2(scan_of(1)[:, 1], scan_of(1)[:, 0])
+    np.testing.assert_allclose(offsets, -azimuth / (2 * np.pi) * 0.1, atol=1e-9)
+
+
+def test_the_vertical_correction_can_be_left_out(drive):
+    kind = "kitti-raw" if "sync" in drive.name else "kitti-odometry"
+    recording = open_recording(kind, drive, OpenSettings(vertical_correction=False))
+    scan = next(event for event in recording.events() if isinstance(event, RecordedScan))
+    np.testing.assert_array_equal(scan.points, scan_of(0))
+    assert recording.notes.source["vertical_correction_deg"] == 0.0
+    assert opened(drive).notes.source["vertical_correction_deg"] == KITTI_VERTICAL_DEG
+
+
+def test_the_dataset_says_what_was_done_to_its_scans(drive, tmp_path):
+    recording = opened(drive)
+    summary = take(recording, recording.trajectory(), tmp_path / "taken", TakeSettings())
+    source = Dataset(tmp_path / "taken").description.source
+    raw = "sync" in drive.name
+    assert source["scans_deskewed"] == summary.deskewed == (3 if raw else 0)
+    assert source["point_times"] == ("azimuth" if raw else "none")
+
+
+def test_a_drive_that_we_wrote_is_left_as_it_is(raw):
+    (raw / SCANS_AT_REST).write_text("")
+    scan = events_of(raw, RecordedScan)[1]
+    assert scan.offsets_s is None
+    np.testing.assert_array_equal(scan.points, scan_of(1))
+
+
+@pytest.mark.parametrize("place", [".", "calib", "../calib"])
+def test_the_calibration_may_lie_inside_the_drive_or_in_a_folder_of_its_own(raw, place):
+    expected = opened(raw).calibration
+    (raw / place).mkdir(exist_ok=True)
+    for path in list(raw.parent.glob("calib_*.txt")):
+        path.rename(raw / place / path.name)
+    found = opened(raw)
+    np.testing.assert_array_equal(found.calibration.T_camera_lidar, expected.T_camera_lidar)
+    assert found.trajectory() is not None

@@ -195,3 +195,10 @@ def test_matched_depth_of_the_recording_is_near_its_stored_depth(kitti_recording
     error = np.abs(depth["sgbm"] - depth["stored"])[both] / depth["stored"][both]
     assert np.median(error) < 0.03
     assert both.sum() / (depth["stored"] > 0).sum() > 0.5
+
+
+@pytest.mark.parametrize("depth", ["sgbm", "stored"])
+def test_only_matched_depth_has_a_baseline(kitti, tmp_path, depth):
+    import_kitti_object(kitti, tmp_path / "out", depth=depth)
+    for camera in Dataset(tmp_path / "out").description.sensors.cameras:
+        assert camera.depth.baseline_m == (pytest.approx(0.5) if depth == "sgbm" else None)

@@ -30,8 +30,8 @@ def test_a_robot_posts_the_datasets_queries_in_turn_with_its_key(robot):
     def post(path, *, data, headers, catch_response):
         sent.append((path, data, headers))
         assert catch_response
-        pose = None if len(sent) == 2 else {}
-        yield SimpleNamespace(status_code=200, json=lambda: {"pose": pose}, failure=failures.append)
+        answer = ({"status": "LOCALIZED", "pose": {}}, {}, {"status": "AMBIGUOUS", "pose": None})[(len(sent) - 1) % 3]
+        yield SimpleNamespace(status_code=200, json=lambda: answer, failure=failures.append)
 
     robot.client = SimpleNamespace(post=post)
     for _ in range(6):
@@ -41,4 +41,4 @@ def test_a_robot_posts_the_datasets_queries_in_turn_with_its_key(robot):
     assert sent[5][1] == sent[0][1]
     assert all(headers["Authorization"] == "Bearer secret" for _, _, headers in sent)
     assert all(headers["Content-Type"].startswith("multipart/form-data; boundary=") for _, _, headers in sent)
-    assert failures == ["no pose"]
+    assert failures == ["no answer"] * 2

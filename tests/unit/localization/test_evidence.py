@@ -15,7 +15,9 @@ from service.registration.rendered import Agreement
 
 
 def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
-    return Refined(candidates, np.eye(6) if covariance is None else covariance, points, disagreement)
+    return Refined(
+        candidates, np.eye(6) if covariance is None else covariance, points, disagreement, lambda _: np.eye(6)
+    )
 
 
 def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):

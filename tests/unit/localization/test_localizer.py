@@ -56,9 +56,9 @@ def test_without_registration_the_pose_stands_at_the_place_at_the_cameras_own_he
     )
     assert answer.street == answer.hypotheses[0].street == 2
     # The place's LiDAR is at (20, 100, 2), 1.8 m above the ground; the camera 1.5 m.
-    np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, 100, 0.2 + answer.height_m], atol=0.05)
+    np.testing.assert_allclose(answer.T_map_camera_guess[:3, 3], [20, 100, 0.2 + answer.height_m], atol=0.05)
     assert answer.height_m == pytest.approx(1.5, abs=0.05)
-    assert np.rad2deg(heading_of_camera(answer.T_map_camera)) == pytest.approx(90, abs=1)
+    assert np.rad2deg(heading_of_camera(answer.T_map_camera_guess)) == pytest.approx(90, abs=1)
 
 
 def test_with_registration_the_pose_is_where_the_picture_was_taken(localizer: Localizer, query: Query) -> None:
@@ -66,9 +66,9 @@ def test_with_registration_the_pose_is_where_the_picture_was_taken(localizer: Lo
     assert answer.candidates is not None
     assert answer.covariance is not None
     assert answer.candidates[0].registered.inliers > 0.8
-    np.testing.assert_array_equal(answer.candidates[0].T_map_camera, answer.T_map_camera)
-    np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, 100, 1.7], atol=0.3)
-    assert np.rad2deg(heading_of_camera(answer.T_map_camera)) == pytest.approx(90, abs=1)
+    np.testing.assert_array_equal(answer.candidates[0].T_map_camera, answer.T_map_camera_guess)
+    np.testing.assert_allclose(answer.T_map_camera_guess[:3, 3], [20, 100, 1.7], atol=0.3)
+    assert np.rad2deg(heading_of_camera(answer.T_map_camera_guess)) == pytest.approx(90, abs=1)
     np.testing.assert_allclose(answer.covariance, answer.covariance.T)
     assert (np.linalg.eigvalsh(answer.covariance) > 0).all()
 
@@ -104,7 +104,7 @@ def test_a_map_without_a_cloud_answers_by_retrieval(
 
 
 def test_the_camera_axis_lies_level_where_the_camera_is_level(localizer: Localizer, query: Query) -> None:
-    R_map_camera = localizer.localize(query).T_map_camera[:3, :3]
+    R_map_camera = localizer.localize(query).T_map_camera_guess[:3, :3]
     np.testing.assert_allclose(R_map_camera.T @ R_map_camera, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(R_map_camera[:, 1], [0, 0, -1], atol=0.02)
 
@@ -112,9 +112,9 @@ def test_the_camera_axis_lies_level_where_the_camera_is_level(localizer: Localiz
 def test_the_vehicles_pose_follows_from_where_the_camera_sits(localizer: Localizer, query: Query) -> None:
     T_vehicle_camera = transform_from(np.eye(3), np.array([1.0, 0.0, 0.5]))
     answer = localizer.localize(replace(query, T_vehicle_camera=T_vehicle_camera))
-    assert answer.T_map_vehicle is not None
-    np.testing.assert_allclose(answer.T_map_vehicle @ T_vehicle_camera, answer.T_map_camera, atol=1e-9)
-    assert localizer.localize(query).T_map_vehicle is None
+    assert answer.T_map_vehicle_guess is not None
+    np.testing.assert_allclose(answer.T_map_vehicle_guess @ T_vehicle_camera, answer.T_map_camera_guess, atol=1e-9)
+    assert localizer.localize(query).T_map_vehicle_guess is None
 
 
 @pytest.mark.parametrize("k", [1, 5, 12])
@@ -253,7 +253,7 @@ def test_a_calibrated_map_believes_nothing_of_a_picture_that_is_too_empty_to_reg
 
 def test_one_frame_of_a_sequence_is_answered_like_a_single_query(localizer: Localizer, query: Query) -> None:
     alone, sequence = localizer.localize(query), localizer.localize_frames((query,), (np.eye(4),))
-    np.testing.assert_array_equal(sequence.T_map_camera, alone.T_map_camera)
+    np.testing.assert_array_equal(sequence.T_map_camera_guess, alone.T_map_camera_guess)
     np.testing.assert_array_equal(sequence.evidence, alone.evidence)
 
 
@@ -263,8 +263,8 @@ def test_a_sequence_is_answered_with_the_pose_of_its_first_frame(localizer: Loca
     few = np.zeros_like(query.depth_m)
     few[20:23, 20:24] = query.depth_m[20:23, 20:24]  # enough to be looked up, nothing to register
     answer = localizer.localize_frames((replace(query, depth_m=few), query), (np.eye(4), behind))
-    np.testing.assert_allclose(localizer.localize(query).T_map_camera[:2, 3], [20, 100], atol=0.3)
-    np.testing.assert_allclose(answer.T_map_camera[:2, 3], [20, 105], atol=0.3)
+    np.testing.assert_allclose(localizer.localize(query).T_map_camera_guess[:2, 3], [20, 100], atol=0.3)
+    np.testing.assert_allclose(answer.T_map_camera_guess[:2, 3], [20, 105], atol=0.3)
 
 
 def test_a_sequence_needs_a_pose_for_every_frame(localizer: Localizer, query: Query) -> None:
@@ -282,7 +282,7 @@ def test_a_prior_that_is_wrong_does_not_move_a_pose_that_the_pictures_are_sure_o
         Prior(heading_rad=-np.pi / 2, heading_std_rad=0.01),
     ):
         answer = localizer.localize(replace(query, prior=wrong))
-        np.testing.assert_allclose(answer.T_map_camera, alone.T_map_camera, atol=1e-9)
+        np.testing.assert_allclose(answer.T_map_camera_guess, alone.T_map_camera_guess, atol=1e-9)
         assert answer.covariance is not None
         np.testing.assert_allclose(answer.covariance, alone.covariance, atol=1e-9)
 
@@ -292,7 +292,7 @@ def test_a_prior_decides_between_streets_that_nothing_else_tells_apart(twin_map:
     localizer = Localizer.open(MapBundle.open(twin_map))
     known = Prior(position_m=np.array([15.0, y + 5.0]), position_std_m=10.0)
     answer = localizer.localize(replace(query, prior=known))
-    np.testing.assert_allclose(answer.T_map_camera[:3, 3], [20, y, 1.7], atol=0.3)
+    np.testing.assert_allclose(answer.T_map_camera_guess[:3, 3], [20, y, 1.7], atol=0.3)
 
 
 def test_a_prior_that_is_wrong_lends_a_wrong_pose_no_confidence(
@@ -313,7 +313,7 @@ def test_a_prior_that_is_wrong_lends_a_wrong_pose_no_confidence(
     for position in ([20.0, 0.0], [60.0, 100.0], [-1e6, 1e6]):
         wrong = Prior(position_m=np.array(position), position_std_m=1.0, heading_rad=-np.pi / 2, heading_std_rad=0.1)
         answer = localizer.localize(replace(query, prior=wrong))
-        np.testing.assert_allclose(answer.T_map_camera, alone.T_map_camera, atol=1e-9)
+        np.testing.assert_allclose(answer.T_map_camera_guess, alone.T_map_camera_guess, atol=1e-9)
         assert answer.confidence is not None
         assert answer.confidence <= alone.confidence
         assert answer.status in (alone.status, "AMBIGUOUS", "OUT_OF_MAP")
@@ -324,7 +324,7 @@ def test_a_prior_decides_without_registration_too(twin_map: Path, query: Query, 
     localizer = Localizer.open(MapBundle.open(twin_map))
     known = Prior(position_m=np.array([15.0, y + 5.0]), position_std_m=10.0)
     answer = localizer.localize(replace(query, prior=known, refine=False))
-    np.testing.assert_allclose(answer.T_map_camera[:2, 3], [20, y], atol=0.3)
+    np.testing.assert_allclose(answer.T_map_camera_guess[:2, 3], [20, y], atol=0.3)
     assert answer.street == answer.hypotheses[0].street
     apart = np.linalg.norm(answer.hypotheses[0].position_m[:2] - [20, y])
     assert apart < 1.0
@@ -334,7 +334,7 @@ def test_a_prior_far_from_everything_leaves_retrieval_as_it_was(localizer: Local
     alone = localizer.localize(replace(query, refine=False))
     lost = Prior(position_m=np.array([-1e6, 1e6]), position_std_m=0.1)
     answer = localizer.localize(replace(query, refine=False, prior=lost))
-    np.testing.assert_array_equal(answer.T_map_camera, alone.T_map_camera)
+    np.testing.assert_array_equal(answer.T_map_camera_guess, alone.T_map_camera_guess)
 
 
 @pytest.mark.parametrize("seed", [4, 6, 8, 10])
@@ -345,4 +345,4 @@ def test_a_prior_in_a_street_that_looks_the_same_but_measures_otherwise_does_not
     localizer = Localizer.open(MapBundle.open(streets_alike(seed_of_first=seed)))
     for wrong in (None, Prior(position_m=np.array([20.0, 0.0]), position_std_m=10.0)):
         answer = localizer.localize(replace(query, prior=wrong))
-        np.testing.assert_allclose(answer.T_map_camera[:2, 3], [20, 90], atol=0.3)
+        np.testing.assert_allclose(answer.T_map_camera_guess[:2, 3], [20, 90], atol=0.3)

@@ -202,7 +202,7 @@ def asked(content, calibration, scan, *, right, bias, count=30, monkeypatch):
         def localize(self, _query):
             T_map_camera = truth.copy()
             T_map_camera[0, 3] += 0.5 if next(number) < right else 5.0
-            return type("Answer", (), {"T_map_camera": T_map_camera, "evidence": np.zeros(len(FEATURES))})
+            return type("Answer", (), {"T_map_camera_guess": T_map_camera, "evidence": np.zeros(len(FEATURES))})
 
     truth = scan.T_map_level
     monkeypatch.setattr(site_check, "Localizer", Answering)

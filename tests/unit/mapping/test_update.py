@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping import places
+from model_training.mapping import places, update
 from model_training.mapping.area import CELL_M, covered_by, polygon_of
 from model_training.mapping.stored_map import voxels_of
 from model_training.mapping.update import update_map
@@ -53,7 +53,7 @@ def test_it_answers_like_the_map_built_at_once(extended, whole, small_dataset):
             )
             for bundle in (extended, whole)
         )
-        assert np.linalg.norm(one.T_map_camera[:3, 3] - other.T_map_camera[:3, 3]) < 0.02
+        assert np.linalg.norm(one.T_map_camera_guess[:3, 3] - other.T_map_camera_guess[:3, 3]) < 0.02
 
 
 def test_the_same_drive_again_adds_no_place(small_map, small_dataset, tmp_path):
@@ -262,3 +262,31 @@ def test_votes_are_recorded_only_where_both_drives_had_them(half_maps, halves, m
     assert (
         "passes_vote" not in update_map(half_maps[0], halves[1], tmp_path / "x", passes_vote=True, threads=1).parameters
     )
+
+
+def test_a_drive_too_far_from_the_map_is_refused(half_maps, halves, tmp_path):
+    class Far(type(halves[1])):
+        def survey_poses(self):
+            poses = super().survey_poses()
+            poses[:, 1, 3] += 300_000.0
+            return poses
+
+    with pytest.raises(DatasetError, match=r"scan \d+ lies 300 km from the middle of the map"):
+        update_map(half_maps[0], Far(halves[1].folder, halves[1].numbers), tmp_path / "m", threads=1)
+
+
+def test_a_drive_is_cleared_of_traffic_if_the_maps_was(halves, map_of, tmp_path, monkeypatch):
+    """And where the map was built without, the update is, too; what is said of the map holds of all of its drives."""
+    asked = []
+    real = update.moved
+
+    def listening(*args, each_scan=False, **more):
+        asked.append(each_scan)
+        return real(*args, each_scan=each_scan, **more)
+
+    monkeypatch.setattr(update, "moved", listening)
+    for voted in (True, False):
+        made = update_map(map_of(halves[0], traffic_vote=voted), halves[1], tmp_path / f"m{voted}", threads=1)
+        assert asked == [True] * voted
+        assert made.parameters.get("traffic_vote") == (1.0 if voted else None)
+        asked.clear()

@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from model_training.mapping.voxel_map import TILE_M, VOXEL, VOXEL_WITHOUT_BRIGHTNESS, VoxelMap, lattice_origin
+from service.errors import DatasetError
 
 
 def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
@@ -204,3 +207,56 @@ def test_forgotten_voxels_are_gone(cloud):
     voxels.keep(means[:, 0] < 101.0)
     np.testing.assert_array_equal(voxels.means(), means[means[:, 0] < 101.0])
     np.testing.assert_array_equal(voxels.keys_of(voxels.means()), voxels.sums()[0])
+
+
+REACH_CELLS = (1 << 19) - 2
+cells = st.tuples(*[st.integers(-REACH_CELLS, REACH_CELLS - 1)] * 3)
+
+
+@given(cells, cells, st.sampled_from([0.1, 0.3, 1.0]))
+def test_two_voxels_within_reach_never_share_a_key_and_keep_their_place(one, other, voxel_m):
+    voxels = VoxelMap(voxel_m, np.array([30.0, -600.0, 9.0]))
+    points = voxels.origin + (np.array([one, other]) + 0.5) * voxel_m
+    voxels.add(points)
+    keys = voxels.keys_of(points)
+    assert (keys[0] == keys[1]) == (one == other)
+    found = voxels.means()
+    assert len(found) == len({one, other})
+    for point in points:
+        assert np.abs(found - point).max(axis=1).min() < 1e-3 * voxel_m
+
+
+@given(st.integers(0, 2), st.sampled_from([-1, 1]), st.floats(1.001, 1e9))
+def test_what_lies_beyond_the_keys_is_refused_instead_of_taken_for_something_near(axis, sign, times):
+    """At 0.3 m keys end after 157 km: a UTM position beside local ones fell into voxels of the map."""
+    voxels = VoxelMap(0.3, np.zeros(3))
+    point = np.zeros((2, 3))
+    point[1, axis] = sign * times * voxels.reach_m
+    with pytest.raises(DatasetError, match="one frame"):
+        voxels.add(point)
+    with pytest.raises(DatasetError, match="one frame"):
+        voxels.keys_of(point)
+    assert not len(voxels.sums()[0])
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_a_coordinate_that_is_no_number_is_refused(number):
+    with pytest.raises(DatasetError):
+        VoxelMap(0.3, np.zeros(3)).add(np.array([[0.0, number, 0.0]]))
+
+
+def test_neighbours_of_the_farthest_voxels_are_theirs():
+    """One cell further, the neighbour's key along y would be that of a voxel at the other end, one row on."""
+    voxels = VoxelMap(1.0, np.zeros(3))
+    far = voxels.reach_m - 0.5
+    ends = [[0.5, far, 0.5], [1.5, -far, 0.5]]
+    voxels.add(np.repeat(np.array(ends), 4, axis=0))
+    assert len(voxels.surfels(fewest=4).positions) == 2
+    assert len(voxels.surfels(fewest=5).positions) == 0
+
+
+def test_sums_of_a_map_out_of_reach_are_refused():
+    near, far = (VoxelMap(0.5, np.array([x, 0.0, 0.0])) for x in (0.0, 400_000.0))
+    far.add(far.origin + np.array([[0.1, 0.1, 0.1]]))
+    with pytest.raises(DatasetError, match="400 km from the middle"):
+        near.add_statistics(far.statistics())

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.errors import BundleError
+from service.maps import reader
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 
@@ -56,6 +57,37 @@ def test_a_flipped_bit_is_refused(bundle_copy: Path, name: str) -> None:
 def test_a_missing_file_is_refused(bundle_copy: Path, name: str) -> None:
     (bundle_copy / name).unlink()
     with pytest.raises(BundleError, match=f"{name}: it is missing"):
+        MapBundle.open(bundle_copy)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_vanishes_while_the_bundle_is_opened_is_refused(
+    bundle_copy: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when an operator removes it: all files were there when they were looked at."""
+
+    def looked_at(*arguments: object, **changed: object) -> None:
+        original(*arguments, **changed)
+        (bundle_copy / name).unlink()
+
+    original = reader._require_files
+    monkeypatch.setattr(reader, "_require_files", looked_at)
+    with pytest.raises(BundleError, match=name.rpartition("/")[2]):
+        MapBundle.open(bundle_copy).encoder_bytes()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_vanishes_while_it_is_compared_is_refused(
+    bundle_copy: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compare(path: Path) -> str:
+        if path == bundle_copy / name:
+            path.unlink()
+        return original(path)
+
+    original = reader.sha256_of
+    monkeypatch.setattr(reader, "sha256_of", compare)
+    with pytest.raises(BundleError, match=f"{name}: it cannot be read"):
         MapBundle.open(bundle_copy)
 
 

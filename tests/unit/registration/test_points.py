@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y
-from service.registration.points import PointSettings, inverse_depth_noise, points_of
+from service.registration.points import LEAST_NOISE, PointSettings, inverse_depth_noise, points_of
 
-ALL = PointSettings(columns=80, points=100_000, ground_share=0.5, correlated=1.0)
+ALL = PointSettings(columns=80, points=100_000, ground_share=0.5)
 HIGH_M = 100.0  # so high that no point is of the ground or of a vehicle
 
 
@@ -38,8 +38,23 @@ def test_the_noise_of_the_inverse_depth_is_read_off_a_plane(noise):
     assert inverse_depth_noise(tilted_plane(320, 240, noise=noise)) == pytest.approx(noise, rel=0.05)
 
 
-def test_a_faultless_plane_has_no_noise():
-    assert inverse_depth_noise(tilted_plane(320, 240)) < 1e-6
+@pytest.mark.parametrize(
+    "depth",
+    [
+        tilted_plane(320, 240),
+        np.full((240, 320), 3.0, np.float32),  # a constant wall: every difference is 0
+        (np.round(1000 / np.linspace(0.999, 1.001, 320)).astype(np.float32) * np.ones((240, 1), np.float32))
+        / np.float32(1000),
+    ],
+)
+def test_no_picture_is_free_of_noise(depth):
+    assert inverse_depth_noise(depth) == LEAST_NOISE
+
+
+def test_the_least_noise_is_lost_in_the_least_deviation_of_a_point():
+    """So the bound changes no point: at the end of the reach it is a twelfth of it."""
+    settings = PointSettings()
+    assert LEAST_NOISE * settings.reach_m**2 < 0.1 * settings.floor_m
 
 
 def test_holes_and_edges_do_not_change_the_noise():
@@ -102,14 +117,14 @@ def test_the_uncertainty_grows_with_the_square_of_the_depth():
     near = depths_of(found) < 15
     at_10, at_20 = np.median(per_ray[near]), np.median(per_ray[~near])
     assert at_20 == pytest.approx(4 * at_10, rel=0.05)
-    assert at_10 == pytest.approx(10**2 * 5e-4 * np.sqrt(2), rel=0.1)  # half of the variance is shared by neighbours
+    assert at_10 == pytest.approx(10**2 * 5e-4, rel=0.1)
 
 
 def test_a_slanted_ray_is_as_uncertain_as_it_is_long():
     depth = 1 / (0.1 + np.random.default_rng(4).normal(0, 1e-3, (60, 80)))
     found = points_in(depth, replace(ALL, floor_m=0.0))
     length = np.linalg.norm(found.xyz, axis=1)
-    np.testing.assert_allclose(found.sigma / (length * depths_of(found)), 1e-3 * np.sqrt(2), rtol=0.1)
+    np.testing.assert_allclose(found.sigma / (length * depths_of(found)), 1e-3, rtol=0.1)
 
 
 def test_blocks_on_an_edge_are_left_out():
@@ -207,11 +222,11 @@ def test_depth_of_another_size_and_the_same_aspect_gives_the_same_points(factor)
 
 
 def test_the_noise_may_be_given_and_is_then_not_read_off_the_picture():
-    """A faultless wall 10 m ahead, told to be noisy: 10^2 * 1e-3 * sqrt(2) m along the straight ray."""
+    """A faultless wall 10 m ahead, told to be noisy: 10^2 * 1e-3 m along the straight ray."""
     depth = np.full((60, 80), 10.0)
     found = points_in(depth, replace(ALL, floor_m=0.0), noise=1e-3)
     straight = np.argmax(found.ray @ R_BODY_OPTICAL[:, 2])
-    assert found.sigma[straight] == pytest.approx(0.1 * np.sqrt(2), rel=1e-3)
+    assert found.sigma[straight] == pytest.approx(0.1, rel=1e-3)
     assert points_in(depth, replace(ALL, floor_m=0.0)).sigma.max() < 1e-3
 
 

@@ -8,7 +8,15 @@ import faiss
 import numpy as np
 import pytest
 
-from service.errors import DecodeError, ImageSizeError, RequestError, TooLargeError, UnknownMapError
+from service.errors import (
+    BundleError,
+    DecodeError,
+    ImageSizeError,
+    NotReadyError,
+    RequestError,
+    TooLargeError,
+    UnknownMapError,
+)
 from service.geometry.camera import PinholeCamera
 from service.localization.prior import Prior
 from service.maps.reader import MapBundle
@@ -92,8 +100,8 @@ def test_a_prior_in_degrees_tells_two_streets_apart_like_one_in_metres(
     known = (replace(encoded, prior=Prior(position_m=np.array([20.0, y]), position_std_m=10.0)),
              replace(encoded, prior=Prior(position_std_m=10.0), prior_wgs84=earth.to_earth(np.array([20.0, y, 0.0]))[:2]))  # fmt: skip
     in_metres, in_degrees = (twins.localize(each).answer for each in known)
-    np.testing.assert_allclose(in_metres.T_map_camera[:2, 3], [20, y], atol=0.3)
-    np.testing.assert_allclose(in_degrees.T_map_camera, in_metres.T_map_camera, atol=1e-6)
+    np.testing.assert_allclose(in_metres.T_map_camera_guess[:2, 3], [20, y], atol=0.3)
+    np.testing.assert_allclose(in_degrees.T_map_camera_guess, in_metres.T_map_camera_guess, atol=1e-6)
 
 
 def test_a_prior_in_degrees_keeps_what_else_is_known(twins: Engine, encoded: EncodedQuery) -> None:
@@ -128,4 +136,46 @@ def test_the_services_rate_of_false_accepts_holds_where_a_query_names_none(
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     engine = Engine.open(Settings(maps=(tmp_path / "m",), threads=1, false_accept_rate=of_service))
     assert engine.localize(replace(encoded, false_accept_rate=of_query)).answer.status == status
+    engine.close()
+
+
+@pytest.mark.parametrize("name", [None, "tiny"])
+def test_an_empty_maps_folder_is_a_service_that_is_not_ready(
+    tmp_path: Path, encoded: EncodedQuery, content_of: Callable[..., Any], name: str | None
+) -> None:
+    (tmp_path / "maps").mkdir()
+    engine = Engine.open(Settings(maps=(tmp_path / "maps",), threads=1))
+    assert not engine.is_ready
+    with pytest.raises(NotReadyError, match="no map is mounted"):
+        engine.localize(replace(encoded, map_name=name))
+    write_bundle(tmp_path / "maps" / "m", content_of())
+    engine.watcher.scan()
+    assert engine.is_ready
+    assert engine.localize(replace(encoded, map_name=name)).bundle.name == "tiny"
+    engine.close()
+
+
+def test_a_map_that_would_refuse_every_request_is_not_mounted(
+    content_of: Callable[..., Any], calibration_json: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Its calibration promises one false accept in a thousand, and the service's setting wants fewer."""
+    write_bundle(tmp_path / "calibrated", content_of(name="calibrated", calibration=calibration_json()))
+    asked = "false_accept_rate is 0.0005, less than the 0.001 .* set STREETFIX_FALSE_ACCEPT_RATE to 0.001 or more"
+    with pytest.raises(BundleError, match=asked) as error:
+        Engine.open(Settings(maps=(tmp_path,), threads=1, false_accept_rate=0.0005))
+    assert error.value.field == "false_accept_rate"
+    write_bundle(tmp_path / "uncalibrated", content_of())
+    engine = Engine.open(Settings(maps=(tmp_path,), threads=1, false_accept_rate=0.0005))
+    assert [each.bundle.name for each in engine.registry] == ["tiny"]
+    assert [each.bundle for each in engine.registry.refused] == ["calibrated"]
+    engine.close()
+
+
+def test_a_map_that_promises_less_than_the_default_is_mounted_if_the_setting_fits(
+    content_of: Callable[..., Any], calibration_json: Callable[..., Any], tmp_path: Path
+) -> None:
+    thresholds = [{"false_accept_rate": 0.1, "confidence": 0.9}]
+    write_bundle(tmp_path / "m", content_of(calibration=calibration_json(thresholds=thresholds)))
+    engine = Engine.open(Settings(maps=(tmp_path / "m",), threads=1, false_accept_rate=0.1))
+    assert engine.is_ready
     engine.close()

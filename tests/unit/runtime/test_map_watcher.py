@@ -9,6 +9,7 @@ import pytest
 from service.errors import BundleError
 from service.localization.localizer import Localizer
 from service.maps.content import BundleContent
+from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.runtime.map_registry import MapRegistry
 from service.runtime.map_watcher import MapWatcher, stamp_of
@@ -142,7 +143,7 @@ def test_whatever_a_bundle_does_others_are_mounted(watched: Watched) -> None:
     watched.write("a", seed=1, name="a")
     watched.write("b", seed=1, name="b")
     told = watcher.scan()
-    assert "is not mounted" in told[0]
+    assert any("is not mounted: " in each and "ZeroDivisionError" in each for each in told)
     assert watched.serving("b") == "b"
 
 
@@ -186,3 +187,213 @@ def test_a_folder_that_vanishes_while_it_is_looked_at_does_no_harm(
 
     monkeypatch.setattr(os, "scandir", scandir)
     assert stamp_of(bundle_copy) == tuple(each for each in whole if not each[0].startswith("cloud/"))
+
+
+def started(*paths: Path, strict: bool = False, warm: Callable[[Localizer], None] = lambda _: None) -> MapRegistry:
+    """What a service that was started on these folders has mounted."""
+    registry = MapRegistry()
+    MapWatcher(registry, paths, warm=warm).open_first(strict=strict)
+    return registry
+
+
+def damage(bundle: Path) -> None:
+    content = bytearray((bundle / "places.npy").read_bytes())
+    content[-1] ^= 1
+    (bundle / "places.npy").write_bytes(content)
+
+
+def test_a_start_warms_and_mounts_what_is_there(watched: Watched) -> None:
+    warmed: list[str] = []
+    registry = started(watched.folder, warm=lambda localizer: warmed.append(localizer.bundle.path.name))
+    assert [each.bundle.path.name for each in registry] == warmed == ["first"]
+    assert registry.refused == ()
+
+
+def test_a_start_passes_over_damaged_bundles_and_says_so(
+    watched: Watched, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    watched.write("bad", seed=1, name="west")
+    damage(watched.folder / "bad")
+    registry = started(watched.folder, tmp_path / "nowhere")
+    assert [each.bundle.name for each in registry] == ["tiny"]
+    assert [each.bundle for each in registry.refused] == ["bad", "nowhere"]
+    assert registry.refused[0].reason.startswith("bad/places.npy: its content is not what the manifest says")
+    assert registry.refused[1].reason.startswith("nowhere: there is no such folder")
+    assert not any(str(tmp_path) in each.reason for each in registry.refused)
+    assert f"map_refused path={watched.folder / 'bad'}" in caplog.text
+
+
+def test_a_start_fails_if_there_are_bundles_and_none_can_be_mounted(watched: Watched, tmp_path: Path) -> None:
+    damage(watched.folder / "first")
+    with pytest.raises(BundleError, match=r"first/places\.npy: its content"):
+        started(watched.folder)
+    with pytest.raises(BundleError, match="nowhere: there is no such folder"):
+        started(tmp_path / "nowhere")
+    (tmp_path / "copied").mkdir()
+    (tmp_path / "copied" / "places.npy").touch()
+    with pytest.raises(BundleError, match=r"copied: there is no manifest\.json"):
+        started(tmp_path / "copied")
+
+
+def test_a_start_without_any_bundle_waits_for_one(tmp_path: Path, content_of: Content) -> None:
+    """A fresh volume, as a container gets it: empty but for a folder that only root may look into."""
+    folder = tmp_path / "volume"
+    (folder / "lost+found").mkdir(parents=True, mode=0)
+    (folder / ".hidden").mkdir()
+    registry = MapRegistry()
+    watcher = MapWatcher(registry, [folder], warm=lambda _: None)
+    watcher.open_first()
+    assert (len(registry), registry.refused) == (0, ())
+    write_bundle(folder / "site", content_of())
+    assert watcher.scan()[0].startswith("mounted tiny")
+    assert len(registry) == 1
+
+
+def test_a_folder_that_may_not_be_read_is_passed_over(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As lost+found is for everybody but root, who runs these tests at times."""
+    real = Path.exists
+
+    def exists(path: Path, **options: bool) -> bool:
+        if path.parent.name == "lost+found":
+            raise PermissionError(13, "Permission denied")
+        return real(path, **options)
+
+    (watched.folder / "lost+found").mkdir()
+    monkeypatch.setattr(Path, "exists", exists)
+    assert len(started(watched.folder)) == 1
+
+
+def test_a_strict_start_wants_all_bundles_whole_and_at_least_one(watched: Watched, tmp_path: Path) -> None:
+    assert len(started(watched.folder, strict=True)) == 1
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BundleError, match=r"there is no map bundle in .*empty"):
+        started(tmp_path / "empty", strict=True)
+    shutil.copytree(watched.folder / "first", watched.folder / "twin")
+    with pytest.raises(BundleError, match="both version"):
+        started(watched.folder, strict=True)
+    assert len(started(watched.folder)) == 1
+    shutil.rmtree(watched.folder / "twin")
+    watched.write("bad", seed=1, name="west")
+    damage(watched.folder / "bad")
+    with pytest.raises(BundleError, match=r"places\.npy"):
+        started(watched.folder, strict=True)
+
+
+def test_only_the_newest_three_versions_are_opened(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for seed in range(1, 5):
+        watched.write(f"v{seed}", seed=seed)
+    opened: list[str] = []
+    real = MapBundle.open
+    monkeypatch.setattr(MapBundle, "open", lambda path: opened.append(path.name) or real(path))
+    registry = MapRegistry()
+    watcher = MapWatcher(registry, [watched.folder], warm=watched.warm)
+    with caplog.at_level("INFO"):
+        watcher.open_first()
+    assert opened == [each.bundle.path.name for each in registry.versions("tiny")] == ["v4", "v3", "v2"]
+    assert caplog.text.count("map_mounted") == len(watched.warmed) == 3
+    assert watcher.scan() == []
+    shutil.rmtree(watched.folder / "v3")
+    told = watcher.scan(drop_missing=True)
+    assert [each.split()[0] for each in told] == ["unmounted", "mounted"]  # there is room for an older one
+    assert [each.bundle.path.name for each in registry.versions("tiny")] == ["v4", "v2", "v1"]
+
+
+def test_an_older_one_is_opened_in_place_of_a_newer_one_that_is_damaged(watched: Watched) -> None:
+    for seed in range(1, 5):
+        watched.write(f"v{seed}", seed=seed)
+    damage(watched.folder / "v3")
+    registry = started(watched.folder)
+    assert [each.bundle.path.name for each in registry.versions("tiny")] == ["v4", "v2", "v1"]
+    assert [each.bundle for each in registry.refused] == ["v3"]
+
+
+def test_what_was_refused_is_reported_until_it_is_whole_or_gone(watched: Watched) -> None:
+    for name in ("mended", "removed"):
+        watched.write(name, seed=1, name=name)
+        damage(watched.folder / name)
+    watched.watcher.scan()
+    assert [each.bundle for each in watched.registry.refused] == ["mended", "removed"]
+    shutil.rmtree(watched.folder / "mended")
+    watched.write("mended", seed=1, name="mended")
+    shutil.rmtree(watched.folder / "removed")
+    watched.watcher.scan()
+    assert watched.registry.refused == ()
+
+
+def test_an_explicit_look_tries_again_what_was_refused_though_its_files_are_the_same(watched: Watched) -> None:
+    failing = [True]
+
+    def warm(_: Localizer) -> None:
+        if failing:
+            raise MemoryError
+
+    watcher = MapWatcher(watched.registry, [watched.folder], warm=warm)
+    watched.write("second", seed=1)
+    assert "MemoryError" in watcher.scan()[0]
+    failing.clear()
+    assert watcher.scan() == []
+    assert watcher.scan(drop_missing=True)[0].startswith("mounted")
+
+
+def test_a_version_whose_folder_went_can_be_rolled_back_to_and_still_tells_its_streets(watched: Watched) -> None:
+    old = watched.registry.get("tiny")
+    watched.write("second", seed=1)
+    watched.watcher.scan()
+    shutil.rmtree(watched.folder / "first")
+    watched.watcher.scan()
+    assert watched.registry.serve("tiny", old.bundle.manifest.version) is old
+    watched.watcher.scan()
+    assert watched.registry.get("tiny") is old
+    assert b"FeatureCollection" in old.bundle.streets_geojson()
+
+
+def test_several_that_are_gone_go_at_once(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the second would serve for a moment."""
+    for seed in (1, 2):
+        watched.write(f"v{seed}", seed=seed)
+    watched.watcher.scan()
+    for seed in (1, 2):
+        shutil.rmtree(watched.folder / f"v{seed}")
+    served: list[str] = []
+    real = watched.registry.table._change
+    monkeypatch.setattr(
+        watched.registry.table, "_change", lambda change: (real(change), served.append(watched.serving()))
+    )
+    watched.watcher.scan(drop_missing=True)
+    assert set(served) == {"first"}
+
+
+def test_a_folder_that_cannot_be_read_for_the_moment_loses_nothing(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def iterdir(path: Path) -> object:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    assert watched.watcher.scan(drop_missing=True) == []
+    assert watched.serving() == "first"
+    assert "Input/output error" in watched.registry.refused[0].reason
+    monkeypatch.undo()
+    watched.watcher.scan()
+    assert watched.registry.refused == ()
+
+
+def test_a_hangup_that_comes_just_after_a_look_is_not_lost(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The event is set between the end of a wait and whatever follows."""
+    watcher = watched.watcher
+    looks: list[bool] = []
+    real = watcher._told.wait
+
+    def wait(timeout: float | None = None) -> bool:
+        told = real(0.0)
+        if not looks:
+            watcher.look_now()
+        return told
+
+    monkeypatch.setattr(watcher._told, "wait", wait)
+    monkeypatch.setattr(watcher, "scan", lambda *, drop_missing=False: looks.append(drop_missing) or [])
+    watcher.start(0.0)
+    _until(lambda: True in looks)
+    watcher.stop()

@@ -11,6 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from service.contract.convert import parsed, query_from
 from service.contract.schema import LocalizeRequest
 from service.runtime.engine import Engine
+from service.runtime.map_registry import Refused
 from service.runtime.settings import Settings
 
 Parts = Callable[..., dict[str, bytes]]
@@ -91,3 +92,13 @@ def test_the_maps_and_the_process_are_named(engine: Engine) -> None:
     manifest = localizer.bundle.manifest
     assert found["streetfix_map", (("map", "tiny"), ("version", manifest.version))] == manifest.counts.places
     assert found["process_resident_memory_bytes", ()] > 1e7
+
+
+def test_bundles_that_are_not_mounted_are_counted_and_the_first_are_named(engine: Engine) -> None:
+    assert values(engine)["streetfix_bundles_refused", ()] == 0
+    engine.registry.refused = tuple(Refused(f"m{number:02}" + 300 * "x", "damaged") for number in range(25))
+    found = values(engine)
+    assert found["streetfix_bundles_refused", ()] == 25
+    named = [dict(labels)["bundle"] for name, labels in found if name == "streetfix_bundle_refused"]
+    assert (len(named), max(map(len, named))) == (20, 200)
+    engine.registry.refused = ()

@@ -1,11 +1,13 @@
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from service.errors import RequestError
 from service.runtime.environment import require_known, setting_names
-from service.runtime.settings import Settings, load_settings
+from service.runtime.settings import Limits, Settings, load_settings
 
 
 def test_the_service_binds_to_loopback_unless_told_otherwise() -> None:
@@ -166,3 +168,17 @@ def test_an_allowed_host_that_is_no_name_is_refused(monkeypatch: pytest.MonkeyPa
 def test_allowed_hosts_are_joined_by_commas(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STREETFIX_ALLOWED_HOSTS", "Maps.example, *.robots.example,")
     assert load_settings().allowed_hosts == ("maps.example", "*.robots.example")
+
+
+def test_every_number_has_a_least_and_a_most() -> None:
+    """An endless timeout, or a limit that gRPC's 32 bits do not hold, would fail at the first request."""
+
+    def bounds_of(model: type[BaseModel]) -> Iterator[tuple[str, set[str]]]:
+        for name, field in model.model_fields.items():
+            kinds = {field.annotation, *get_args(field.annotation)}
+            if bool not in kinds and kinds & {int, float}:
+                yield name, {key for each in field.metadata for key in ("ge", "gt", "le", "lt") if hasattr(each, key)}
+
+    found = dict([*bounds_of(Settings), *bounds_of(Limits)])
+    assert len(found) > 15
+    assert [name for name, bounds in found.items() if not (bounds & {"ge", "gt"} and bounds & {"le", "lt"})] == []

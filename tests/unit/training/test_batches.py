@@ -3,8 +3,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training.batches import PAIR_REACH_M, City  # noqa: E402  # after the skip
+from model_training.training.batches import PAIR_REACH_M, City, open_cities  # noqa: E402  # after the skip
 from model_training.training.packs import Pack  # noqa: E402
+from service.errors import DatasetError  # noqa: E402
 
 TURN_DEG = 9.0
 
@@ -89,3 +90,32 @@ def test_queries_without_a_place_nearby_are_never_drawn(pack_of, grid, tmp_path)
     city = City(Pack.open(folder), grid, turn_deg=TURN_DEG)
     assert city.usable.tolist() == list(range(30, 60))
     assert float(draw(city, pairs=12).query_xy.max()) < 1000
+
+
+def test_a_pack_with_too_few_usable_queries_is_refused_before_training(pack_of, tmp_path, grid):
+    """NumPy's own error said "Cannot take a larger sample than population"."""
+    folder = pack_of(tmp_path / "few", places=20)
+    queries = np.load(folder / "queries.npy")
+    queries[:5, 0] += 1000.0  # near no place
+    np.save(folder / "queries.npy", queries)
+    with pytest.raises(
+        DatasetError, match=r"15 of its 20 queries lie within 2\.5 m of a place, and a batch takes 16 pairs"
+    ) as error:
+        open_cities([folder], grid, turn_deg=TURN_DEG, pairs=16)
+    assert (error.value.field, "--pairs 15" in error.value.message, str(folder) in error.value.message) == (
+        "pairs",
+        True,
+        True,
+    )
+    (city,) = open_cities([folder], grid, turn_deg=TURN_DEG, pairs=15)
+    assert len(city.draw(15, np.random.default_rng(0)).pairs) == 15
+
+
+@pytest.mark.parametrize("damage", ["gone", "empty", "cut off"])
+def test_a_damaged_pack_is_named_with_the_remedy(pack_of, tmp_path, grid, damage):
+    folder = pack_of(tmp_path / "pack", places=20)
+    path = folder / "ranges.npy"
+    content = path.read_bytes()
+    path.unlink() if damage == "gone" else path.write_bytes(b"" if damage == "empty" else content[: len(content) // 2])
+    with pytest.raises(DatasetError, match=r"ranges\.npy: it is"):
+        open_cities([folder], grid, turn_deg=TURN_DEG, pairs=4)

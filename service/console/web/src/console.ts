@@ -54,7 +54,7 @@ export class ConsolePage {
       served: () => { void this.#look(); },
       coverage: (shows) => { void this.#showCoverage(shows); },
     });
-    this.#live = new LivePanel(this.#service, (answer) => { this.#map.showAt(answer.position.x, answer.position.y); });
+    this.#live = new LivePanel(this.#service, (position) => { this.#map.showAt(position.x, position.y); });
     this.#tabs = new Tabs([
       { name: 'Ask', content: this.#ask.element },
       { name: 'Maps', content: this.#maps.element },

@@ -20,6 +20,8 @@ export interface Pose {
 export type Status = 'LOCALIZED' | 'AMBIGUOUS' | 'OUT_OF_MAP';
 
 export interface Hypothesis {
+  /** Only the first hypothesis of a LOCALIZED answer is. */
+  confirmed: boolean;
   pose: Pose;
   share: number;
   inliers: number;
@@ -39,12 +41,23 @@ export interface MapVersion {
   version: string;
 }
 
+/** Where the camera may be: over all hypotheses and the rest of the map. It is not a pose. */
+export interface Spread {
+  mean: Vector;
+  /** 3 x 3, row by row. */
+  covariance: number[];
+  heading_std_deg: number;
+  hypotheses_weight: number;
+}
+
+/** Street and pose are null unless the answer is LOCALIZED, the spread is null if it is. */
 export interface Answer {
   status: Status;
   confidence: number | null;
   street: { id: string; name: string; vote: number } | null;
-  pose: Pose;
+  pose: Pose | null;
   hypotheses: Hypothesis[];
+  spread: Spread | null;
   neighbours: Neighbour[];
   map: MapVersion;
   timings_ms: { decode: number; fuse: number; encode: number; search: number; register: number; total: number };
@@ -119,8 +132,8 @@ export interface LastAnswer {
   status: Status;
   confidence: number | null;
   street: string | null;
-  position: Vector;
-  heading_deg: number;
+  position: Vector | null;
+  heading_deg: number | null;
   frames: number;
   total_ms: number;
 }

@@ -1,5 +1,5 @@
 // The answer in words and numbers, and what led to it.
-import type { Answer, Explanation, Truth } from '../contract';
+import type { Answer, Explanation, Pose, Truth } from '../contract';
 import { element, facts } from '../element';
 import { ellipseOf } from '../map/ellipse';
 import { degrees, metres, milliseconds, percent } from '../numbers';
@@ -14,8 +14,8 @@ const STATUS_TEXT = {
 } as const;
 const STATUS_MEANING = {
   LOCALIZED: 'Act on it.',
-  AMBIGUOUS: 'In the map, but not sure where: look at the hypotheses. A prior or more frames decide.',
-  OUT_OF_MAP: 'The map does not show what the pictures do.',
+  AMBIGUOUS: 'In the map, but not sure where: there is no pose. Look at the hypotheses; a prior or more frames decide.',
+  OUT_OF_MAP: 'The map does not show what the pictures do. There is no pose; do not use the hypotheses as one.',
 } as const;
 /** What confidence promises: a position within this of the true one. */
 const WRONG_M = 1;
@@ -41,8 +41,8 @@ export class AnswerPanel {
     this.#pictures.show(rgb, explanation);
     this.element.replaceChildren(
       this.#head(answer, truth),
-      this.#pose(answer),
-      answer.hypotheses.length > 1 ? this.#hypotheses(answer) : '',
+      answer.pose === null ? this.#spread(answer) : this.#pose(answer, answer.pose),
+      answer.hypotheses.length > (answer.pose === null ? 0 : 1) ? this.#hypotheses(answer) : '',
       element('section', {}, element('h2', {}, 'What the machine saw'), this.#pictures.element),
       this.#neighbours(answer),
       this.#times(answer, elapsedMs),
@@ -71,7 +71,7 @@ export class AnswerPanel {
       'div',
       { class: `verdict ${answer.status.toLowerCase()}` },
       element('p', { class: 'status' }, STATUS_TEXT[answer.status]),
-      element('p', { class: 'street' }, answer.street?.name ?? 'in no street'),
+      element('p', { class: 'street' }, answer.pose === null ? 'no pose' : (answer.street?.name ?? 'in no street')),
       element('p', { class: 'meaning' }, STATUS_MEANING[answer.status]),
       element(
         'div',
@@ -82,8 +82,20 @@ export class AnswerPanel {
     );
   }
 
-  #pose(answer: Answer): HTMLElement {
-    const { position, heading_deg, covariance } = answer.pose;
+  #spread(answer: Answer): HTMLElement {
+    const rows: [string, string][] = [];
+    if (answer.spread !== null) {
+      const ellipse = ellipseOf(answer.spread.covariance);
+      rows.push(['σ on the ground', `${metres(ellipse.major)} × ${metres(ellipse.minor)}`]);
+      rows.push(['σ heading', degrees(answer.spread.heading_std_deg)]);
+      rows.push(['in one of the hypotheses', percent(answer.spread.hypotheses_weight)]);
+    }
+    rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
+    return element('section', {}, element('h2', {}, 'Where it may be'), facts(rows));
+  }
+
+  #pose(answer: Answer, pose: Pose): HTMLElement {
+    const { position, heading_deg, covariance } = pose;
     const rows: [string, string][] = [
       ['x, y, z', `${position.x.toFixed(2)}, ${position.y.toFixed(2)}, ${position.z.toFixed(2)} m`],
       ['heading', degrees(heading_deg)],
@@ -101,7 +113,7 @@ export class AnswerPanel {
     return element(
       'section',
       {},
-      element('h2', {}, 'Hypotheses'),
+      element('h2', {}, answer.pose === null ? 'Hypotheses, not confirmed' : 'Hypotheses'),
       table(
         ['', 'support', 'on the map', 'x, y', 'heading'],
         answer.hypotheses.map((each, k) => [
@@ -116,18 +128,19 @@ export class AnswerPanel {
   }
 
   #neighbours(answer: Answer): HTMLElement {
+    const { pose } = answer;
     return element(
       'section',
       {},
       element('h2', {}, 'Most similar places'),
       table(
-        ['', 'place', 'similarity', 'street', 'away'],
+        ['', 'place', 'similarity', 'street', ...(pose === null ? [] : ['away'])],
         answer.neighbours.map((each, k) => [
           `n${k + 1}`,
           `${each.place}`,
           each.similarity.toFixed(3),
           each.street ?? '–',
-          metres(Math.hypot(each.position.x - answer.pose.position.x, each.position.y - answer.pose.position.y), 1),
+          ...(pose === null ? [] : [metres(Math.hypot(each.position.x - pose.position.x, each.position.y - pose.position.y), 1)]),
         ]),
       ),
     );

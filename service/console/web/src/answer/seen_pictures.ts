@@ -20,12 +20,12 @@ export class SeenPictures {
       ),
       this.#figure('Fused 2.5D image: what is encoded', this.#png(fused), 'Range in place of intensity, colour kept', 'cells'),
       view === null ? '' : this.#figure('LiDAR view it matched (place n1)', this.#png(view), 'The map seen from the most similar place', 'cells'),
-      mapDepth === null ? '' : this.#overlay(depth, mapDepth),
+      mapDepth === null ? '' : this.#overlay(depth, mapDepth, explanation.answer.pose === null ? 'the best guess, not confirmed' : 'the answer'),
     );
   }
 
-  #overlay(depth: string, mapDepth: string): HTMLElement {
-    const over = element('img', { src: this.#png(mapDepth), alt: 'The map’s depth, drawn at the answered pose', class: 'over' });
+  #overlay(depth: string, mapDepth: string, where: string): HTMLElement {
+    const over = element('img', { src: this.#png(mapDepth), alt: `The map’s depth, drawn at ${where}`, class: 'over' });
     const slider = element('input', { type: 'range', min: '0', max: '100', value: '50', 'aria-label': 'How much of the map’s depth lies over the query’s' });
     const place = (): void => {
       over.style.clipPath = `inset(0 0 0 ${slider.value}%)`;
@@ -38,7 +38,7 @@ export class SeenPictures {
       'figure',
       { class: 'compare' },
       element('div', { class: 'stack' }, element('img', { src: this.#png(depth), alt: 'The query’s depth' }), over, line, slider),
-      element('figcaption', {}, element('span', {}, '◂ query’s depth'), element('span', {}, 'map’s depth at the answer ▸')),
+      element('figcaption', {}, element('span', {}, '◂ query’s depth'), element('span', {}, `map’s depth at ${where} ▸`)),
     );
   }
 

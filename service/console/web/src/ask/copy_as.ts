@@ -29,7 +29,9 @@ export function asPython(question: Question, request: LocalizeRequest, base: URL
     '    )',
     'response.raise_for_status()',
     'answer = response.json()',
-    'print(answer["status"], answer["confidence"], answer["pose"]["position"])',
+    'print(answer["status"], answer["confidence"])',
+    'if answer["status"] == "LOCALIZED":  # else there is no pose',
+    '    print(answer["pose"]["position"])',
   ];
   return lines.join('\n') + '\n';
 }

@@ -32,8 +32,9 @@ export interface ErrorOfAnswer {
   degrees: number | null;
 }
 
-/** On the ground, and of the heading. */
-export function errorOf(answer: Answer, truth: Truth): ErrorOfAnswer {
+/** On the ground, and of the heading; null without a pose. */
+export function errorOf(answer: Answer, truth: Truth): ErrorOfAnswer | null {
+  if (answer.pose === null) return null;
   const { position, heading_deg } = answer.pose;
   const turn = truth.heading_deg === null ? null : Math.abs(((heading_deg - truth.heading_deg + 540) % 360) - 180);
   return { metres: Math.hypot(position.x - truth.position.x, position.y - truth.position.y), degrees: turn };

@@ -1,7 +1,7 @@
-// What was answered: the pose with its covariance and field of view, what it was found by, and what it might have been.
+// What was answered: the pose with its covariance and field of view, or where the camera may be; and the places it was found by.
 import type { Answer, Camera, Pose, Truth, Vector } from '../contract';
 import { ellipseOf } from './ellipse';
-import type { Overlay, Point } from './overlay';
+import type { Ink, Overlay, Point } from './overlay';
 import type { Palette } from './palette';
 
 const VIEW_M = 18;
@@ -26,12 +26,16 @@ export class AnswerLayer {
       const at = overlay.at(neighbour.position.x, neighbour.position.y, neighbour.position.z);
       if (at !== null) overlay.dot(at, 5, { line: palette.neighbour, fill: palette.halo, width: 2 });
     });
-    this.#drawOthers(overlay, palette, answer, colour);
-    this.#drawView(overlay, answer.pose, camera, colour, palette);
-    if (answer.pose.covariance !== null) this.#drawEllipse(overlay, answer.pose, colour, palette, metrePx);
+    this.#drawUnconfirmed(overlay, palette, answer, colour);
+    if (answer.spread !== null) this.#drawEllipse(overlay, answer.spread.mean, answer.spread.covariance, { line: colour, width: 2, dash: [6, 6] }, metrePx);
+    if (answer.pose !== null) {
+      this.#drawView(overlay, answer.pose, camera, colour, palette);
+      const ink = { line: colour, fill: palette.answerFill, width: 2 };
+      if (answer.pose.covariance !== null) this.#drawEllipse(overlay, answer.pose.position, answer.pose.covariance, ink, metrePx);
+    }
     if (truth !== null) drawCross(overlay, truth.position, palette);
-    const at = positionOn(overlay, answer.pose);
-    if (at !== null) {
+    const at = answer.pose === null ? null : positionOn(overlay, answer.pose);
+    if (answer.pose !== null && at !== null) {
       overlay.dot(at, 7, { line: palette.halo, fill: colour, width: 2.5 });
       drawArrow(overlay, answer.pose, at, colour, palette);
     }
@@ -40,14 +44,14 @@ export class AnswerLayer {
   drawNames(overlay: Overlay, palette: Palette): void {
     if (this.shown === null) return;
     const { answer, truth } = this.shown;
-    const at = positionOn(overlay, answer.pose);
     const colour = colourOf(answer, palette);
-    const name = answer.hypotheses.length > 1 && answer.status === 'AMBIGUOUS' ? '1st' : 'answer';
-    if (at !== null) overlay.label(name, [at[0], at[1] + 20], colour, palette.halo, true);
-    if (answer.status === 'AMBIGUOUS') {
-      answer.hypotheses.slice(1).forEach((hypothesis, k) => {
+    if (answer.pose !== null) {
+      const at = positionOn(overlay, answer.pose);
+      if (at !== null) overlay.label('answer', [at[0], at[1] + 20], colour, palette.halo, true);
+    } else {
+      answer.hypotheses.forEach((hypothesis, k) => {
         const there = positionOn(overlay, hypothesis.pose);
-        if (there !== null) overlay.label(ordinal(k + 2), [there[0], there[1] + 20], colour, palette.halo, true);
+        if (there !== null) overlay.label(`${ordinal(k + 1)}?`, [there[0], there[1] + 20], colour, palette.halo, true);
       });
     }
     if (truth !== null) {
@@ -60,8 +64,8 @@ export class AnswerLayer {
     });
   }
 
-  #drawOthers(overlay: Overlay, palette: Palette, answer: Answer, colour: string): void {
-    for (const hypothesis of answer.hypotheses.slice(1)) {
+  #drawUnconfirmed(overlay: Overlay, palette: Palette, answer: Answer, colour: string): void {
+    for (const hypothesis of answer.hypotheses.filter((each) => !each.confirmed)) {
       const at = positionOn(overlay, hypothesis.pose);
       if (at === null) continue;
       overlay.dot(at, 4 + 8 * Math.sqrt(hypothesis.share), { line: colour, fill: palette.halo, width: 2, dash: [3, 3] });
@@ -85,8 +89,8 @@ export class AnswerLayer {
     overlay.path(edge, { line: colour, fill: palette.answerFill, width: 1.2 }, true);
   }
 
-  #drawEllipse(overlay: Overlay, pose: Pose, colour: string, palette: Palette, metrePx: number): void {
-    const ellipse = ellipseOf(pose.covariance ?? []);
+  #drawEllipse(overlay: Overlay, middle: Vector, covariance: number[], ink: Ink, metrePx: number): void {
+    const ellipse = ellipseOf(covariance);
     if (SIGMAS_95 * ellipse.major * metrePx < SMALLEST_PX) return; // the mark covers it
     const edge: Vector[] = [];
     for (let k = 0; k < 48; k++) {
@@ -94,12 +98,12 @@ export class AnswerLayer {
       const along = SIGMAS_95 * ellipse.major * Math.cos(turn);
       const across = SIGMAS_95 * ellipse.minor * Math.sin(turn);
       edge.push({
-        x: pose.position.x + along * Math.cos(ellipse.angle) - across * Math.sin(ellipse.angle),
-        y: pose.position.y + along * Math.sin(ellipse.angle) + across * Math.cos(ellipse.angle),
-        z: pose.position.z,
+        x: middle.x + along * Math.cos(ellipse.angle) - across * Math.sin(ellipse.angle),
+        y: middle.y + along * Math.sin(ellipse.angle) + across * Math.cos(ellipse.angle),
+        z: middle.z,
       });
     }
-    overlay.path(edge, { line: colour, fill: palette.answerFill, width: 2 }, true);
+    overlay.path(edge, ink, true);
   }
 }
 
@@ -151,5 +155,5 @@ function drawCross(overlay: Overlay, position: Vector, palette: Palette): void {
 }
 
 function ordinal(k: number): string {
-  return `${k}${k === 2 ? 'nd' : k === 3 ? 'rd' : 'th'}`;
+  return `${k}${k === 1 ? 'st' : k === 2 ? 'nd' : k === 3 ? 'rd' : 'th'}`;
 }

@@ -1,4 +1,4 @@
-// The horizontal part of a 6 x 6 covariance as an ellipse.
+// The horizontal part of a covariance as an ellipse.
 
 export interface Ellipse {
   /** Standard deviations along the two axes, metres, the larger first. */
@@ -8,10 +8,10 @@ export interface Ellipse {
   angle: number;
 }
 
-/** Row by row, translation first, as the contract has it. */
+/** 6 x 6 or 3 x 3, row by row, translation first, as the contract has it. */
 export function ellipseOf(covariance: number[]): Ellipse {
   const [xx = 0, xy = 0] = covariance;
-  const yy = covariance[7] ?? 0;
+  const yy = covariance[Math.sqrt(covariance.length) + 1] ?? 0;
   const mean = (xx + yy) / 2;
   const spread = Math.hypot((xx - yy) / 2, xy);
   return {

@@ -136,11 +136,22 @@ export class MapView {
   showAnswer(shown: Shown, points: QueryPoints): void {
     this.#answer.shown = shown;
     this.#dropQuery();
-    this.#query = new QueryCloud(points, this.#frame, this.#renderer.getPixelRatio());
-    this.#scene.add(this.#query.object);
-    const poses = shown.answer.status === 'AMBIGUOUS' ? shown.answer.hypotheses.map((each) => each.pose) : [shown.answer.pose];
-    this.#look(poses.map((pose) => pose.position));
-    const { position, heading_deg } = shown.answer.pose;
+    const { pose, hypotheses, spread } = shown.answer;
+    if (pose !== null) {
+      // Points at a place that nothing confirms would look as if the pictures had been taken there.
+      this.#query = new QueryCloud(points, this.#frame, this.#renderer.getPixelRatio());
+      this.#scene.add(this.#query.object);
+    }
+    const poses = pose === null ? hypotheses.map((each) => each.pose) : [pose];
+    const positions = poses.map((each) => each.position);
+    if (positions.length === 0 && spread !== null) positions.push(spread.mean);
+    this.#look(positions);
+    const first = poses[0];
+    if (first === undefined) {
+      this.#moved();
+      return;
+    }
+    const { position, heading_deg } = first;
     const at = new Vector3(this.#frame.x(position.x), this.#frame.y(position.y), this.#frame.z(position.z));
     this.#cameras.follow(at, (heading_deg * Math.PI) / 180);
     this.#moved();

@@ -1,5 +1,5 @@
 // What the service does now: rates, and its last answers.
-import type { LastAnswer } from '../contract';
+import type { LastAnswer, Vector } from '../contract';
 import { button, element } from '../element';
 import { milliseconds, percent } from '../numbers';
 import { ServiceError, type Service } from '../service';
@@ -17,7 +17,7 @@ export class LivePanel {
   #looks: Look[] = [];
   #timer = 0;
 
-  constructor(readonly service: Service, readonly chosen: (answer: LastAnswer) => void) {
+  constructor(readonly service: Service, readonly chosen: (position: Vector) => void) {
     this.element.append(
       element('section', {}, element('h2', {}, 'Now'), this.#figures, this.#chart, element('p', { class: 'hint' }, 'answers a second, the last two minutes')),
       this.#told,
@@ -107,9 +107,11 @@ export class LivePanel {
     );
   }
 
-  /** Pressed, the map shows the place. */
-  #street(answer: LastAnswer): HTMLButtonElement {
+  /** Pressed, the map shows the place. An answer that is not localized has none. */
+  #street(answer: LastAnswer): HTMLElement {
+    const { position } = answer;
+    if (position === null) return element('span', {}, 'no pose');
     const street = answer.street ?? 'no street';
-    return button(street, () => { this.chosen(answer); }, { class: 'link', 'aria-label': `Show answer ${answer.number}, ${street}, on the map` });
+    return button(street, () => { this.chosen(position); }, { class: 'link', 'aria-label': `Show answer ${answer.number}, ${street}, on the map` });
   }
 }

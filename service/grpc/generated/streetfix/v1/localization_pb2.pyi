@@ -297,7 +297,7 @@ class Options(_message.Message):
     def __init__(self, neighbours: _Optional[int] = ..., refine: _Optional[bool] = ..., false_accept_rate: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses")
+    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread")
     STATUS_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     STREET_FIELD_NUMBER: _ClassVar[int]
@@ -308,6 +308,7 @@ class LocalizeResponse(_message.Message):
     MAP_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
+    SPREAD_FIELD_NUMBER: _ClassVar[int]
     status: LocalizationStatus
     confidence: float
     street: Street
@@ -318,19 +319,34 @@ class LocalizeResponse(_message.Message):
     map: MapVersion
     timings: Timings
     hypotheses: _containers.RepeatedCompositeFieldContainer[Hypothesis]
-    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ...) -> None: ...
+    spread: Spread
+    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ...) -> None: ...
+
+class Spread(_message.Message):
+    __slots__ = ("mean", "covariance", "heading_std_deg", "hypotheses_weight")
+    MEAN_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    HEADING_STD_DEG_FIELD_NUMBER: _ClassVar[int]
+    HYPOTHESES_WEIGHT_FIELD_NUMBER: _ClassVar[int]
+    mean: Vector3
+    covariance: _containers.RepeatedScalarFieldContainer[float]
+    heading_std_deg: float
+    hypotheses_weight: float
+    def __init__(self, mean: _Optional[_Union[Vector3, _Mapping]] = ..., covariance: _Optional[_Iterable[float]] = ..., heading_std_deg: _Optional[float] = ..., hypotheses_weight: _Optional[float] = ...) -> None: ...
 
 class Hypothesis(_message.Message):
-    __slots__ = ("pose", "share", "inliers", "similarity")
+    __slots__ = ("pose", "share", "inliers", "similarity", "confirmed")
     POSE_FIELD_NUMBER: _ClassVar[int]
     SHARE_FIELD_NUMBER: _ClassVar[int]
     INLIERS_FIELD_NUMBER: _ClassVar[int]
     SIMILARITY_FIELD_NUMBER: _ClassVar[int]
+    CONFIRMED_FIELD_NUMBER: _ClassVar[int]
     pose: Pose
     share: float
     inliers: float
     similarity: float
-    def __init__(self, pose: _Optional[_Union[Pose, _Mapping]] = ..., share: _Optional[float] = ..., inliers: _Optional[float] = ..., similarity: _Optional[float] = ...) -> None: ...
+    confirmed: bool
+    def __init__(self, pose: _Optional[_Union[Pose, _Mapping]] = ..., share: _Optional[float] = ..., inliers: _Optional[float] = ..., similarity: _Optional[float] = ..., confirmed: _Optional[bool] = ...) -> None: ...
 
 class Street(_message.Message):
     __slots__ = ("id", "name", "street", "section", "class_index", "vote")

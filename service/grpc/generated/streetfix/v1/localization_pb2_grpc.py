@@ -77,7 +77,7 @@ class LocalizationServiceServicer:
     """
 
     def Localize(self, request, context):
-        """Localizes one pair of pictures. An answer that is not LOCALIZED is still an answer.
+        """Localizes one pair of pictures. An answer that is not LOCALIZED is still an answer, but it has no pose.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

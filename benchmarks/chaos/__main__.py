@@ -1,0 +1,87 @@
+"""``make chaos``: random operators, disks, clients and deaths against a running service -> reports/serving.json.
+
+Every step does one thing to a service of several workers: a signal, a worker killed, map versions that come, go, are damaged or half
+copied, a version chosen, slow and aborted connections, a full disk, other API keys. After it both faces must answer a known pair
+rightly, from the version that should serve, or refuse it with a clear error; and all workers must agree. Meanwhile others ask.
+
+The same seed does the same things again: --seed 7 --steps 120.
+"""
+
+import argparse
+import signal
+import sys
+import time
+from pathlib import Path
+
+from benchmarks.chaos.asking import Pair
+from benchmarks.chaos.disk import small_disk
+from benchmarks.chaos.run import Chaos, Findings
+from benchmarks.report import ROOT, Report
+from benchmarks.serving.__main__ import QUERIES, site_from
+from benchmarks.serving.ratios import Site
+
+STEPS = 1000
+
+
+def main() -> None:
+    """Parse, do the steps, write the report; leaves with 1 where anything was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument("--workers", type=int, default=3)
+    parser.add_argument("--stop", action="store_true", help="at the first wrong, lost or differing answer")
+    parser.add_argument("--no-report", action="store_true", help="leave reports/serving.json as it is")
+    parser.add_argument(
+        "--log", type=Path, default=ROOT / "out" / "chaos.log", help="what is done and what the service logs"
+    )
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate")
+    parser.add_argument("--map", type=Path, help="another bundle than the paper's city, with --dataset")
+    parser.add_argument("--dataset", type=Path)
+    parser.add_argument("--queries", default=QUERIES)
+    arguments = parser.parse_args()
+    site = site_from(arguments)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    print(f"seed {arguments.seed}, {arguments.steps} steps, {arguments.workers} workers, map {site.bundle}", flush=True)
+    told = " ".join(sys.argv[1:])
+    report = Report("serving", "make chaos" + (f' ARGS="{told}"' if told else ""))
+    report.keep_others()
+    began = time.monotonic()
+    size = sum(path.stat().st_size for path in site.bundle.rglob("*") if path.is_file())
+    arguments.log.parent.mkdir(parents=True, exist_ok=True)
+    with small_disk(int(8 * size / 2**20) + 64) as disk, arguments.log.open("w", buffering=1) as log:
+        chaos = Chaos(
+            disk, site.bundle, pair_of(site), seed=arguments.seed, workers=arguments.workers,
+            tell=lambda line: print(line, flush=True), log=lambda line: print(f"{time.strftime('%H:%M:%S')} {line}", file=log),
+        )  # fmt: skip
+        found = chaos.run(arguments.steps, stop_at_first=arguments.stop)
+    print(f"{found.steps} steps in {(time.monotonic() - began) / 60:.1f} minutes, seed {found.seed}", flush=True)
+    rows(report, found)
+    if not arguments.no_report:
+        print(f"written: {report.write()}", flush=True)
+    sys.exit(1 if found.wrong or found.disagreements else 0)
+
+
+def pair_of(site: Site) -> Pair:
+    """The first pair of the site's queries."""
+    return Pair(site.payloads(refine=True)[0], site.payloads(refine=False)[0])
+
+
+def rows(report: Report, found: Findings) -> None:
+    """What came of a run."""
+    report.row("chaos.steps", found.steps, "count", bar=STEPS, n=found.answers)
+    for name, told in (
+        ("chaos.wrong_or_lost_answers", found.wrong),
+        ("chaos.disagreements", found.disagreements),
+    ):
+        report.row(name, len(told), "count", bar=0, better="lower", n=found.answers,
+                   why=f"first: {told[0]}" if told else None)  # fmt: skip
+    report.row("chaos.refusals", sum(found.refusals.values()), "count", n=found.answers)
+    report.row("chaos.tracebacks", found.tracebacks, "count")
+    report.notes["chaos"] = {
+        "seed": found.seed, "disk": found.disk, "actions": dict(sorted(found.actions.items())),
+        "refusals": dict(found.refusals), "wrong": found.wrong[:20], "disagreements": found.disagreements[:20],
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Figures in documents that come from a report or from the code, not from somebody's memory.
+
+A document marks such a figure by comments, which Markdown does not show::
+
+    <!-- figure: serving full.answers_per_s .0f -->41<!-- /figure -->
+    <!-- figure: code false_accept_rate .0% -->2 %<!-- /figure -->
+
+The first word is a report or ``code``, the second a row's id or a name of ``CODE``, the third a format of Python's (a percentage gets
+its space). ``make reports`` writes the figures anew; a test fails where one is not up to date.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from benchmarks.provenance import ROOT
+from model_training.stock import CALIBRATION
+from service.localization.query import FALSE_ACCEPT_RATE
+from service.maps.calibration import Calibration, read_calibration
+
+REPORTS = ROOT / "reports"
+_FIGURE = re.compile(r"(<!-- figure: (\S+) (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
+
+
+def stock_calibration() -> Calibration:
+    """The calibration that comes with the stock encoder."""
+    calibration = read_calibration(CALIBRATION.read_bytes(), path=str(CALIBRATION))
+    if calibration is None:
+        raise ValueError(f"{CALIBRATION}: the stock encoder is not calibrated")
+    return calibration
+
+
+#: What documents may take from the code.
+CODE: dict[str, Callable[[], float]] = {
+    "false_accept_rate": lambda: FALSE_ACCEPT_RATE,
+    "least_false_accept_rate": lambda: stock_calibration().least_false_accept_rate,
+    "localized_from_confidence": lambda: stock_calibration().threshold(FALSE_ACCEPT_RATE),
+}
+
+
+def documents() -> list[Path]:
+    """README, the pages of ``docs``, and what else may hold figures."""
+    return [
+        ROOT / "README.md",
+        *sorted((ROOT / "docs").glob("*.md")),
+        ROOT / "model_training" / "stock" / "MODEL_CARD.md",
+    ]
+
+
+def figure(source: str, name: str, form: str) -> str:
+    """A figure as a document shows it.
+
+    Raises:
+        ValueError: there is no such report, row or name, or the row has no value.
+    """
+    if source == "code":
+        if name not in CODE:
+            raise ValueError(f"figure: {name}: no such figure of the code; there are {', '.join(CODE)}")
+        value: float | None = CODE[name]()
+    else:
+        path = REPORTS / f"{source}.json"
+        if not path.exists():
+            raise ValueError(f"figure: {source}: there is no such report; take one of reports/*.json, or code")
+        values = {row["id"]: row["value"] for row in json.loads(path.read_text())["rows"]}
+        if (value := values.get(name)) is None:
+            raise ValueError(f"figure: {source} {name}: the report has no such row, or no value in it")
+    shown = format(value, form)
+    return shown.replace("%", " %") if form.endswith("%") else shown
+
+
+def with_figures(text: str) -> str:
+    """A document with all its marked figures as they are now.
+
+    Raises:
+        ValueError: a figure's source is not there.
+    """
+    return _FIGURE.sub(lambda found: found[1] + figure(found[2], found[3], found[4]) + found[6], text)
+
+
+def without_figures(text: str) -> str:
+    """What is left of a document: the figures that somebody typed, and no others."""
+    return _FIGURE.sub("", text)
+
+
+def write_figures() -> list[Path]:
+    """Bring all documents up to date; which of them changed."""
+    changed = []
+    for page in documents():
+        text = page.read_text()
+        if (new := with_figures(text)) != text:
+            page.write_text(new)
+            changed.append(page)
+    return changed

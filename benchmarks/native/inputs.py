@@ -1,0 +1,277 @@
+"""Random inputs, ordinary and extreme, for every C function; prints a hash of what each returned.
+
+Run by ``python_in`` out of an unpacked wheel. Under sanitizers a bad access ends in a report; between the builds of two compilers the
+printed lines must be equal. Outputs that hold NaN are compared as NaN: which of its many bit patterns it is, no standard says.
+
+Example: python -m benchmarks.native.inputs --rounds 40
+"""
+
+import argparse
+import ctypes
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import StreetfixError
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z, transform_from
+from service.imaging import depth16
+from service.imaging.gather import gather
+from service.imaging.level import level_camera
+from service.imaging.view_grid import ViewGrid
+from service.registration.kernel import (
+    STATE,
+    SURFEL,
+    BeamModel,
+    QueryPoints,
+    SolverOptions,
+    agree,
+    align,
+    pulls,
+    render,
+)
+from service.registration.points import PointSettings, blocks_of, inverse_depth_noise, points_of
+from service.registration.rays import RayPicture, RaySettings, adjust
+from service.registration.register import Registered
+from service.registration.sight import Sights
+from service.registration.surfel_map import TILE_M, SurfelMap
+
+Floats = NDArray[np.float64]
+
+#: Height and width of pictures: one pixel, one row, one column, flat, small ones that no block size divides, and a usual one.
+SIZES = ((1, 1), (1, 7), (7, 1), (16, 2560), (48, 64), (61, 33), (240, 320))
+
+
+def camera_of(rng: np.random.Generator, height: int, width: int) -> PinholeCamera:
+    """Of a field of view from very narrow to very wide; its centre may lie outside the picture."""
+    focal = width * float(np.exp(rng.uniform(-2.5, 2.5)))
+    at = rng.uniform(-0.5, 1.5, 2) if rng.random() < 0.2 else rng.uniform(0.4, 0.6, 2)
+    return PinholeCamera(width, height, focal, focal * rng.uniform(0.8, 1.25), at[0] * width, at[1] * height)
+
+
+def depth_of(rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
+    """Ranges of a street, some without measurement; at times of no number, infinite, negative, huge or tiny."""
+    depth = rng.uniform(0.3, 45.0, (height, width)).astype(np.float32)
+    if rng.random() < 0.5:  # smooth, as surfaces are
+        depth = np.linspace(1, rng.uniform(2, 40), width, dtype=np.float32)[None] + 0.01 * depth
+        depth = np.array(np.broadcast_to(depth, (height, width)))
+    depth[rng.random((height, width)) < rng.choice([0.0, 0.3, 1.0], p=[0.5, 0.4, 0.1])] = 0
+    if rng.random() < 0.4:
+        for value in (np.nan, np.inf, -np.inf, -1.0, 1e38, 1e-38):
+            depth[rng.random((height, width)) < 0.03] = value
+    return depth
+
+
+def rotation_of(rng: np.random.Generator) -> Floats:
+    """Any rotation."""
+    a, b, c = rng.uniform(-np.pi, np.pi, 3)
+    return np.asarray(rotation_z(a) @ rotation_y(b) @ rotation_x(c))
+
+
+def street(rng: np.random.Generator) -> SurfelMap:
+    """A ground, two house fronts and a wall across, of a few thousand surfels; now and then of one."""
+    x, y, z = np.arange(-30, 30, 0.5), np.arange(-6, 6, 0.5), np.arange(0, 8, 0.5)
+    parts = [
+        (np.stack([g.ravel() for g in np.meshgrid(x, y, [0.0])], 1), (0, 0, 1)),
+        (np.stack([g.ravel() for g in np.meshgrid(x, [-6.0], z)], 1), (0, 1, 0)),
+        (np.stack([g.ravel() for g in np.meshgrid(x, [6.0], z)], 1), (0, -1, 0)),
+        (np.stack([g.ravel() for g in np.meshgrid([25.0], y, z)], 1), (-1, 0, 0)),
+    ]
+    surfels = np.zeros(sum(len(points) for points, _ in parts), SURFEL)
+    surfels["xyz"] = np.concatenate([points for points, _ in parts]) + rng.normal(0, 0.03, (len(surfels), 3))
+    normals = np.concatenate([np.tile(normal, (len(points), 1)) for points, normal in parts]) + rng.normal(
+        0, 0.05, (len(surfels), 3)
+    )
+    surfels["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    surfels["thickness_m"], surfels["points"] = rng.uniform(0, 0.1, len(surfels)), 5
+    if rng.random() < 0.1:
+        surfels = surfels[:1].copy()
+    tile = np.floor(surfels["xyz"][:, :2] / TILE_M)
+    order = np.lexsort(tile.T)
+    surfels, tile = surfels[order], tile[order]
+    keys, first, count = np.unique(tile, axis=0, return_index=True, return_counts=True)
+    tiles = np.column_stack([(keys + 0.5) * TILE_M, first, count]).astype(np.float64)
+    tiles = np.ascontiguousarray(tiles[np.argsort(tiles[:, 2])])
+    return SurfelMap.prepare(np.array([500.0, -300.0, 40.0]), surfels, tiles)
+
+
+def points_for(rng: np.random.Generator) -> QueryPoints:
+    """Any number of points, none among them; some of no number, infinite, or far away."""
+    count = int(rng.choice([0, 1, 31, 32, 33, 500]))
+    xyz = rng.uniform(-25, 25, (count, 3)).astype(np.float32)
+    if rng.random() < 0.4 and count:
+        xyz[rng.random(count) < 0.1] = rng.choice([np.nan, np.inf, 1e30, -1e12])
+    with np.errstate(all="ignore"):
+        ray = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+    sigma, weight, q = rng.uniform(0, 2, count), rng.uniform(0, 1, count), rng.uniform(0, 0.5, count)
+    return QueryPoints(xyz, ray, *(each.astype(np.float32) for each in (sigma, weight, q)))
+
+
+def states_for(rng: np.random.Generator) -> NDArray[Any]:
+    """Starts near and far; some that are no pose."""
+    states = np.zeros(int(rng.integers(0, 4)), STATE)
+    for state in states:
+        state["R"], state["t"] = rotation_z(rng.uniform(-np.pi, np.pi)), rng.uniform(-20, 20, 3)
+        state["anchor"], state["up"] = state["t"], (0, 0, 1)
+        if rng.random() < 0.2:
+            state[rng.choice(["R", "t", "anchor", "up"])].flat[0] = rng.choice([np.nan, np.inf, 1e300])
+        state["offset"] = rng.choice([0.0, 0.3, -2.0, np.nan], p=[0.4, 0.3, 0.2, 0.1])
+        state["log_scale"] = rng.choice([0.0, 0.02, 800.0], p=[0.5, 0.4, 0.1])
+    return states
+
+
+OPTIONS = SolverOptions(iterations=6, reach=1.0, robust_first=1.0, robust_last=0.1, free_offset=True)
+BEAM = BeamModel(
+    hit=0.7, new=0.1, gone=0.1, any=0.1, rough_m=0.1, span_m=40.0, certain=2.0, margin_m=0.3, nothing_m=60.0
+)  # fmt: skip
+LARGE = 400  # bytes of random data for the codecs
+
+
+def _gather(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
+    rgb = rng.integers(0, 256, (height, width, 3), np.uint8)
+    scale = int(rng.integers(1, 4))
+    depth = depth_of(rng, height * scale, width * scale) if rng.random() < 0.3 else depth_of(rng, height, width)
+    R = rotation_of(rng) if rng.random() < 0.5 else R_BODY_OPTICAL.T @ rotation_z(rng.uniform(-0.5, 0.5))
+    return list(gather(rgb, depth, camera_of(rng, height, width), R, ViewGrid()))
+
+
+def _level(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
+    down = rng.normal(size=3) if rng.random() < 0.5 else None
+    level = level_camera(
+        depth_of(rng, height, width),
+        camera_of(rng, height, width),
+        down_camera=down,
+        nominal_height_m=rng.uniform(0.2, 3.0),
+    )
+    return [level.R_level_camera, np.array(level.height_m)]
+
+
+def _points(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
+    depth, camera = depth_of(rng, height, width), camera_of(rng, height, width)
+    noise = inverse_depth_noise(depth)
+    settings = PointSettings(columns=int(rng.choice([1, 8, 128, 5000])))
+    blocks = blocks_of(depth, camera, settings, noise=noise)
+    points = points_of(depth, camera, R_BODY_OPTICAL, 1.5, PointSettings())
+    return [np.array(noise), blocks.z_m, points.xyz, points.sigma, points.weight]
+
+
+def _align(rng: np.random.Generator, cloud: SurfelMap) -> list[NDArray[Any]]:
+    points, states = points_for(rng), states_for(rng)
+    align(cloud.grid, cloud.surfels, points, states, OPTIONS, tolerance_m=0.2)
+    found = [states[name] for name in states.dtype.names or ()]
+    for state in states[:1]:
+        patch = (np.arange(len(points)) // 7).astype(np.int32)
+        found.append(pulls(cloud.grid, cloud.surfels, points, states[:1], OPTIONS, patch))
+        del state
+    return [*found, cloud.grid.block, cloud.grid.nearest]
+
+
+def _render(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -> list[NDArray[Any]]:
+    height, width = min(height, 96), min(width, 128)
+    camera = camera_of(rng, height, width)
+    T = transform_from(rotation_of(rng) @ R_BODY_OPTICAL, rng.uniform(-20, 20, 3))
+    drawn = render(
+        cloud.surfels,
+        cloud.tiles,
+        tile_m=TILE_M,
+        T_map_camera=T,
+        camera=camera,
+        size_m=rng.uniform(0.05, 2),
+        reach_m=40.0,
+    )
+    count = int(rng.integers(1, 300))
+    pixel = rng.integers(0, drawn.size, count).astype(np.int32)
+    z, sigma = rng.uniform(0.1, 60, count), rng.uniform(1e-3, 2, count)
+    if rng.random() < 0.2:
+        z[0] = rng.choice([np.nan, np.inf])
+    told = agree(drawn, pixel, z, sigma, rng.uniform(0, 0.3, count).astype(np.float32), BEAM, scale=1.01, offset=0.1)
+    return [drawn, np.array(told)]
+
+
+def _rays(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -> list[NDArray[Any]]:
+    height, width = min(height, 96), min(width, 128)
+    camera = camera_of(rng, height, width)
+    settings = RaySettings(fewest=1, patch=int(rng.choice([1, 6, 16])))
+    sights = Sights(cloud, settings)
+    R, t = rotation_z(rng.uniform(-np.pi, np.pi)), np.r_[rng.uniform(-20, 20), rng.uniform(-5, 5), 1.5]
+    T_level_camera = transform_from(R_BODY_OPTICAL, np.zeros(3))
+    met = sights.meet(transform_from(R, t) @ T_level_camera, camera)
+    with np.errstate(all="ignore"):
+        inverse = np.where((depth := depth_of(rng, height, width)) > 0, 1 / depth, 0).astype(np.float32)
+    picture = RayPicture(
+        inverse, camera, T_level_camera, 1e-3, rng.choice([None, 80.0]), rng.random((height, width)) < 0.3
+    )
+    found = Registered(R, cloud.origin_m + t, 1.0, 0.0, 0.9, np.eye(8), 0)
+    adjusted = adjust(sights, [picture], found, settings)
+    if adjusted is None:
+        return [met]
+    pose, scatter = adjusted
+    return [met, pose.R_map_level, pose.camera_m, np.array([pose.scale, pose.offset]), pose.information, scatter]
+
+
+def _codecs(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
+    """Rows of random filters and data; the codec's own bounds are all that guards it."""
+    height, width = min(height, 64), min(width, 64)
+    rows = rng.integers(0, 256, (height, 1 + 2 * width), np.uint8)
+    rows[:, 0] = rng.integers(0, 6 if rng.random() < 0.3 else 5, height)
+    raw, out = rows.tobytes(), np.zeros((height, width), np.uint16)
+    buffer = (ctypes.c_char * len(raw)).from_buffer_copy(raw)
+    done = depth16.library().streetfix_unfilter(buffer, height, width, out.ctypes.data)
+    packed = rng.integers(0, 256, int(rng.integers(0, LARGE)), np.uint8)
+    if rng.random() < 0.7:  # short numbers, so that more than a few pixels are read
+        packed &= 0x77
+    data, pixels = packed.tobytes(), np.zeros((height, width), np.uint16)
+    given = (ctypes.c_char * len(data)).from_buffer_copy(data) if data else None
+    read = depth16.library().streetfix_rvl(given, len(data), pixels.size, pixels.ctypes.data)
+    return [np.array([done, read]), out[:done], pixels]
+
+
+def digest(arrays: list[NDArray[Any]]) -> str:
+    """Of shapes, types and bits; any NaN as the same."""
+    told = hashlib.sha256()
+    for array in arrays:
+        array = np.ascontiguousarray(array)
+        if array.dtype.kind == "f":
+            array = np.where(np.isnan(array), np.array(np.nan, array.dtype), array)
+        told.update(f"{array.shape} {array.dtype}".encode() + array.tobytes())
+    return told.hexdigest()[:16]
+
+
+def rounds(seed: int, count: int) -> None:
+    """Ask every function so many times with each size of picture, and print what came back."""
+    np.seterr(all="ignore")  # what is asked makes no sense at times
+    rng = np.random.default_rng(seed)
+    for number in range(count):
+        cloud = street(rng)
+        height, width = SIZES[number % len(SIZES)]
+        cases: dict[str, Callable[[], list[NDArray[Any]]]] = {
+            "gather": lambda h=height, w=width: _gather(rng, h, w),
+            "level": lambda h=height, w=width: _level(rng, h, w),
+            "points": lambda h=height, w=width: _points(rng, h, w),
+            "align": lambda c=cloud: _align(rng, c),
+            "render": lambda c=cloud, h=height, w=width: _render(rng, c, h, w),
+            "rays": lambda c=cloud, h=height, w=width: _rays(rng, c, h, w),
+            "codecs": lambda h=height, w=width: _codecs(rng, h, w),
+        }  # fmt: skip
+        for name, case in cases.items():
+            try:
+                told = digest(case())
+            except (StreetfixError, np.linalg.LinAlgError) as error:  # refused, or too little to solve for
+                told = f"refused: {type(error).__name__} {error}"
+            print(number, name, f"{height}x{width}", told, flush=True)
+
+
+def main() -> None:
+    """Parse and ask."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    rounds(arguments.seed, arguments.rounds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""Drives along real streets as a user gets them: import, map and answers at their defaults, figures with the status applied.
+
+``real.DRIVE.answered_*`` and ``median_m`` are of answers that were accepted; what is called forced is the best guess of every query,
+whatever its status. Both stand in the report.
+"""
+
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.report import Report
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.measures import RIGHT_M, recall_at
+from model_training.evaluation.odometry import as_query
+from model_training.evaluation.predict import RANKED, Predictions, predict
+from model_training.evaluation.stages import stages_of
+from model_training.importing.kinds import OpenSettings, open_recording
+from model_training.importing.take import TakeSettings, take
+from model_training.mapping.build import BuildSettings, build_map
+from model_training.stock import ENCODER
+from service.errors import NoDepthError
+from service.localization.localizer import Localizer
+from service.maps.reader import MapBundle
+
+DRIVES = ("kitti_0005", "kitti_0013")
+QUERIES = "recorded"
+SEQUENCE = 5
+#: Bars of issue 36 (docs/decisions.md).
+_ANSWERED, _WRONG, _MEDIAN_M, _RECALL_5M, _RECALL_10M, _INLIERS = 0.95, 0.02, 0.12, 0.95, 0.98, 0.5
+
+
+@dataclass(frozen=True)
+class Street:
+    """A drive that was imported and mapped."""
+
+    name: str
+    dataset: Dataset
+    localizer: Localizer
+
+
+def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] = DRIVES) -> None:
+    """Each drive on its own map; then each one's queries on the other's map, where they are strangers."""
+    streets = [street for name in drives if (street := _street(report, data, work, name)) is not None]
+    for street in streets:
+        found = predict(street.localizer, street.dataset, QUERIES)
+        answer_rows(report, f"real.{street.name}", found)
+        _inlier_rows(report, street)
+        if street.name == "kitti_0013":
+            _sequence_rows(report, street)
+    accepted = [
+        predict(own.localizer, other.dataset, QUERIES).localized
+        for own in streets
+        for other in streets
+        if own is not other
+    ]
+    if accepted:
+        report.share("real.strangers.accepted", np.concatenate(accepted), bar=_WRONG, better="lower")
+
+
+def answer_rows(report: Report, row: str, found: Predictions) -> None:
+    """Rows of a query set: retrieval, answers by their status, and beside them the same answers forced."""
+    true_xy, errors = found.T_true[:, :2, 3], position_errors(found)
+    report.share(f"{row}.recall_at_1_5m", recall_at(found.ranked_xy, true_xy, 1), bar=_RECALL_5M)
+    report.share(f"{row}.recall_at_5_5m", recall_at(found.ranked_xy, true_xy, 5))
+    report.share(f"{row}.recall_at_1_10m", recall_at(found.ranked_xy, true_xy, 1, within_m=10.0), bar=_RECALL_10M)
+    status_rows(report, row, errors, found.localized, bars=(_ANSWERED, _WRONG, _MEDIAN_M))
+
+
+def status_rows(
+    report: Report, row: str, errors_m: NDArray[np.float64], localized: NDArray[np.bool_], *,
+    bars: tuple[float | None, float | None, float | None],
+) -> None:  # fmt: skip
+    """Shares of all queries with the status applied, and forced.
+
+    Args:
+        report: where to.
+        row: name that the rows begin with.
+        errors_m: of the best guess of each query; infinite where there is none.
+        localized: whether each is accepted.
+        bars: for accepted and within 1 m, accepted and wrong, and the median of accepted errors.
+    """
+    answered_bar, wrong_bar, median_bar = bars
+    report.share(f"{row}.answered", localized)
+    report.share(f"{row}.answered_within_1_m", localized & (errors_m <= RIGHT_M), bar=answered_bar)
+    report.share(f"{row}.answered_wrong", localized & (errors_m > RIGHT_M), bar=wrong_bar, better="lower")
+    accepted = errors_m[localized]
+    report.row(
+        f"{row}.median_m", float(np.median(accepted)) if len(accepted) else None, "m", bar=median_bar, better="lower",
+        n=len(accepted), why=None if len(accepted) else "no answer was accepted",
+    )  # fmt: skip
+    report.share(f"{row}.forced_within_1_m", errors_m <= RIGHT_M)
+    finite = errors_m[np.isfinite(errors_m)]
+    report.row(f"{row}.forced_median_m", float(np.median(finite)) if len(finite) else None, "m", n=len(finite))
+
+
+def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:
+    """The drive's map, made anew; None where the recording is not there, which the report then says."""
+    if not (data / name).exists():
+        report.row(
+            f"real.{name}.answered_within_1_m", None, "share", bar=_ANSWERED, why=f"no recordings at {data.name}"
+        )
+        return None
+    folders = {kind: work / f"{name}_{kind}" for kind in ("raw", "data", "map")}
+    for folder in folders.values():
+        shutil.rmtree(folder, ignore_errors=True)
+    subprocess.run([sys.executable, str(data / "unpack.py"), str(data / name), str(folders["raw"])], check=True)
+    (drive,) = folders["raw"].glob("*/*_sync")
+    recording = open_recording("kitti-raw", drive, OpenSettings(depth="sgbm"))
+    trajectory = recording.trajectory()
+    if trajectory is None:
+        raise FileNotFoundError(f"{drive} has no poses (oxts)")
+    take(recording, trajectory, folders["data"], TakeSettings())
+    dataset = Dataset(folders["data"])
+    build_map(dataset, ENCODER, folders["map"], BuildSettings(name=name))
+    return Street(name, dataset, Localizer.open(MapBundle.open(folders["map"])))
+
+
+def _inlier_rows(report: Report, street: Street) -> None:
+    found = stages_of(street.localizer, street.dataset, QUERIES)
+    at_truth = [each.inliers_at_truth for each in found if np.isfinite(each.inliers_at_truth)]
+    from_truth = [each.inliers_from_truth for each in found if np.isfinite(each.inliers_from_truth)]
+    bar = _INLIERS if street.name == "kitti_0013" else None
+    report.row(f"real.{street.name}.inliers_at_truth", float(np.median(at_truth)), "share", bar=bar, n=len(at_truth))
+    report.row(f"real.{street.name}.inliers_from_truth", float(np.median(from_truth)), "share", n=len(from_truth))
+
+
+def _sequence_rows(report: Report, street: Street) -> None:
+    """Every five consecutive pairs as one question, where the others stood against the last by the recording's poses."""
+    frames, errors, localized = list(street.dataset.queries(QUERIES)), list[float](), list[bool]()
+    for last in range(SEQUENCE - 1, len(frames)):
+        group = frames[last - SEQUENCE + 1 : last + 1]
+        queries, poses = as_query(
+            group, np.random.default_rng(0), grid=street.localizer.bundle.grid, ranked=RANKED, exact=True
+        )
+        truth = frames[last].T_map_camera
+        try:
+            answer = street.localizer.localize_frames(queries, poses)
+        except NoDepthError:
+            errors.append(np.inf)
+            localized.append(False)
+            continue
+        if truth is None:
+            raise ValueError(f"query {last} of {street.name} has no truth")
+        errors.append(float(np.hypot(*(answer.T_map_camera_guess[:2, 3] - truth[:2, 3]))))
+        localized.append(answer.status == "LOCALIZED")
+    row = f"real.sequence{SEQUENCE}.{street.name}"
+    status_rows(report, row, np.array(errors), np.array(localized, bool), bars=(1.0, None, None))

@@ -1,0 +1,47 @@
+"""A table of queries against the truth, stage by stage, for people."""
+
+import math
+
+from rich.console import Console
+from rich.table import Table
+
+from model_training.evaluation.stages import MEANING, QueryStages, lost_by_stage
+
+_HEAD = (
+    "query", "tilt", "height", "place rank", "start", "candidate", "from truth", "inliers at truth", "error", "heading", "status",
+    "confidence", "lost by",
+)  # fmt: skip
+
+
+def print_stages(name: str, found: list[QueryStages], console: Console) -> None:
+    """Print a row a query, then how many queries each stage lost.
+
+    Args:
+        name: of the query set.
+        found: its queries.
+        console: where to.
+    """
+    table = Table(box=None, padding=(0, 1, 0, 0), title=f"{name}: each stage against the truth", title_justify="left")
+    for k, head in enumerate(_HEAD):
+        table.add_column(head, justify="left" if k >= len(_HEAD) - 3 else "right", overflow="fold")
+    for each in found:
+        table.add_row(*_row(each))
+    console.print(table)
+    for stage, count in lost_by_stage(found).items():
+        if count:
+            label = "right" if stage == "-" else f"lost by {stage}"
+            console.print(f"  {count:4d} of {len(found)} {label}: {MEANING[stage]}", highlight=False, soft_wrap=True)
+
+
+def _row(each: QueryStages) -> tuple[str, ...]:
+    return (
+        str(each.number), _number(each.tilt_deg, "{:.1f}°"), _number(each.height_error_m, "{:+.2f} m"),
+        str(each.rank or "-"), *(_number(x, "{:.2f} m") for x in (each.start_m, each.candidate_m, each.from_truth_m)),
+        f"{_number(each.inliers_at_truth, '{:.2f}')} > {_number(each.inliers_from_truth, '{:.2f}')}",
+        _number(each.error_m, "{:.2f} m"), _number(each.heading_error_deg, "{:.0f}°"), each.status or "refused",
+        _number(each.confidence, "{:.3f}"), str(each.lost),
+    )  # fmt: skip
+
+
+def _number(value: float, form: str) -> str:
+    return form.format(value) if math.isfinite(value) else "-"

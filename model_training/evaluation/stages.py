@@ -1,0 +1,227 @@
+"""Which stage of the answer loses a query: every stage is compared with the truth, in the order in which they run.
+
+``failures`` reads the cause off kept answers. This module asks again and looks inside, so it needs the map and the pictures.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.evaluation.measures import RIGHT_M, RIGHT_PLACE_M
+from service.errors import DatasetError, NoDepthError
+from service.geometry.rigid import Rotation, Transform, heading_of_camera, transform_from, wrap_angle
+from service.localization.answer import Answer
+from service.localization.frames import Frame
+from service.localization.localizer import Localizer
+from service.localization.refine import settings_for_rig
+from service.localization.starts import starts_from
+from service.registration.kernel import STATE, QueryPoints
+from service.registration.points import blocks_of, points_from
+from service.registration.register import RegistrationSettings, Start, register, registered_of, score
+from service.registration.surfel_map import SurfelMap
+
+#: A level that is further off than this is wrong: registration starts from it and moves by about so much.
+TILT_DEG, HEIGHT_M = 3.0, 0.5
+#: Registration can reach the truth from a start that is this near.
+START_M, START_DEG = 4.0, 30.0
+#: A candidate with another heading is another answer.
+HEADING_DEG = 10.0
+
+Report = Callable[[str, int, int], None]
+
+
+class Lost(StrEnum):
+    """The first stage that lost a query; ``NOT`` where the answer is right and accepted."""
+
+    NOT = "-"
+    LEVEL = "level"
+    RETRIEVAL = "retrieval"
+    CANDIDATES = "candidates"
+    REGISTRATION = "registration"
+    CHOICE = "choice"
+    STATUS = "status"
+
+
+MEANING = {
+    Lost.NOT: "the answer is within 1 m and accepted",
+    Lost.LEVEL: f"the estimated level is more than {TILT_DEG:g} degrees or {HEIGHT_M:g} m off",
+    Lost.RETRIEVAL: f"no start is within {START_M:g} m and {START_DEG:g} degrees of the truth",
+    Lost.CANDIDATES: "no registered pose is within 1 m, although registration from the true pose stays there",
+    Lost.REGISTRATION: "registration leaves even the true pose by more than 1 m",
+    Lost.CHOICE: "a registered pose is within 1 m, but another one was chosen",
+    Lost.STATUS: "the chosen pose is within 1 m, but the status is not LOCALIZED",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryStages:
+    """One query against its truth, stage by stage. Distances are metres on the ground; infinite where there is nothing.
+
+    Attributes:
+        number: of the query in its set.
+        tilt_deg: angle between the estimated vertical and the normal of the map's ground.
+        height_error_m: estimated camera height above the ground less the true one.
+        rank: of the first place within 5 m, from 1; 0 where none was found.
+        start_m: of the nearest start that looks the right way.
+        candidate_m: of the nearest registered pose that looks the right way.
+        from_truth_m: where registration ends that starts at the true pose.
+        inliers_at_truth: share of inliers at the true pose.
+        inliers_from_truth: share of inliers where registration from the true pose ends.
+        error_m: of the answer, whatever its status.
+        heading_error_deg: of the answer, 0 to 180.
+        status: of the answer; empty where the pictures were refused.
+        confidence: of the answer; NaN where there is none.
+        noise: estimated standard deviation of inverse depth, 1/m.
+        lost: the first stage that lost the query.
+    """
+
+    number: int
+    tilt_deg: float = np.inf
+    height_error_m: float = np.inf
+    rank: int = 0
+    start_m: float = np.inf
+    candidate_m: float = np.inf
+    from_truth_m: float = np.inf
+    inliers_at_truth: float = np.nan
+    inliers_from_truth: float = np.nan
+    error_m: float = np.inf
+    heading_error_deg: float = np.nan
+    status: str = ""
+    confidence: float = np.nan
+    noise: float = np.nan
+    lost: Lost = Lost.LEVEL
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; None where there is no finite number."""
+        return {
+            name: None if isinstance(value, float) and not np.isfinite(value) else value
+            for name, value in asdict(self).items()
+        }
+
+
+def stages_of(
+    localizer: Localizer, dataset: Dataset, name: str, *, report: Report = lambda *_: None
+) -> list[QueryStages]:
+    """Ask every query of a set and compare each stage with the truth.
+
+    Raises:
+        DatasetError: the set has no truth, or the map has no cloud to register on.
+    """
+    if localizer.bundle.cloud is None:
+        raise DatasetError(
+            f"the map {localizer.bundle.name} has no cloud, so there are no stages to compare", field="bundle"
+        )
+    frames = list(dataset.queries(name))
+    found = []
+    for done, frame in enumerate(frames, 1):
+        if frame.T_map_camera is None:
+            raise DatasetError(
+                f"query set {name!r} of {dataset.folder} has no poses.txt, so nothing can be compared", field="queries"
+            )
+        found.append(_stages(localizer, localizer.bundle.cloud, frame, frame.T_map_camera))
+        report(f"stages {name}", done, len(frames))
+    return found
+
+
+def _stages(localizer: Localizer, cloud: SurfelMap, asked: QueryFrame, truth: Transform) -> QueryStages:
+    try:
+        frame = localizer.look_up(asked.query(localizer.bundle.grid))
+    except NoDepthError:
+        return QueryStages(number=asked.number)
+    answer, bundle = localizer.answer((frame,)), localizer.bundle
+    heading, T_answer = heading_of_camera(truth), answer.T_map_camera_guess
+    tilt_deg, height_error_m = _level_errors(localizer, frame, truth)
+    starts = starts_from(
+        (frame,), None, lidar_height_m=bundle.manifest.lidar_height_m, settings=localizer.refining.starts
+    )
+    away_m = [float(np.hypot(*(place.position_m[:2] - truth[:2, 3]))) for place in answer.neighbours]
+    near = [rank for rank, away in enumerate(away_m, 1) if away <= RIGHT_PLACE_M]
+    from_truth_m, at_truth, from_truth = _from_truth(localizer, cloud, frame, truth)
+    found = QueryStages(
+        number=asked.number, tilt_deg=tilt_deg, height_error_m=height_error_m, rank=near[0] if near else 0,
+        start_m=_nearest(((s.R_map_level, s.camera_m) for s in starts), truth, heading, START_DEG),
+        candidate_m=_nearest(_candidates(answer, frame), truth, heading, HEADING_DEG), from_truth_m=from_truth_m,
+        inliers_at_truth=at_truth, inliers_from_truth=from_truth,
+        error_m=float(np.hypot(*(T_answer[:2, 3] - truth[:2, 3]))),
+        heading_error_deg=abs(float(np.rad2deg(wrap_angle(heading_of_camera(T_answer) - heading)))),
+        status=answer.status, confidence=np.nan if answer.confidence is None else answer.confidence, noise=frame.noise,
+    )  # fmt: skip
+    return replace(found, lost=loses(found))
+
+
+def lost_by_stage(found: list[QueryStages]) -> dict[Lost, int]:
+    """How many queries each stage lost, in the order of the stages; those that are right come first."""
+    return {stage: sum(each.lost == stage for each in found) for stage in Lost}
+
+
+def loses(found: QueryStages) -> Lost:
+    """The first stage that lost a query."""
+    if found.error_m <= RIGHT_M:
+        return Lost.NOT if found.status == "LOCALIZED" else Lost.STATUS
+    if found.tilt_deg > TILT_DEG or abs(found.height_error_m) > HEIGHT_M:
+        return Lost.LEVEL
+    if found.candidate_m <= RIGHT_M:
+        return Lost.CHOICE
+    if found.start_m > START_M:
+        return Lost.RETRIEVAL
+    return Lost.REGISTRATION if found.from_truth_m > RIGHT_M else Lost.CANDIDATES
+
+
+def _level_errors(localizer: Localizer, frame: Frame, truth: Transform) -> tuple[float, float]:
+    """Angle (degrees) between the estimated and the map's vertical, and the error of the camera's height (m)."""
+    bundle = localizer.bundle
+    nearest = int(np.argmin(np.linalg.norm(bundle.T_map_place[:, :2, 3] - truth[:2, 3], axis=1)))
+    place = np.array(bundle.T_map_place[nearest])
+    up = truth[:3, :3] @ frame.R_level_camera[2]
+    tilt = np.arccos(np.clip(up @ place[:3, 2], -1, 1))
+    true_height_m = float((truth[:3, 3] - place[:3, 3]) @ place[:3, 2]) + bundle.manifest.lidar_height_m
+    return float(np.rad2deg(tilt)), float(frame.views.height_m - true_height_m)
+
+
+def _candidates(answer: Answer, frame: Frame) -> Iterator[tuple[Rotation, np.ndarray]]:
+    for candidate in answer.candidates or ():
+        T = candidate.T_map_camera
+        yield T[:3, :3] @ frame.R_level_camera.T, T[:3, 3]
+
+
+def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, heading: float, most_deg: float) -> float:
+    """Distance of the nearest level pose whose heading is about right, metres; infinite where there is none."""
+    away = [
+        float(np.hypot(*(at[:2] - truth[:2, 3])))
+        for R, at in poses
+        if abs(np.rad2deg(wrap_angle(float(np.arctan2(R[1, 0], R[0, 0])) - heading))) <= most_deg
+    ]
+    return min(away, default=np.inf)
+
+
+def _from_truth(localizer: Localizer, cloud: SurfelMap, frame: Frame, truth: Transform) -> tuple[float, float, float]:
+    """How far registration goes that starts at the truth (m), and the share of inliers before and after it."""
+    settings = localizer.refining
+    if frame.query.baseline_m is not None:
+        settings = settings_for_rig(settings, frame.focal_px * frame.query.baseline_m)
+    blocks = blocks_of(frame.query.depth_m, frame.query.camera, settings.points, noise=frame.noise)
+    points = points_from(
+        blocks, frame.R_level_camera, frame.views.height_m, settings.points, noise=frame.noise,
+        focal_baseline_px_m=settings.focal_baseline_px_m,
+    )  # fmt: skip
+    if len(points) < settings.fewest_points:
+        return np.inf, np.nan, np.nan
+    start = Start(truth[:3, :3] @ frame.R_level_camera.T, truth[:3, 3], 0)
+    best = register(cloud, points, [start], frame.views.height_m, settings.registration)[0]
+    at_truth = _inliers(cloud, points, start, frame.views.height_m, settings.registration)
+    T_map_camera = transform_from(best.R_map_level @ frame.R_level_camera, best.camera_m)
+    return float(np.hypot(*(T_map_camera[:2, 3] - truth[:2, 3]))), at_truth, best.inliers
+
+
+def _inliers(
+    cloud: SurfelMap, points: QueryPoints, at: Start, height_m: float, settings: RegistrationSettings
+) -> float:
+    state = np.zeros(1, STATE)
+    state["R"], state["up"] = at.R_map_level, at.R_map_level[:, 2]
+    state["t"] = state["anchor"] = at.camera_m - cloud.origin_m
+    score(cloud, points, state, height_m, settings)
+    return registered_of(state[0], 0, cloud.origin_m).inliers

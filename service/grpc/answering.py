@@ -1,0 +1,65 @@
+"""How every call ends: its request id, its status, one count in the metrics and one line in the log."""
+
+import re
+import uuid
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from time import perf_counter
+
+import grpc
+
+from service.errors import StreetfixError
+from service.grpc.call import Call
+from service.grpc.memory import held_by_call
+from service.grpc.status import fail, refuse
+from service.runtime.engine import Engine
+from service.runtime.logs import log_request
+
+REQUEST_ID = "x-request-id"
+_ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
+
+
+@contextmanager
+def answering(
+    engine: Engine, method: str, context: grpc.ServicerContext, *, lives_long: bool = False
+) -> Iterator[Call]:
+    """Whatever is raised inside ends the call as the contract says, and is counted.
+
+    Args:
+        engine: whose metrics, traces and limits hold.
+        method: name of the call, without its service.
+        context: of the call.
+        lives_long: the call is a stream, whose duration says nothing.
+    """
+    metadata = {name: value for name, value in context.invocation_metadata() if isinstance(value, str)}
+    given = metadata.get(REQUEST_ID, "")
+    request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
+    began, code = perf_counter(), "OK"
+    span = engine.tracing.begin("grpc", metadata.get("traceparent"))
+    try:
+        context.send_initial_metadata(((REQUEST_ID, request_id),))
+        yield Call(
+            engine.admission, context, span, timeout_s=engine.settings.request_timeout_s,
+            hold=None if lives_long else held_by_call.get(),
+        )  # fmt: skip
+    except StreetfixError as error:
+        code = error.code
+        refuse(context, error)
+    except (GeneratorExit, grpc.RpcError):  # the client has gone
+        code = "CANCELLED"
+        raise
+    except CancelledError:  # it has as well; gRPC would take this one for a defect, and log a traceback
+        code = "CANCELLED"
+        context.abort(grpc.StatusCode.CANCELLED, "the caller has gone")
+    except Exception as error:
+        code = "INTERNAL"
+        fail(context, error, request_id)
+    finally:
+        seconds = perf_counter() - began
+        engine.metrics.requested("grpc", method, code, None if lives_long else seconds)
+        span.end(method, code, failed=code in ("INTERNAL", "deadline"))
+        log_request(
+            face="grpc", method=method, code=code, seconds=seconds, request_id=request_id,
+            traceparent=metadata.get("traceparent"),
+        )  # fmt: skip

@@ -1,0 +1,104 @@
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from benchmarks import provenance
+from benchmarks.provenance import MEASURED, ROOT, mark_stale, measured_paths
+
+REPORTS = sorted((ROOT / "reports").glob("*.json"))
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch):
+    """A repository with three commits: the second changes the map code, the third a document."""
+    monkeypatch.setattr(provenance, "ROOT", tmp_path)
+    monkeypatch.setitem(MEASURED, "mine", {"": ("service/maps",), "all.": ("service", "docs")})
+    provenance._changed_files.cache_clear()
+
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(["git", *identity, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    def commit(file, text):
+        path = tmp_path / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        git("add", ".")
+        git("commit", "-qm", file)
+        return git("rev-parse", "HEAD")
+
+    git("init", "-q")
+    yield [commit("service/maps/a.py", "1"), commit("service/maps/a.py", "2"), commit("docs/a.md", "3")], commit
+    provenance._changed_files.cache_clear()
+
+
+def ages(commits, head, *row_ids):
+    rows = [{"id": row_id, "run": commit} for commit in commits for row_id in row_ids]
+    mark_stale("mine", rows, {commit: {"commit": commit} for commit in commits}, head)
+    return [row.get("stale") for row in rows]
+
+
+def test_a_row_is_stale_where_code_that_it_measures_has_changed_since(repository):
+    (first, second, third), _ = repository
+    assert ages([first, second, third], third, "map") == [True, None, None]
+    assert ages([first, second, third], third, "all.map") == [True, True, None]
+
+
+def test_code_that_was_changed_back_is_the_same(repository):
+    (first, _, _), commit = repository
+    assert ages([first], commit("service/maps/a.py", "1"), "map") == [None]
+
+
+def test_a_mark_is_taken_away_from_a_row_that_is_measured_anew(repository):
+    (_, second, third), _ = repository
+    row = {"id": "map", "run": "r", "stale": True}
+    mark_stale("mine", [row], {"r": {"commit": second}}, third)
+    assert "stale" not in row
+
+
+def test_where_git_cannot_tell_the_age_is_unknown(repository, tmp_path, monkeypatch):
+    (first, _, third), _ = repository
+    assert ages(["0" * 40], third, "map") == ["unknown"]
+    monkeypatch.setenv("PATH", "")
+    provenance._changed_files.cache_clear()
+    assert provenance.head_commit() == ""
+    assert ages([first], third, "map") == ["unknown"]
+    assert ages([first], "", "map") == ["unknown"]
+
+
+def test_git_is_asked_once_for_a_commit(repository, monkeypatch):
+    (first, _, third), _ = repository
+    asked = []
+    monkeypatch.setattr(provenance, "git", lambda *arguments: asked.append(arguments) or "")
+    ages([first], third, *(f"row{number}" for number in range(50)))
+    assert len(asked) == 1
+
+
+def test_every_report_says_what_its_rows_measure_and_that_is_there():
+    assert set(MEASURED) == {path.stem for path in REPORTS}
+    for groups in MEASURED.values():
+        assert "" in groups
+        for path in {path for paths in groups.values() for path in paths}:
+            assert (ROOT / path).exists(), path
+
+
+def test_the_longest_beginning_says_what_a_row_measures():
+    assert "model_training/importing" in measured_paths("accuracy", "real.kitti_stereo.recall_at_1")
+    assert "model_training/importing" not in measured_paths("accuracy", "full.unseen")
+    assert measured_paths("a report that is new", "a") == ("service", "model_training", "native")
+
+
+@pytest.mark.parametrize("path", REPORTS, ids=lambda path: path.stem)
+def test_every_row_of_a_committed_report_names_its_run_and_every_run_is_named(path: Path):
+    told = json.loads(path.read_text())
+    assert {row["run"] for row in told["rows"]} == set(told["runs"])
+    ids = [row["id"] for row in told["rows"]]
+    assert len(ids) == len(set(ids))
+    for run in told["runs"].values():
+        assert len(run["commit"]) == 40
+        assert run["command"]
+        assert run["date"] or run["before"]
+        assert {"dirty", "machine"} <= set(run)

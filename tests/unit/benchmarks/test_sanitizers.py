@@ -1,0 +1,66 @@
+"""The check of the C code under sanitizers: that a report is seen, and that nothing is skipped in silence."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from benchmarks.native import sanitizers
+
+try:
+    sanitizers.runtime()
+    missing = ""
+except sanitizers.SanitizersMissingError as error:
+    missing = str(error)
+with_sanitizers = pytest.mark.skipif(bool(missing), reason=missing)
+
+DEFECTS = {
+    "beyond the end": "#include <stdlib.h>\nint wrong(int n) { int *a = malloc(16); a[n] = 1; return a[n + 4]; }",
+    "freed": "#include <stdlib.h>\nint wrong(int n) { int *a = malloc(8); free(a); return a[n]; }",
+    "overflow": "int wrong(int n) { volatile int a = 2147483647; return a + 1 + n; }",
+    "no number": "int wrong(int n) { volatile double a = 0; return (int)(a / a) + n; }",
+}
+
+
+@with_sanitizers
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_defect_is_reported(tmp_path: Path, defect: str) -> None:
+    source, library = tmp_path / "wrong.c", tmp_path / "_wrong.so"
+    source.write_text(DEFECTS[defect])
+    # As the build has them.
+    flags = re.search(r"-O1 -g .*-fsanitize=[a-z,-]+", (sanitizers.ROOT / "native" / "CMakeLists.txt").read_text())
+    subprocess.run(["gcc", *flags[0].split(), "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
+    found = sanitizers.reports_of(tmp_path, ["-c", f"import ctypes; ctypes.CDLL({str(library)!r}).wrong(0)"])
+    assert found
+    assert all("wrong" in each for each in found)
+
+
+@with_sanitizers
+def test_what_fails_without_a_report_is_no_success(tmp_path: Path) -> None:
+    with pytest.raises(sanitizers.RunFailedError, match="a test failed"):
+        sanitizers.reports_of(tmp_path, ["-c", "raise SystemExit('a test failed')"])
+
+
+@with_sanitizers
+def test_a_faultless_run_has_no_report(tmp_path: Path) -> None:
+    assert sanitizers.reports_of(tmp_path, ["-c", "print(1)"]) == []
+
+
+@pytest.mark.parametrize(("ci", "code"), [("true", 1), ("", 0)])
+def test_without_sanitizers_it_is_said_and_fails_where_checks_must_run(monkeypatch, capsys, ci: str, code: int) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
+    monkeypatch.setenv("CI", ci)
+    with pytest.raises(SystemExit) as left:
+        sanitizers.main()
+    assert left.value.code == code
+    assert capsys.readouterr().err.startswith("NOT CHECKED: the C code did not run under sanitizers: there is no gcc")
+
+
+def test_reports_and_failures_end_the_check(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sanitizers, "sanitize", lambda: ["x.c:1:2: runtime error: overflow"])
+    with pytest.raises(SystemExit) as left:
+        sanitizers.main()
+    assert left.value.code == 1
+    assert "sanitizers: 1 reports" in capsys.readouterr().out

@@ -1,0 +1,26 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.bridge.in_place import InPlace
+from service.errors import RequestError
+from service.geometry.camera import PinholeCamera
+
+
+@pytest.mark.parametrize(
+    ("camera", "field"),
+    [
+        (PinholeCamera(64, 48, 1e-9, 32.0, 31.5, 23.5), "camera.fx"),
+        (PinholeCamera(64, 48, 32.0, 32.0, float("nan"), 23.5), "camera.cx"),
+    ],
+)
+def test_a_camera_beyond_the_contracts_bounds_is_refused_without_a_service_too(
+    bundle_path: Path, pictures: Any, camera: PinholeCamera, field: str
+) -> None:
+    rgb, depth_m, good = pictures
+    localize = InPlace(bundle_path)
+    assert localize(rgb, depth_m, good).map.name == "tiny"
+    with pytest.raises(RequestError) as caught:
+        localize(rgb, depth_m, camera)
+    assert caught.value.field == field

@@ -1,0 +1,44 @@
+"""Workers count in files whose blocks are there before they are counted in."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from prometheus_client.mmap_dict import MmapedDict
+
+from service.cli.shared_counts import RESERVED_BYTES, reserve
+
+
+def test_every_file_has_its_blocks(tmp_path: Path) -> None:
+    assert reserve(tmp_path) is None
+    paths = sorted(tmp_path.iterdir())
+    assert [path.name for path in paths] == [
+        f"{kind}_{os.getpid()}.db" for kind in ("counter", "gauge_livesum", "histogram")
+    ]
+    assert all(path.stat().st_size == RESERVED_BYTES for path in paths)
+    assert all(path.stat().st_blocks * 512 >= RESERVED_BYTES for path in paths)
+
+
+def test_the_library_counts_in_them(tmp_path: Path) -> None:
+    assert reserve(tmp_path) is None
+    path = str(tmp_path / f"counter_{os.getpid()}.db")
+    counts = MmapedDict(path)
+    counts.write_value("a", 3.0, 0.0)
+    counts.close()
+    assert reserve(tmp_path) is None
+    assert [(key, value) for key, value, *_ in MmapedDict.read_all_values_from_file(path)] == [("a", 3.0)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no limits of that kind")
+def test_without_room_nothing_is_left_and_the_reason_is_told(tmp_path: Path) -> None:
+    code = f"""
+import resource, pathlib
+from service.cli.shared_counts import RESERVED_BYTES, reserve
+resource.setrlimit(resource.RLIMIT_FSIZE, (RESERVED_BYTES // 2, resource.RLIM_INFINITY))
+print(reserve(pathlib.Path({str(tmp_path)!r})).strerror)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "File too large\n"
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,182 @@
+"""No option without effect: what a request or a setting may say is used, and another value gives another result."""
+
+import ast
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from service.contract import schema
+from service.contract.convert import parsed, query_from, sequence_from
+from service.errors import StreetfixError
+from service.localization.query import Query
+from service.runtime.engine import EncodedQuery
+from service.runtime.settings import Limits, Settings
+
+SERVICE = Path(__file__).parents[3] / "service"
+Json = dict[str, Any]
+T = {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0.1, "y": 0.2, "z": 0.3, "w": 0.9}}
+FRAME: Json = {
+    "camera": {"model": "PINHOLE", "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [0, 0]},
+    "depth": {"scale_m": 0.001, "kind": "z", "encoding": "auto", "max_range_m": 40, "baseline_m": 0.12},
+    "gravity": {"x": 0.1, "y": 1, "z": 0.1},
+}  # fmt: skip
+ABOUT: Json = {
+    "map": "tiny", "T_vehicle_camera": T,
+    "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.02},
+}  # fmt: skip
+POSITION = {"position": {"x": 1, "y": 2, "std_m": 3}, "heading_deg": 10, "heading_std_deg": 20}
+WGS84 = {"wgs84": {"latitude_deg": 1, "longitude_deg": 2, "std_m": 3}, "heading_deg": 10, "heading_std_deg": 20}
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if isinstance(value, (dict, list)):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(inner, (*path, key))
+    else:
+        yield path
+
+
+def fields_of(model: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Paths of a model's fields that are no models themselves; an element of a list has no name of its own."""
+    for name, field in model.model_fields.items():
+        inner = [each for each in _types(field.annotation) if isinstance(each, type) and issubclass(each, BaseModel)]
+        if inner:
+            for each in inner:
+                yield from fields_of(each, (*path, name))
+        else:
+            yield (*path, name)
+
+
+def _types(annotation: Any) -> Iterator[Any]:
+    yield annotation
+    for each in getattr(annotation, "__args__", ()):
+        yield from _types(each)
+
+
+def named(document: Json) -> set[tuple[str, ...]]:
+    """The leaves of a document without the numbers of list elements."""
+    return {tuple(key for key in path if isinstance(key, str)) for path in leaves(document)}
+
+
+ALONE = [FRAME | ABOUT | {"prior": prior} for prior in (POSITION, WGS84)]
+SEQUENCE = {"frames": [FRAME, FRAME | {"T_reference_camera": T}]}
+SEQUENCES = [ABOUT | SEQUENCE | {"prior": prior} for prior in (POSITION, WGS84)]
+
+
+def test_the_documents_say_all_that_a_request_may() -> None:
+    assert set.union(*map(named, ALONE)) == set(fields_of(schema.LocalizeRequest))
+    assert set.union(*map(named, SEQUENCES)) == set(fields_of(schema.SequenceRequest))
+
+
+def other(value: Any, path: tuple[Any, ...]) -> Any:
+    """Another good value, or one that must be refused where there is no other good one."""
+    told = {"kind": "range", "encoding": "carla", "map": "west", "model": "OPENCV"}
+    if path[-1] in told:
+        return told[path[-1]]
+    if isinstance(value, bool):
+        return not value
+    return value + 1 if isinstance(value, int) else 0.7 * value
+
+
+def with_other(document: Json, path: tuple[Any, ...]) -> Json:
+    copy: Json = json.loads(json.dumps(document))
+    node: Any = copy
+    for key in path[:-1]:
+        node = node[key]
+    node[path[-1]] = other(node[path[-1]], path)
+    return copy
+
+
+def plain(value: Any) -> Any:
+    """As something that can be compared."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return [plain(each) for each in value] if isinstance(value, tuple) else value
+
+
+def asked_alone(document: Json) -> Any:
+    """What the engine is asked, or that the request was refused."""
+    try:
+        return plain(query_from(parsed(json.dumps(document).encode(), schema.LocalizeRequest), rgb=b"", depth=b""))
+    except StreetfixError as error:
+        return error.message
+
+
+def asked_in_sequence(document: Json) -> Any:
+    try:
+        request = parsed(json.dumps(document).encode(), schema.SequenceRequest)
+        return plain(sequence_from(request, [(b"", b"")] * len(request.frames)))
+    except StreetfixError as error:
+        return error.message
+
+
+@pytest.mark.parametrize(
+    ("asked", "document", "path"),
+    [
+        pytest.param(asked, document, path, id=f"{asked.__name__}-{'.'.join(map(str, path))}")
+        for asked, documents in ((asked_alone, ALONE), (asked_in_sequence, SEQUENCES))
+        for document in documents
+        for path in leaves(document)
+    ],
+)
+def test_another_value_of_any_field_asks_the_engine_something_else_or_is_refused(
+    asked: Callable[[Json], Any], document: Json, path: tuple[Any, ...]
+) -> None:
+    as_it_is = asked(document)
+    assert not isinstance(as_it_is, str), as_it_is
+    assert asked(with_other(document, path)) != as_it_is
+
+
+@pytest.mark.parametrize("changed", [{"model": "OPENCV"}, {"distortion": [0.1]}])
+def test_a_camera_that_is_not_rectified_is_refused_with_the_remedy(changed: Json) -> None:
+    refused = asked_alone(ALONE[0] | {"camera": FRAME["camera"] | changed})
+    assert f"camera.{next(iter(changed))}" in refused
+    assert "rectify" in refused
+
+
+def classes_of_options() -> Iterator[type]:
+    """All classes of settings in the service: their names end so."""
+    yield from (EncodedQuery, Query, Limits, Settings)
+    for path in sorted(SERVICE.rglob("*.py")):
+        if "generated" in path.parts:
+            continue
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and node.name.endswith(
+                ("Settings", "Options", "Weights", "Model", "Policy")
+            ):
+                module = ".".join(("service", *path.relative_to(SERVICE).with_suffix("").parts))
+                kind = getattr(import_module(module), node.name)
+                if issubclass(kind, BaseModel) or dataclasses.is_dataclass(kind):
+                    yield kind
+
+
+@cache
+def used_names() -> frozenset[str]:
+    """Names that are read as an attribute, or written in a string (of a C struct's fields), anywhere in the service.
+
+    A docstring is longer than a name; a field's own declaration is neither.
+    """
+    found = set()
+    for path in SERVICE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+                found.add(node.attr)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.add(node.value)
+    return frozenset(found)
+
+
+@pytest.mark.parametrize("kind", dict.fromkeys(classes_of_options()), ids=lambda kind: kind.__name__)
+def test_every_option_is_read_somewhere(kind: type) -> None:
+    names = set(kind.model_fields if issubclass(kind, BaseModel) else kind.__dataclass_fields__)
+    assert kind.__name__ == "BeamModel" or names - used_names() == set()  # that one a C struct takes whole (`astuple`)

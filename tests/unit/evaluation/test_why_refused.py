@@ -1,0 +1,81 @@
+"""What to check where nearly nothing is accepted: simulated queries that say something wrong of themselves."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.predict import predict
+from model_training.evaluation.why_refused import causes, out_of_range
+from service.localization.localizer import Localizer
+from service.maps.calibration import FEATURES
+from service.maps.reader import MapBundle
+
+NAME = "drive1_precise"
+
+
+@pytest.fixture(scope="module")
+def localizer(small_map):
+    return Localizer.open(MapBundle.open(small_map))
+
+
+@pytest.fixture
+def told_wrong(small_dataset, tmp_path):
+    """The small dataset whose description says other intrinsics or another unit of depth than is true."""
+
+    def made(*, focal=1.0, depth=1.0):
+        folder = shutil.copytree(small_dataset.folder, tmp_path / f"{focal}-{depth}")
+        description = json.loads((folder / "dataset.json").read_text())
+        for camera in description["sensors"]["cameras"]:
+            camera["fx"], camera["fy"] = camera["fx"] * focal, camera["fy"] * focal
+            camera["depth"]["scale_m"] *= depth
+        (folder / "dataset.json").write_text(json.dumps(description))
+        return Dataset(folder)
+
+    return made
+
+
+def refused(localizer, dataset):
+    answers = predict(localizer, dataset, NAME)
+    answers.status[:] = "OUT_OF_MAP"
+    return list(dataset.queries(NAME)), answers
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"focal": 2.0}, "the focal length is off by a factor of two: fx and fy times 0.5 fit the map"),
+        ({"depth": 10.0}, "the depth unit is off: depth times 0.1 fits the map"),
+        ({"depth": 0.001}, "the depth unit is off: depth times 1000 fits the map"),
+    ],
+)
+def test_a_wrong_focal_length_and_a_wrong_unit_are_named(localizer, told_wrong, wrong, told):
+    assert causes(localizer, *refused(localizer, told_wrong(**wrong)))[0].what == told
+
+
+def test_right_intrinsics_and_units_are_not_suspected(localizer, small_dataset):
+    assert causes(localizer, *refused(localizer, small_dataset)) == []
+
+
+def test_where_enough_is_accepted_nothing_is_said(localizer, small_dataset):
+    frames, answers = refused(localizer, small_dataset)
+    answers.status[:] = "LOCALIZED"
+    assert causes(localizer, frames, answers) == []
+
+
+def test_evidence_out_of_range_is_named_in_the_order_of_likelihood(calibration_of):
+    calibration = calibration_of()
+    evidence = np.tile(np.array(calibration.right.mean), (5, 1))
+    assert out_of_range(calibration, evidence) == []
+    for name in ("margin", "log_noise", "through"):
+        evidence[:, FEATURES.index(name)] += 5 * calibration.right.spread[FEATURES.index(name)]
+    told = out_of_range(calibration, evidence)
+    assert [each.what.split(" (")[0] for each in told] == ["baseline", "traffic in the map", "calibration"]
+    assert "log_noise +5.0" in told[0].what
+
+
+def test_answers_without_evidence_speak_of_depth(calibration_of):
+    (cause,) = out_of_range(calibration_of(), np.full((3, len(FEATURES)), np.nan))
+    assert "depth" in cause.what

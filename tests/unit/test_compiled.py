@@ -1,0 +1,105 @@
+"""The loader of the compiled libraries: what C and Python say of a shared structure must be the same."""
+
+import ctypes
+import re
+from ctypes import Structure, c_double, c_float, c_int64
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import service
+from service.compiled import compiled_layout, declared_layout, load
+from service.errors import StreetfixError
+from service.imaging import depth16, gather, level
+from service.imaging.as_c import CPicture
+from service.registration import kernel, points, rays, sight
+
+LIBRARIES = (gather.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, sight.LIBRARY)
+
+
+@pytest.mark.parametrize("loaded", [gather._library, level._library, kernel._library, points._library, sight._library,
+                                    rays._library, depth16.library])  # fmt: skip
+def test_what_was_built_fits_what_python_declares(loaded):
+    assert loaded() is not None
+
+
+class SwappedPicture(Structure):
+    _fields_ = [("width", c_int64), ("height", c_int64), *((name, c_double) for name in ("fx", "fy", "cx", "cy"))]
+
+
+class NarrowPicture(Structure):
+    _fields_ = [("height", c_int64), ("width", c_int64), *((name, c_float) for name in ("fx", "fy", "cx", "cy"))]
+
+
+class LongPicture(Structure):
+    _fields_ = [*CPicture._fields_, ("skew", c_double)]
+
+
+class ShortPicture(Structure):
+    _fields_ = CPicture._fields_[:-1]
+
+
+class RenamedPicture(Structure):
+    _fields_ = [("rows", c_int64), *CPicture._fields_[1:]]
+
+
+@pytest.mark.parametrize(
+    ("declared", "named"),
+    [
+        (SwappedPicture, "Picture.height"),
+        (NarrowPicture, "Picture"),
+        (LongPicture, "Picture"),
+        (ShortPicture, "Picture"),
+        (RenamedPicture, "Picture.height"),
+        (np.dtype([(name, "<f8") for name in ("height", "width", "fx", "fy", "cx", "cy")][:5]), "Picture"),
+    ],
+)
+def test_a_structure_that_lies_otherwise_is_refused(declared, named):
+    with pytest.raises(StreetfixError, match=rf"_gather\.so .*: {named} is .* in C and .* in Python; install .* again"):
+        load(gather.LIBRARY, {"Picture": declared})
+
+
+def test_a_structure_that_c_does_not_know_is_refused():
+    with pytest.raises(StreetfixError, match=r"Scene is not there in C"):
+        load(gather.LIBRARY, {"Scene": CPicture})
+
+
+def test_a_constant_of_another_value_is_refused():
+    with pytest.raises(
+        StreetfixError, match=r"SAMPLES is \(offset 0, size 9\) in C and \(offset 0, size 4\) in Python"
+    ):
+        load(gather.LIBRARY, constants={"SAMPLES": 4})
+
+
+def test_a_library_without_a_table_is_refused():
+    with pytest.raises(StreetfixError, match="Picture is not there in C"):
+        load(depth16.LIBRARY, {"Picture": CPicture})
+
+
+def test_a_library_that_was_not_compiled_is_named():
+    with pytest.raises(StreetfixError, match=r"_nothing\.so is missing .*pip install"):
+        load(Path(__file__).with_name("_nothing.so"))
+
+
+def test_every_structure_that_a_library_tells_of_is_compared():
+    source = "".join(path.read_text() for path in Path(service.__file__).parent.rglob("*.py"))
+    for library in LIBRARIES:
+        structures = {name.partition(".")[0] for name in compiled_layout(ctypes.CDLL(str(library)))}
+        assert structures
+        for name in structures:
+            assert re.search(rf'load\(\s*LIBRARY[^)]*"{name}": ', source), f"{library.name}: nobody compares {name}"
+
+
+@pytest.mark.parametrize("path", sorted(Path(service.__file__).parent.rglob("*.c")), ids=lambda path: path.stem)
+def test_every_structure_that_a_function_takes_is_in_its_library_s_table(path):
+    """``const View *v`` of an exported function, if the struct is Python's too."""
+    exported = re.findall(r"^(?:WIDE )?\w+ streetfix_\w+\(([^)]*)\)", path.read_text(), re.MULTILINE)
+    taken = {name for arguments in exported for name in re.findall(r"\b([A-Z][a-z]\w*) \*", arguments)}
+    library = ctypes.CDLL(str(path.with_name(f"_{path.stem}.so")))
+    assert taken <= set(compiled_layout(library))
+
+
+def test_a_dtype_and_a_structure_of_the_same_fields_lie_alike():
+    dtype = np.dtype([("height", "<i8"), ("width", "<i8"), *((name, "<f8") for name in ("fx", "fy", "cx", "cy"))])
+    assert declared_layout("Picture", dtype) == declared_layout("Picture", CPicture)
