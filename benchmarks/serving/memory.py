@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import cv2
@@ -23,6 +24,7 @@ from benchmarks.serving.http2 import call
 from benchmarks.serving.limited import Limited
 from benchmarks.serving.machines import Server
 from benchmarks.serving.ratios import Site
+from model_training.loadtest.payloads import Payload
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
 LIMIT_MIB = 2048
@@ -124,15 +126,8 @@ def _sent(url: str, path: str, body: memoryview, *, chunked: bool) -> str:
     try:
         with socket.create_connection((at.hostname, at.port), timeout=_TIMEOUT_S) as connection:
             connection.sendall(head.encode())
-            if not chunked:
-                connection.sendall(body)
-            else:
-                for start in range(0, len(body), 2**20):
-                    piece = body[start : start + 2**20]
-                    connection.sendall(f"{len(piece):x}\r\n".encode())
-                    connection.sendall(piece)
-                    connection.sendall(b"\r\n")
-                connection.sendall(b"0\r\n\r\n")
+            with suppress(ConnectionResetError, BrokenPipeError):  # it was refused, which its answer says
+                _send_body(connection, body, chunked=chunked)
             return (
                 connection.recv(200).split(b"\r\n")[0].decode("ascii", "replace").removeprefix("HTTP/1.1 ") or "closed"
             )
@@ -140,11 +135,23 @@ def _sent(url: str, path: str, body: memoryview, *, chunked: bool) -> str:
         return type(error).__name__
 
 
-def _asked(url: str, payload: object) -> str:
+def _send_body(connection: socket.socket, body: memoryview, *, chunked: bool) -> None:
+    if not chunked:
+        connection.sendall(body)
+        return
+    for start in range(0, len(body), 2**20):
+        piece = body[start : start + 2**20]
+        connection.sendall(f"{len(piece):x}\r\n".encode())
+        connection.sendall(piece)
+        connection.sendall(b"\r\n")
+    connection.sendall(b"0\r\n\r\n")
+
+
+def _asked(url: str, payload: Payload) -> str:
     try:
         found = httpx.post(
             f"{url}/v1/localize", content=payload.body, headers={"Content-Type": payload.content_type}, timeout=60
-        )  # type: ignore[attr-defined]
+        )
     except httpx.HTTPError as error:
         return type(error).__name__
     return str(found.status_code)
