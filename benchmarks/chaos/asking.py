@@ -25,7 +25,7 @@ What = Literal["maps", "full", "retrieval", "stream"]
 Face = Literal["rest", "grpc"]
 FACES: tuple[Face, ...] = ("rest", "grpc")
 #: How fast answers come is not judged here, and other work may share the machine.
-TIMEOUT_S = 60.0
+TIMEOUT_S = 150.0
 _OPTIONS = (("grpc.use_local_subchannel_pool", 1), ("grpc.max_receive_message_length", -1), ("grpc.enable_retries", 0))
 
 

@@ -28,7 +28,7 @@ from service.grpc.generated.streetfix.v1.localization_pb2_grpc import Localizati
 from service.runtime.keys import hash_of, new_key
 
 #: Until all workers must agree, and until a service must have ended.
-SETTLED_S, ENDED_S = 60.0, 60.0
+SETTLED_S, ENDED_S = 120.0, 120.0
 #: Until every worker has looked at the folder after SIGHUP.
 _LOOKED_S = 3.0
 _SAME_M = 0.01
@@ -604,7 +604,7 @@ class Chaos:
 
     def _settings(self) -> dict[str, object]:
         return {
-            "workers": self._workers, "threads": 1, "watch_s": 0.5, "drain_s": 0.5, "grace_s": 10, "request_timeout_s": 20,
+            "workers": self._workers, "threads": 1, "watch_s": 0.5, "drain_s": 0.5, "grace_s": 10, "request_timeout_s": 120,
             "api_keys": self._keys_file,
         }  # fmt: skip
 

@@ -23,7 +23,7 @@ from service.errors import StreetfixError
 
 SERVED_CORE, LOADING_CORE = 0, 1
 #: A service that is not ready after this long is ended.
-_READY_S = 120.0
+_READY_S = 300.0
 _CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 _SERVE = [sys.executable, "-c", "from service.cli.main import main; main()", "serve"]
 
