@@ -112,7 +112,8 @@ class Chaos:
         self._keys_are_broken = False
         self._sockets: list[socket.socket] = []
         self._number = self._full_since = 0
-        self._killed_s = self._sighup_s = 0.0
+        self._sighup_s = 0.0
+        self._whole_s: float | None = None
         self._valid = [new_key()]
         self._caller = Caller(_free_port(), _free_port(), pair, self._valid[0])
         self._reference: dict[tuple[Face, What], tuple[float, float, float]] = {}
@@ -167,7 +168,8 @@ class Chaos:
             heard()
             return
         step.expected = self._oracle.unsure(step.expected)
-        if time.monotonic() > self._killed_s + SETTLED_S:
+        self._note_whole()
+        if self._whole_s is not None and time.monotonic() > self._whole_s + _LOOKED_S:
             self._oracle.is_unsure = False
         self._done[-1] += f"; {' or '.join(sorted(step.expected.finals))} serves"
         if self._server is not None and self._server.process.poll() is not None:
@@ -273,11 +275,19 @@ class Chaos:
         return self._sighup() if told else self._same()
 
     def _is_whole(self) -> bool:
-        """Whether all workers have answered for some time: one that starts handles an earlier SIGHUP when it is ready."""
-        whole = len(_listeners(self._caller.port, self._pids())) == self._workers
-        if whole and self._killed_s > self._sighup_s - 2 * SETTLED_S:
-            time.sleep(_LOOKED_S)
-        return whole
+        """Whether all workers answer and have done what waited for them when they started, as an earlier SIGHUP."""
+        self._note_whole()
+        if self._whole_s is None:
+            return False
+        time.sleep(max(0.0, self._whole_s + _LOOKED_S - time.monotonic()))
+        return True
+
+    def _note_whole(self) -> None:
+        """Keep since when all workers answer."""
+        if len(_listeners(self._caller.port, self._pids())) < self._workers:
+            self._whole_s = None
+        elif self._whole_s is None:
+            self._whole_s = time.monotonic()
 
     def _maybe_sighup(self, told: str) -> Step:
         self._note(told)
@@ -348,7 +358,7 @@ class Chaos:
             time.sleep(0.005)
         cut = [(killed, time.monotonic())]
         self._note(f"{len(victims)} of {len(there)}")
-        self._killed_s = time.monotonic()
+        self._whole_s = None
         return Step(self._oracle.worker_started_again(), cut=cut)
 
     def _restart(self) -> Step:
