@@ -13,7 +13,9 @@ from service.localization.localizer import Localizer
 from service.localization.query import Query
 from service.maps.reader import MapBundle
 
-SETTINGS = BuildSettings(name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False)
+SETTINGS = BuildSettings(
+    name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False, traffic_vote=False
+)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +122,12 @@ def test_weather_removal_is_recorded(small_dataset, encoder_file, tmp_path):
 def test_progress_is_told_for_every_place(small_dataset, encoder_file, bundle, tmp_path):
     told = []
     build_map(
-        small_dataset, encoder_file, tmp_path / "told", SETTINGS, threads=1, report=lambda *event: told.append(event)
+        small_dataset,
+        encoder_file,
+        tmp_path / "told",
+        replace(SETTINGS, traffic_vote=True),
+        threads=1,
+        report=lambda *event: told.append(event),
     )
     count = bundle.manifest.counts.places
     assert told == [
@@ -291,8 +298,9 @@ def test_a_survey_with_poses_of_two_frames_is_refused_before_the_work(small_data
 
 
 def test_traffic_is_voted_about_unless_told_otherwise(small_dataset, encoder_file, bundle, tmp_path):
-    assert bundle.manifest.parameters["traffic_vote"] == 1.0
-    settings = replace(SETTINGS, traffic_vote=False)
-    made = build_map(small_dataset, encoder_file, tmp_path / "with traffic", settings, threads=1)
-    assert "traffic_vote" not in made.parameters
-    assert made.counts.cloud_points >= bundle.manifest.counts.cloud_points
+    assert BuildSettings(name="any").traffic_vote
+    assert "traffic_vote" not in bundle.manifest.parameters
+    settings = replace(SETTINGS, traffic_vote=True)
+    made = build_map(small_dataset, encoder_file, tmp_path / "without traffic", settings, threads=1)
+    assert made.parameters["traffic_vote"] == 1.0
+    assert made.counts.cloud_points <= bundle.manifest.counts.cloud_points
