@@ -8,8 +8,10 @@ import ctypes
 import threading
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-#: Blocks of this size are the system's own pages, and an arena keeps no more than this at its end. Pictures of usual cameras are smaller:
-#: fetching pages anew costs about 0.25 ms a MiB.
+#: Blocks of this size are the system's own pages; an arena keeps no more than that at its end. Lower ones cost time, since pages are
+#: fetched anew for every picture (decision log).
+MAPPED_BYTES, KEPT_BYTES = 16 * 2**20, 32 * 2**20
+#: What is freed at once and worth a trim.
 LARGE_BYTES = 8 * 2**20
 #: Trimming takes milliseconds, so it is done for many releases at once.
 _TRIM_AFTER_S = 0.25
@@ -24,8 +26,8 @@ def keep_little(threads: int) -> None:
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "mallopt"):
         return
-    libc.mallopt(_M_MMAP_THRESHOLD, LARGE_BYTES)
-    libc.mallopt(_M_TRIM_THRESHOLD, LARGE_BYTES)
+    libc.mallopt(_M_MMAP_THRESHOLD, MAPPED_BYTES)
+    libc.mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
     libc.mallopt(_M_ARENA_MAX, threads + 2)
 
 
