@@ -123,7 +123,11 @@ def write_report(path: Path, report: Mapping[str, Any]) -> Path:
     explain(rows)
     mark_stale(path.stem, rows, runs, head)
     named = {row["run"] for row in rows}
-    told = {"stale_as_of": head or None, "runs": {key: runs[key] for key in sorted(runs) if key in named}, "rows": rows}
+    kept = {key: runs[key] for key in sorted(runs) if key in named}
+    # The newest run once more, for programs that ask a report for one commit; each row's own run is what counts.
+    dated = [run for run in kept.values() if run.get("date")]
+    made = max(dated, key=lambda run: run["date"]) if dated else None
+    told = {"made": made, "stale_as_of": head or None, "runs": kept, "rows": rows}
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     part.write_text(json.dumps(told | ({"notes": report["notes"]} if report.get("notes") else {}), indent=1) + "\n")
