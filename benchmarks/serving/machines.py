@@ -73,27 +73,19 @@ class Server:
         maps: bundle, or folder of bundles.
         core: it is pinned to; None for all.
         trusted: authorities of its certificate, where it speaks TLS.
-        port: of REST; 0 lets the system choose.
-        grpc_port: of gRPC; 0 lets the system choose.
-        stderr: where its log goes; None shows it.
-        temporary: folder of its temporary files; None leaves that to the system.
-        enter: called in its process before it begins, as to enter a control group.
-        settings: as in the environment, lower case.
+        log: gets each line of its log; None shows them.
+        launching: as of ``launch``.
 
     Raises:
         RuntimeError: it ended before it was ready.
     """
 
     def __init__(
-        self, maps: Path, *, core: int | None = SERVED_CORE, trusted: ssl.SSLContext | None = None, port: int = 0,
-        grpc_port: int = 0, log: Callable[[str], None] | None = None, temporary: Path | None = None,
-        enter: Callable[[], None] | None = None, **settings: object,
+        self, maps: Path, *, core: int | None = SERVED_CORE, trusted: ssl.SSLContext | None = None,
+        log: Callable[[str], None] | None = None, **launching: Any,
     ) -> None:  # fmt: skip
         began = time.perf_counter()
-        stderr = None if log is None else subprocess.PIPE
-        self.process = launch(
-            maps, port=port, grpc_port=grpc_port, stderr=stderr, temporary=temporary, enter=enter, **settings
-        )
+        self.process = launch(maps, stderr=None if log is None else subprocess.PIPE, **launching)
         pin(self.process.pid, core)
         self._hearing: threading.Thread | None = None
         if log is not None and self.process.stderr is not None:

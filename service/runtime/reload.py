@@ -92,7 +92,8 @@ class Reloader:
             told = self._wake.wait(every_s)
             if self._stopping:
                 return
-            self._wake.clear()
+            if told:  # a signal that comes after the wait has timed out is for the next look
+                self._wake.clear()
             self.look(everything=told)
 
 

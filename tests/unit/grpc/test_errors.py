@@ -39,20 +39,6 @@ def engine(bundle_path: Path) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def channel(engine: Engine) -> Iterator[grpc.Channel]:
-    server = GrpcServer(engine, host="127.0.0.1", port=0)
-    server.start()
-    with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
-        yield channel
-    server.stop(grace_s=0)
-
-
-@pytest.fixture
-def stub(channel: grpc.Channel) -> LocalizationServiceStub:
-    return LocalizationServiceStub(channel)
-
-
-@pytest.fixture
 def request_of(parts_of: Parts) -> Callable[..., pb.LocalizeRequest]:
     def make(**changed: Any) -> pb.LocalizeRequest:
         parts = parts_of()

@@ -17,7 +17,6 @@ from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.grpc.memory import MessageMemory
 from service.grpc.reading import SERVICE
-from service.grpc.server import GrpcServer
 from service.runtime.engine import Engine
 from service.runtime.memory import MIB, MemoryBudget
 from service.runtime.settings import Limits, Settings
@@ -34,20 +33,6 @@ def engine(bundle_path: Path) -> Iterator[Engine]:
     engine.memory = MemoryBudget(8 * MIB, messages=2)
     yield engine
     engine.close()
-
-
-@pytest.fixture
-def channel(engine: Engine) -> Iterator[grpc.Channel]:
-    server = GrpcServer(engine, host="127.0.0.1", port=0)
-    server.start()
-    with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
-        yield channel
-    server.stop(grace_s=0)
-
-
-@pytest.fixture
-def stub(channel: grpc.Channel) -> LocalizationServiceStub:
-    return LocalizationServiceStub(channel)
 
 
 @pytest.fixture

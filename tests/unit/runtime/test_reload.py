@@ -1,12 +1,14 @@
 """Files that change while the service runs."""
 
 import logging
+import threading
 from pathlib import Path
 
 import pytest
 
 from service.errors import KeysError
 from service.runtime.reload import Reloader
+from service.runtime.wakeup import Wakeup
 
 
 class Loaded:
@@ -108,3 +110,27 @@ def test_one_that_fails_does_not_keep_the_others_back(path: Path, tmp_path: Path
     other.write_text("22")
     reloader.look()
     assert second.times == 2
+
+
+def test_a_signal_that_comes_just_after_a_wait_has_timed_out_is_not_lost(path: Path) -> None:
+    """It asks for all files, also those that look unchanged."""
+
+    class SignalledLate(Wakeup):
+        waits = 0
+
+        def wait(self, timeout_s: float | None = None) -> bool:
+            self.waits += 1
+            if self.waits == 1:
+                self.set()  # between the end of the wait and what follows it
+                return False
+            return super().wait(timeout_s)
+
+    again = threading.Event()
+    loaded, reloader = Loaded(), Reloader()
+    reloader.watch("x", [path], loaded)
+    reloader._wake = SignalledLate()
+    reloader.watch("y", [path], lambda: again.set() if loaded.times > 1 else None)
+    reloader.start(every_s=0)
+    assert again.wait(10)
+    reloader.stop()
+    assert loaded.times == 2
