@@ -8,6 +8,7 @@ import asyncio
 import re
 from collections.abc import Callable
 from email.message import Message
+from functools import lru_cache
 from typing import TypeVar
 
 from starlette.requests import Request
@@ -159,6 +160,9 @@ def _part(body: bytearray, start: int, end: int) -> tuple[str, bytes]:
     raise _malformed("a part has no Content-Disposition")
 
 
+@lru_cache(
+    maxsize=64
+)  # a client sends the same few for every request, and the library's parser is the dearest step of splitting
 def _name_from(disposition: str) -> str:
     header = Message()
     header["content-disposition"] = disposition.strip()

@@ -1,5 +1,7 @@
 """Which candidates exclude each other, and how the support is shared among them."""
 
+import math
+
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
@@ -12,9 +14,9 @@ RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
 
 def is_rival(one: Candidate, other: Candidate) -> bool:
     """Whether two candidates are answers that exclude each other."""
-    apart = np.linalg.norm(one.T_map_camera[:3, 3] - other.T_map_camera[:3, 3])
-    turned = np.trace(one.T_map_camera[:3, :3].T @ other.T_map_camera[:3, :3])
-    return bool(apart > RIVAL_M or turned < 1 + 2 * np.cos(RIVAL_RAD))
+    apart = math.dist(one.T_map_camera[:3, 3], other.T_map_camera[:3, 3])
+    trace = (one.T_map_camera[:3, :3] * other.T_map_camera[:3, :3]).sum()  # of the rotation between both
+    return bool(apart > RIVAL_M or trace < 1 + 2 * np.cos(RIVAL_RAD))
 
 
 def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
