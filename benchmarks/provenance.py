@@ -148,7 +148,7 @@ def loaded_commit() -> str:
 
 def is_dirty() -> bool | None:
     """Whether the code differs from the commit that is checked out; None without Git."""
-    told = git("status", "--porcelain", "--", "service", "model_training", "benchmarks")
+    told = git("status", "--porcelain", "--", "service", "model_training", "benchmarks", "native")
     return None if told is None else bool(told)
 
 

@@ -46,7 +46,8 @@ def memory_rows(report: Report, site: Site) -> None:
     good = _good_parts(sent[0].body, sent[0].content_type)
     with Limited(LIMIT_MIB) as limited:
         # Where no control group can be made the service sees the machine's memory, so it is told what the limit would have left.
-        told = {} if limited.enter else {"request_memory_mib": LIMIT_MIB // 2}
+        told: dict[str, int] = {} if limited.enter else {"request_memory_mib": LIMIT_MIB // 2}
+        told["limits__max_message_bytes"] = LARGE_BYTES  # by default gRPC would refuse such messages by their length
         with Server(site.bundle, core=None, enter=limited.enter, **told) as server:
             limited.watch(server.process.pid)
             ends: dict[str, Counter[str]] = {}
@@ -94,15 +95,19 @@ def _until_over(attackers: list[tuple[str, Callable[[], str]]], ends: dict[str, 
 def _attackers(server: Server, good: dict[str, bytes]) -> list[tuple[str, Callable[[], str]]]:
     large = memoryview(_large_body())
     message = memoryview(_large_message())
+    frame = memoryview(_as_frame(message))
     sequence = memoryview(_sequence())
     kinds = list(hostile_kinds(good).values())
     found: list[tuple[str, Callable[[], str]]] = []
     found += BODIES * [("body", lambda: _sent(server.url, "/v1/localize", large, chunked=False))]
     found += BODIES // 3 * [("chunked body", lambda: _sent(server.url, "/v1/localize", large, chunked=True))]
     found += MESSAGES * [("message", lambda: call(server.grpc, f"{_SERVICE}/Localize", message, timeout_s=_TIMEOUT_S))]
-    for path in ("/grpc.health.v1.Health/Check", "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
-                 f"{_SERVICE}/LocalizeStream"):  # fmt: skip
-        found += OF_OTHERS * [(path.rsplit("/", 1)[-1], _message_to(server.grpc, path, message))]
+    for path, sent in (
+        ("/grpc.health.v1.Health/Check", message),
+        ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", message),
+        (f"{_SERVICE}/LocalizeStream", frame),
+    ):
+        found += OF_OTHERS * [(path.rsplit("/", 1)[-1], _message_to(server.grpc, path, sent))]
     found += SEQUENCES * [
         ("sequence of large pictures", lambda: _sent(server.url, "/v1/localize/sequence", sequence, chunked=False))
     ]
@@ -177,8 +182,14 @@ def _large_message() -> bytes:
     for name, value in _CAMERA.items():
         setattr(message.camera, name, value)
     written = message.SerializeToString()
-    left = LARGE_BYTES - 16 - len(written)
+    left = LARGE_BYTES - 32 - len(written)
     return written + b"\xfa\x7f" + _varint(left) + bytes(left)  # field 2047, bytes
+
+
+def _as_frame(message: memoryview) -> bytes:
+    """A message as the frame of a stream's message, which is answered."""
+    number = pb.LocalizeStreamRequest.DESCRIPTOR.fields_by_name["frame"].number
+    return _varint(number << 3 | 2) + _varint(len(message)) + message
 
 
 def _sequence() -> bytes:

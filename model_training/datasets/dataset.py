@@ -124,14 +124,18 @@ class QueryFrame:
             )  # fmt: skip
 
     def query(self, grid: ViewGrid) -> Query:
-        """The query that a service makes of these pictures for a map with this view grid, all options at their defaults."""
+        """The query that a service makes of these pictures for a map with this view grid, all options at their defaults.
+
+        Raises:
+            DatasetError: a picture vanished or is damaged.
+        """
         spec = self.camera.depth
         how = DepthFormat(
             kind=spec.kind, scale_m=spec.scale_m, baseline_m=spec.baseline_m, max_range_m=spec.max_range_m
         )
-        return decoded_query(
-            self.rgb_path.read_bytes(), self.depth_path.read_bytes(), self.camera.pinhole(), how, grid=grid
-        )
+        rgb, depth = read_bytes(self.rgb_path), read_bytes(self.depth_path)
+        with _decoding(self.rgb_path, self.depth_path):
+            return decoded_query(rgb, depth, self.camera.pinhole(), how, grid=grid)
 
     def request(self) -> dict[str, Any]:
         """The parts of a request to the service that follow from the camera, as ``streetfix localize --camera`` takes them."""
@@ -250,12 +254,12 @@ class Dataset:
 
 
 @contextmanager
-def _decoding(path: Path) -> Iterator[None]:
-    """What is wrong with a picture, said of its file; a request's field would say nothing here."""
+def _decoding(*paths: Path) -> Iterator[None]:
+    """What is wrong with pictures, said of their files; a request's field would say nothing here."""
     try:
         yield
     except StreetfixError as error:
-        raise DatasetError(f"{path}: {error.message}", field=path.name) from error
+        raise DatasetError(f"{', '.join(map(str, paths))}: {error.message}", field=paths[0].name) from error
 
 
 def _camera_names(folder: Path, count: int) -> list[str] | None:

@@ -10,6 +10,7 @@ from jaxtyping import Float64
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.datasets.files import read_bytes
 from service.errors import DatasetError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.imaging.depth_formats import read_depth_values
@@ -66,7 +67,7 @@ def payloads(
 
 
 def _payload(frame: QueryFrame, map_name: str | None, refine: bool, cheap_depth: bool) -> Payload:
-    rgb, depth, spec = frame.rgb_path.read_bytes(), frame.depth_path.read_bytes(), frame.camera.depth
+    rgb, depth, spec = read_bytes(frame.rgb_path), read_bytes(frame.depth_path), frame.camera.depth
     if cheap_depth:
         depth = _as_raw16(depth, frame)
     document: dict[str, Any] = frame.request() | {"options": {"refine": refine}}

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from service.client.tls import EncryptedKeyError, refuse_password
 from service.errors import KeysError
 from service.runtime.readable import why_unreadable
 
@@ -109,7 +110,11 @@ class Certificates:
         before = self._bytes()
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         try:
-            context.load_cert_chain(self._certificate, self._key, password=_no_password)
+            context.load_cert_chain(self._certificate, self._key, password=refuse_password)
+        except EncryptedKeyError as error:
+            raise KeysError(
+                f"{self._key}: the private key is encrypted; decrypt it: openssl pkey -in FILE -out PLAIN"
+            ) from error
         except (OSError, ssl.SSLError) as error:
             raise KeysError(f"{self._certificate}, {self._key}: no certificate with its key ({error})") from error
         if self._client_ca is not None:
@@ -146,8 +151,3 @@ def _context_of(certificates: Certificates) -> ssl.SSLContext:
     context = _DelegatingContext(ssl.PROTOCOL_TLS_SERVER)
     context.certificates = certificates
     return context
-
-
-def _no_password() -> bytes:
-    """Else OpenSSL asks for one at the terminal."""
-    return b""

@@ -23,18 +23,21 @@ class DrainingServer(uvicorn.Server):
         config: of the service.
         engine: that is told first.
         delay_s: the while, seconds.
+        started: called once it listens.
         leaving: called when it is over.
         beside: further listeners of the same loop, each with its configuration, as the health port's: a loop that hangs must not
             look alive.
     """
 
     def __init__(
-        self, config: uvicorn.Config, engine: "Engine", *, delay_s: float, leaving: Callable[[], object] = lambda: None,
+        self, config: uvicorn.Config, engine: "Engine", *, delay_s: float, started: Callable[[], object] = lambda: None,
+        leaving: Callable[[], object] = lambda: None,
         beside: Sequence[tuple[socket.socket, uvicorn.Config]] = (),
     ) -> None:  # fmt: skip
         super().__init__(config)
         self._engine = engine
         self._delay_s = delay_s
+        self._started = started
         self._leaving = leaving
         self._beside = beside
         self._leave_at_s: float | None = None
@@ -51,6 +54,7 @@ class DrainingServer(uvicorn.Server):
 
             server = await asyncio.get_running_loop().create_server(protocol, sock=listener, backlog=config.backlog)
             self.servers.append(server)
+        self._started()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """No new connections, then the end of running requests; other faces begin to leave at the same moment."""

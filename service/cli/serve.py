@@ -9,6 +9,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -158,7 +159,7 @@ def _answer_by_workers(settings: "Settings") -> None:
     Each listens on a socket of its own, between which the system spreads connections: of one socket that all share, whoever is quick
     takes all connections of clients that keep them.
     """
-    from service.cli.shared_counts import reserve
+    from service.cli.shared_counts import release, reserve
     from service.cli.workers import supervise
     from service.runtime.serving_table import SharedMemory, SharedServingTable
 
@@ -186,14 +187,11 @@ def _answer_by_workers(settings: "Settings") -> None:
                     typer.echo(f"streetfix: {told}", err=True)
                 _answer(shared, listener, health, table=table, ready=ready, says_where=number == 0)
 
-        def ended(pid: int) -> None:
-            for path in counts.glob(f"gauge_live*_{pid}.db"):  # what it had in hand it has no more
-                path.unlink(missing_ok=True)
-
         # Requests and streams each end within the grace; what still runs long after it hangs.
         code = supervise(
-            settings.workers, work, ended=ended, kill_after_s=settings.drain_s + 2 * settings.grace_s + 10.0
-        )
+            settings.workers, work, ended=partial(release, counts),
+            kill_after_s=settings.drain_s + 2 * settings.grace_s + 10.0,
+        )  # fmt: skip
     if code:
         raise typer.Exit(code)
 
@@ -250,16 +248,21 @@ def _answer(
             beside = [] if health is None else [(health, _plain(create_health_app(engine)))]
             with (
                 _grpc(engine, keys, tls) as (grpc_port, leave),
-                _reloading(engine),
-                reloading(keys, tls, every_s=settings.watch_s),
+                reloading(keys, tls, every_s=settings.watch_s) as reloader,
+                _watching(engine, also=reloader.look_now),
             ):
-                server = DrainingServer(config, engine, delay_s=settings.drain_s, leaving=leave, beside=beside)
+
+                def started() -> None:
+                    ready()
+                    if says_where:
+                        _say_where(engine, listener, grpc_port, "http" if tls is None else "https", health)
+
+                server = DrainingServer(
+                    config, engine, delay_s=settings.drain_s, started=started, leaving=leave, beside=beside
+                )
                 # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
                 for number in (signal.SIGINT, signal.SIGTERM):
                     signal.signal(number, server.handle_exit)
-                ready()
-                if says_where:
-                    _say_where(engine, listener, grpc_port, "http" if tls is None else "https", health)
                 server.run(sockets=[listener])
         finally:
             engine.close()
@@ -313,7 +316,7 @@ def _grpc(
 
 @contextmanager
 def _hangup_held_back() -> Iterator[None]:
-    """SIGHUP waits inside until ``_reloading`` has a handler for it; without one it would end the process.
+    """SIGHUP waits inside until ``_watching`` has a handler for it; without one it would end the process.
 
     The supervisor does the same for workers.
     """
@@ -321,20 +324,28 @@ def _hangup_held_back() -> Iterator[None]:
     try:
         yield
     finally:
+        # One that came after ``_watching`` had ended is dropped: ignoring a signal discards it while it is blocked.
+        handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.signal(signal.SIGHUP, handler)
 
 
 @contextmanager
-def _reloading(engine: "Engine") -> Iterator[None]:
+def _watching(engine: "Engine", *, also: Callable[[], None]) -> Iterator[None]:
     """Look for new bundles inside: every so often, and on SIGHUP.
 
-    SIGHUP means: read again what lies outside. Whatever else is to be read anew belongs into ``reload``. Nothing inside the service
-    sends SIGHUP; workers tell each other about maps through the serving table.
+    SIGHUP means: read again what lies outside. Nothing inside the service sends SIGHUP; workers tell each other about maps through
+    the serving table.
+
+    Args:
+        engine: whose maps are looked for.
+        also: called on SIGHUP, too; it must be safe in a signal handler.
     """
     watcher = engine.watcher
 
     def reload(_number: int, _frame: FrameType | None) -> None:  # runs between two instructions of the main thread
         watcher.look_now()
+        also()
 
     watcher.start(engine.settings.watch_s or threading.TIMEOUT_MAX)
     before = signal.signal(signal.SIGHUP, reload)

@@ -20,8 +20,9 @@ import typer
 
 from service.errors import StreetfixError
 
-#: Seconds before a worker that ended by itself is started again, so that one that ends at once does not keep the machine busy.
-RESTART_S = 1.0
+#: Seconds before a worker that ended by itself is started again. The wait doubles, up to the most, for one that ends again within
+#: ``STEADY_S``, so that a worker that ends at once does not keep the machine busy.
+RESTART_S, MOST_RESTART_S, STEADY_S = 1.0, 30.0, 10.0
 _PR_SET_PDEATHSIG = 1
 _STOPPING = (signal.SIGTERM, signal.SIGINT)
 _WATCHED = (*_STOPPING, signal.SIGHUP, signal.SIGCHLD)
@@ -61,6 +62,8 @@ class _Supervisor:
         os.set_blocking(self._ready, False)
         self._running: dict[int, int] = {}  # process id -> number of the worker
         self._due = dict.fromkeys(range(count), 0.0)  # number of a worker that is to be started -> when
+        self._started: dict[int, float] = {}  # number of a worker -> when it was started last
+        self._wait_s: dict[int, float] = {}  # number of a worker -> how long it waited before it was started last
         self._answered: set[int] = set()
         self._stopping = False
         self._kill_at: float | None = None
@@ -74,14 +77,16 @@ class _Supervisor:
                 received = _bytes(self._signals)
                 if signal.SIGCHLD in received:
                     self._reap()
-                for number in (signal.SIGHUP, *_STOPPING):
+                if signal.SIGHUP in received:
+                    self._pass_on(signal.SIGHUP)
+                for number in _STOPPING:
                     if number in received:
-                        self._pass_on(number)
+                        self._stop(number)
                 if self._kill_at is not None and time.monotonic() >= self._kill_at:
                     self._kill()
             return self._code
         except BaseException:  # a defect here must not leave workers behind
-            self._pass_on(signal.SIGTERM)
+            self._stop(signal.SIGTERM)
             raise
         finally:
             os.close(self._ready)
@@ -90,7 +95,9 @@ class _Supervisor:
     def _start_what_is_due(self) -> None:
         now = time.monotonic()
         for number in [each for each, at in self._due.items() if at <= now]:
-            del self._due[number]
+            if self._due.pop(number, None) is None:  # one before it could not be started, and the service ends
+                return
+            self._started[number] = now
             try:
                 self._running[_forked(number, self._work, self._tell_ready)] = number
             except OSError as error:  # the machine has no room for another process
@@ -123,17 +130,23 @@ class _Supervisor:
     def _not_running(self, number: int) -> None:
         """Start a worker again after a while if it ever answered; else end the service."""
         if number in self._answered:
-            self._due[number] = time.monotonic() + RESTART_S
+            now = time.monotonic()
+            was_steady = now - self._started[number] >= STEADY_S
+            wait_s = RESTART_S if was_steady else min(2 * self._wait_s.get(number, RESTART_S / 2), MOST_RESTART_S)
+            self._wait_s[number], self._due[number] = wait_s, now + wait_s
         else:
             self._code = 1
-            self._pass_on(signal.SIGTERM)
+            self._stop(signal.SIGTERM)
+
+    def _stop(self, number: int) -> None:
+        """Begin the end: no worker is started any more, and all are told to stop."""
+        self._stopping = True
+        self._due.clear()
+        if self._kill_at is None and self._kill_after_s is not None:
+            self._kill_at = time.monotonic() + self._kill_after_s
+        self._pass_on(number)
 
     def _pass_on(self, number: int) -> None:
-        if number in _STOPPING:
-            self._stopping = True
-            self._due.clear()
-            if self._kill_at is None and self._kill_after_s is not None:
-                self._kill_at = time.monotonic() + self._kill_after_s
         for pid in self._running:  # none of them was reaped, so each id is still that of the worker
             os.kill(pid, number)
 

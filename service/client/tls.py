@@ -117,8 +117,8 @@ class ClientTls:
             for file in (self.cert, self.key):  # OpenSSL does not say which of the two it cannot read
                 file.read()
             try:
-                context.load_cert_chain(self.cert.path, self.key.path, password=_no_password)
-            except _EncryptedKeyError as error:
+                context.load_cert_chain(self.cert.path, self.key.path, password=refuse_password)
+            except EncryptedKeyError as error:
                 raise self.key.unusable(
                     "the private key is encrypted", "decrypt it: openssl pkey -in FILE -out PLAIN"
                 ) from error
@@ -139,13 +139,13 @@ class ClientTls:
         return tuple(None if each is None else each.read() for each in (self.ca, self.key, self.cert))  # type: ignore[return-value]
 
 
-class _EncryptedKeyError(Exception):
+class EncryptedKeyError(Exception):
     """OpenSSL wants a password."""
 
 
-def _no_password() -> str:
+def refuse_password() -> str:
     """Without it OpenSSL would ask at the terminal."""
-    raise _EncryptedKeyError
+    raise EncryptedKeyError
 
 
 def _authorities(file: TlsFile) -> str:

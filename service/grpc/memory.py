@@ -17,8 +17,8 @@ STREAMS_SHARE = 0.5
 #: Calls and streams of other services (health, reflection) that are read at once, outside of the budget: they are answered when it is
 #: spent.
 OTHER_CALLS, OTHER_STREAMS = 1, GRPC_OTHERS - 1
-#: A call waits so long for its turn: reading takes milliseconds, so this is an overload.
-TURN_S = 1.0
+#: A call waits so long for its turn, one of another service so long: others may send their messages over a slow link.
+TURN_S, OTHERS_TURN_S = 5.0, 0.1
 
 #: What the call of this thread holds.
 held_by_call: ContextVar[Hold | None] = ContextVar("held_by_call", default=None)
@@ -75,7 +75,7 @@ class MessageMemory:
             BusyError: others read.
         """
         places = self._other_streams if streams else self._other_calls
-        with _taken(places, "more calls send messages than may; try again in a second"):
+        with _taken(places, "more calls send messages than may; try again in a second", wait_s=OTHERS_TURN_S):
             yield
 
     @contextmanager

@@ -12,8 +12,9 @@ import grpc
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.descriptor_pool import Default
 from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
 
-from service.errors import RequestError, StreetfixError
+from service.errors import BusyError, RequestError, StreetfixError
 from service.grpc.call import Call
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.memory import MessageMemory, held_by_call
@@ -27,7 +28,7 @@ else:  # generic in its stub alone
 
 SERVICE: str = pb.DESCRIPTOR.services_by_name["LocalizationService"].full_name
 #: Seconds in which a message of another service (health, reflection) must be there: it is small.
-OTHERS_S = 3.0
+OTHERS_S = 1.0
 #: Ends a call of that name as the contract says; ``service.grpc.answering.answering`` of an engine.
 Answering = Callable[[str, grpc.ServicerContext], AbstractContextManager[Call]]
 Messages = Iterator[bytes]
@@ -103,8 +104,16 @@ class ReadingInterceptor(_Interceptor):
     ) -> Callable[[Messages, grpc.ServicerContext], Any]:
         del method  # our servicer ends its streams itself
 
+        def one_by_one(messages: Messages) -> Iterator[Message]:
+            while (raw := next(messages, None)) is not None:
+                with self._memory.parsing(len(raw)):
+                    request = parsed(raw, message)
+                    del raw  # the stream has reserved memory for one of both
+                yield request
+                del request
+
         def stream(messages: Messages, context: grpc.ServicerContext) -> Any:
-            return handler.stream_stream((parsed(raw, message) for raw in messages), context)
+            return handler.stream_stream(one_by_one(messages), context)
 
         return stream
 
@@ -144,12 +153,16 @@ class ReadingInterceptor(_Interceptor):
         return answers
 
     def _small(self, messages: Messages, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
-        """The only message of a call of another service."""
+        """The only message of a call of another service.
+
+        Nobody needs a key for health. If a caller holds the turn and sends nothing, others are answered as if their messages were
+        empty: health of the whole service.
+        """
         try:
             with self._memory.turn_of_others(streams=False):
                 raw = self._next(messages, method, context, OTHERS_S)
-        except StreetfixError as error:
-            self._end(error, method, context)
+        except BusyError:
+            return GetMessageClass(message)()
         return self._parsed(raw, message, method, context)
 
     def _next(self, messages: Messages, method: str, context: grpc.ServicerContext, timeout_s: float) -> bytes:

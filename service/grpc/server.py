@@ -52,7 +52,7 @@ class GrpcServer:
         settings = engine.settings
         self._patience = Patience()
         memory = MessageMemory(
-            engine.memory, most_bytes=settings.limits.max_request_bytes, most_streams=settings.grpc_streams
+            engine.memory, most_bytes=settings.limits.message_bytes, most_streams=settings.grpc_streams
         )
         reading = ReadingInterceptor(
             self._patience, memory, timeout_s=settings.request_timeout_s, answering=partial(answering, engine)
@@ -62,7 +62,7 @@ class GrpcServer:
         self._server = grpc.server(
             ThreadPoolExecutor(most, thread_name_prefix="streetfix-grpc"),
             options=[
-                ("grpc.max_receive_message_length", settings.limits.max_request_bytes),
+                ("grpc.max_receive_message_length", settings.limits.message_bytes),
                 ("grpc.max_send_message_length", -1),
                 # What a client may send ahead of our asking for its message: gRPC would widen it to megabytes by itself.
                 ("grpc.http2.bdp_probe", 0),

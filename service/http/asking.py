@@ -21,7 +21,7 @@ class Asking:
         self.engine = engine
         self._bodies = asyncio.Semaphore(
             engine.admission.capacity
-        )  # bounds the memory of bodies that are still coming in
+        )  # bounds the number of bodies that are still coming in; their memory is the budget's
 
     async def in_time(self, work: Callable[[], T]) -> T:
         """Work that needs no body, on a worker, in no more time than a request may take.

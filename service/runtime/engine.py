@@ -89,7 +89,7 @@ class Engine:
         self.watcher = watcher or MapWatcher(registry, settings.maps, warm=partial(warm_up, settings.false_accept_rate))
         self.threads = settings.threads or max(1, usable_cores() // settings.workers)
         self.admission = Admission(threads=self.threads, queue=settings.queue, initializer=limit_pools)
-        self.memory = budget_of(settings, threads=self.threads, maps_bytes=_files_bytes(registry))
+        self.memory = budget_of(settings, threads=self.threads)
         self.metrics = Metrics(self.admission, registry, self.memory)
         self.last_answers = LastAnswers()
         self.tracing = Tracing.open(settings.traces_endpoint, share=settings.traces_share)
@@ -249,12 +249,6 @@ def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
     rgb = rng.integers(0, 255, (48, 64, 3), np.uint8)
     depth_m = rng.uniform(2.0, 20.0, (48, 64)).astype(np.float32)
     localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera, false_accept_rate=false_accept_rate))
-
-
-def _files_bytes(registry: MapRegistry) -> int:
-    """Of the files of all open maps."""
-    paths = [path for localizer in registry for path in localizer.bundle.path.rglob("*")]
-    return sum(path.stat().st_size for path in paths if path.is_file())
 
 
 def _prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:

@@ -47,7 +47,11 @@ class Trimmer:
             self._is_coming = True
         timer = threading.Timer(_TRIM_AFTER_S, self._now)
         timer.daemon = True
-        timer.start()
+        try:
+            timer.start()
+        except RuntimeError:  # no thread can be started now, or the interpreter ends: the next release asks again
+            with self._lock:
+                self._is_coming = False
 
     def _now(self) -> None:
         with self._lock:

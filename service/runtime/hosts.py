@@ -54,11 +54,13 @@ class AllowedHosts:
     """Names by which a service may be asked.
 
     Attributes:
-        names: exact ones, and ``*.`` before those that stand for all below.
+        names: that the operator listed: exact ones, and ``*.`` before those that stand for all below.
+        own: name that the service listens on; empty where it is an address.
         any_name: every name is allowed.
     """
 
     names: tuple[str, ...]
+    own: str
     any_name: bool
 
     @classmethod
@@ -69,9 +71,9 @@ class AllowedHosts:
         a service that is reached by others are not known to it.
         """
         guarded = settings.api_keys is not None or settings.tls_client_ca is not None
-        own = () if _is_address(settings.host) else (settings.host.lower().rstrip("."),)
-        listed = (*own, *(each for each in settings.allowed_hosts if each != _ANY))
-        return cls(listed, _ANY in settings.allowed_hosts or (guarded and not settings.allowed_hosts))
+        own = "" if _is_address(settings.host) else settings.host.lower().rstrip(".")
+        listed = tuple(each for each in settings.allowed_hosts if each != _ANY)
+        return cls(listed, own, _ANY in settings.allowed_hosts or (guarded and not settings.allowed_hosts))
 
     def allows(self, host: str) -> bool:
         """Whether a ``Host`` header names this service: an address, a loopback name, or one of the names."""
@@ -79,7 +81,11 @@ class AllowedHosts:
         if authority is None:
             return False
         return (
-            self.any_name or _is_address(authority.host) or self._lists(authority.host) or _is_loopback(authority.host)
+            self.any_name
+            or _is_address(authority.host)
+            or _is_loopback(authority.host)
+            or authority.host == self.own
+            or self._lists(authority.host)
         )
 
     def allows_origin(self, origin: str, host: str) -> bool:

@@ -138,6 +138,8 @@ class MapWatcher:
             if told:
                 self._told.clear()
             try:
+                if time.monotonic() >= next_look:
+                    self._forget_failures_of(table.others_offer())
                 before, seen = seen, table.read()
                 is_news = seen is not before and bool(self._due or table.others_offer())
                 if told or is_news or time.monotonic() >= next_look:
@@ -147,6 +149,14 @@ class MapWatcher:
                     table.settle()  # a worker that all wait for may have ended
             except Exception:  # a defect here must not end the watching, nor the service
                 _log.exception("map_scan_failed")
+
+    def _forget_failures_of(self, versions: Iterable[MapVersion]) -> None:
+        """Try again what failed here alone: the others wait for this worker, and the cause may have passed (memory, a network disk)."""
+        keys = {each.key for each in versions}
+        for path in [path for path in self._failed if path in self._manifests]:
+            if manifest_key(self._manifests[path][1]) in keys:
+                _log.warning("map_tried_again path=%s reason=other workers have it open", path)
+                del self._failed[path]
 
     def _mount_new(self, bundles: Iterable[_Bundle]) -> list[str]:
         told = []

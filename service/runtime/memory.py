@@ -28,7 +28,8 @@ PROCESS_BYTES = 192 * MIB
 THREAD_BYTES = 32 * MIB
 #: Share of the limit that stays free: fragmentation, sockets, connections, versions of maps that come.
 SPARE_SHARE = 0.125
-#: Pages of maps can be read again from their files, but an answer that has to do so is slow: so much of the limit stays for them.
+#: Pages of maps can be read again from their files, but an answer that has to do so is slow: so much of the limit stays for them, also
+#: where the maps come later.
 MAPS_SHARE = 0.25
 #: Largest messages that gRPC holds beside the budget: 2.2 copies while its one thread takes a message over from C, those of health
 #: and reflection, which must be answered when the budget is spent, and those that are parsed.
@@ -181,21 +182,20 @@ class Hold:
             self.shrink_to(0)
 
 
-def budget_of(settings: "Settings", *, threads: int, maps_bytes: int) -> MemoryBudget:
+def budget_of(settings: "Settings", *, threads: int) -> MemoryBudget:
     """The budget of one process: as set, else what the machine's or container's limit leaves.
 
     Args:
         settings: of the service.
         threads: that answer in a process.
-        maps_bytes: of the files of the open maps, which all processes share.
 
     Raises:
         RequestError: too little is left for requests.
     """
-    message = settings.limits.max_request_bytes
+    message, body = settings.limits.message_bytes, settings.limits.max_request_bytes
     if settings.request_memory_mib is None:
         limit = memory_limit()
-        shared = limit * SPARE_SHARE + min(maps_bytes, limit * MAPS_SHARE)
+        shared = limit * (SPARE_SHARE + MAPS_SHARE)
         process = max(anonymous_bytes(), PROCESS_BYTES) + threads * THREAD_BYTES
         if settings.grpc_port is not None:
             process += round((GRPC_COPIES + GRPC_PARSED + GRPC_OTHERS) * message)
@@ -204,7 +204,7 @@ def budget_of(settings: "Settings", *, threads: int, maps_bytes: int) -> MemoryB
     else:
         left = settings.request_memory_mib * MIB // settings.workers
         of = f"setting request_memory_mib: {settings.request_memory_mib} MiB leave"
-    least = max(LEAST_BYTES, 3 * message)
+    least = max(LEAST_BYTES, 3 * body)
     if left < least:
         raise RequestError(
             f"{of} {_mib(max(0, left))} for the requests of each of {settings.workers} processes with {threads} threads, and {_mib(least)} "

@@ -31,8 +31,17 @@ class Limits(BaseModel):
 
     # gRPC takes the length of a message in 32 bits.
     max_request_bytes: int = Field(40 * 2**20, ge=1024, le=2**31 - 1, description="whole body of a request")
+    max_message_bytes: int = Field(
+        16 * 2**20, ge=1024, le=2**31 - 1,
+        description="one gRPC message, no more than max_request_bytes; memory is kept for this size while a message is read",
+    )  # fmt: skip
     max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, le=2**31 - 1, description="one picture, encoded")
     max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, le=2**30, description="one picture, decoded")
+
+    @property
+    def message_bytes(self) -> int:
+        """Of the largest gRPC message: no face takes more than a request may have."""
+        return min(self.max_message_bytes, self.max_request_bytes)
 
 
 class Settings(BaseSettings):

@@ -199,7 +199,37 @@ def test_a_process_that_cannot_be_forked_ends_the_others(started: list["subproce
     started.append(process)
     _, told = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert "worker 2 cannot be started (Resource temporarily unavailable)" in told
+    assert told == "streetfix: worker 2 cannot be started (Resource temporarily unavailable)\n"
+
+
+def test_a_worker_that_ends_again_and_again_waits_longer_each_time(started: list["subprocess.Popen[str]"]) -> None:
+    """The waits are what the supervisor asks ``select`` for; here they pass at once."""
+    process = run(
+        """
+        import itertools, select
+        clock, waits = [0.0], []
+        workers.time.monotonic = lambda: clock[0]
+        real = select.select
+        def passing(readable, *rest):
+            wait_s = rest[2]
+            if wait_s:
+                waits.append(wait_s)
+                clock[0] += wait_s
+                if len(waits) == 7:
+                    print(*waits, flush=True)
+                    os.kill(os.getpid(), signal.SIGTERM)
+                wait_s = 0
+            return real(readable, *rest[:2], wait_s)
+        workers.select.select = passing
+        def work(number, ready):
+            ready()
+            os._exit(1)
+        workers.supervise(1, work)
+        """
+    )
+    started.append(process)
+    told, _ = process.communicate(timeout=60)
+    assert [float(each) for each in told.split()] == [1, 2, 4, 8, 16, 30, 30]
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="only Linux tells a process that its parent has ended")

@@ -131,38 +131,39 @@ def test_no_more_messages_are_read_at_once_than_there_is_memory_for(
     assert becomes(lambda: not is_refused())
 
 
-@pytest.mark.parametrize(
-    ("path", "form"),
-    [
-        ("/grpc.health.v1.Health/Check", "stream_unary"),
-        ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", "stream_stream"),
-    ],
-)
-def test_other_services_read_one_message_at_a_time(channel: grpc.Channel, path: str, form: str) -> None:
-    """They need no key and are not weighed, so a hundred large messages to them must not be read side by side."""
+def test_health_is_answered_while_others_hold_its_turn_and_send_nothing(channel: grpc.Channel) -> None:
+    """It needs no key, so nobody may keep probes from their answer."""
     over = threading.Event()
 
     def silent() -> Iterator[bytes]:
         over.wait(30)
         yield from ()
 
-    ended: list[grpc.StatusCode] = []
-    calls = []
-    for _ in range(4):
-        call = getattr(channel, form)(path)
-        found = call.future(silent()) if form == "stream_unary" else call(silent())
-        found.add_callback(lambda: None)
-        calls.append(found)
-    for found in calls:
-        try:
-            if form == "stream_unary":
-                found.result(timeout=10)
-            else:
-                next(found)
-        except (grpc.RpcError, StopIteration):
-            ended.append(found.code())
+    held = [channel.stream_unary("/grpc.health.v1.Health/Check").future(silent()) for _ in range(4)]
+    for _ in range(5):
+        answer = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=10)
+        assert answer.status == health_pb2.HealthCheckResponse.SERVING
     over.set()
-    assert len(ended) == 4
+    for each in held:
+        each.cancel()
+
+
+def test_reflection_reads_one_message_at_a_time(channel: grpc.Channel) -> None:
+    """Its messages are not weighed, so a hundred large ones must not be read side by side."""
+    over = threading.Event()
+
+    def silent() -> Iterator[bytes]:
+        over.wait(30)
+        yield from ()
+
+    path = "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo"
+    calls = [channel.stream_stream(path)(silent()) for _ in range(4)]
+    ended = []
+    for call in calls:
+        with pytest.raises((grpc.RpcError, StopIteration)):
+            next(call)
+        ended.append(call.code())
+    over.set()
     assert ended.count(grpc.StatusCode.RESOURCE_EXHAUSTED) >= 2
 
 

@@ -151,6 +151,15 @@ def test_only_pages_of_the_same_origin_or_a_listed_name_may_send_more_than_get(
     assert client.get("/v1/maps", headers={"Host": host, "Origin": origin}).status_code == 200
 
 
+def test_the_name_that_a_service_listens_on_is_no_listed_origin(client_with: Any) -> None:
+    """A page of another port of this machine is another program's."""
+    client = client_with(host="localhost")
+    headers = {"Host": "localhost:8000", "Origin": "http://localhost:9999"}
+    assert (
+        client.put("/v1/maps/tiny/serving", headers=headers, json={"version": "x"}).json()["code"] == "forbidden-origin"
+    )
+
+
 def test_a_program_sends_no_origin_and_is_answered(client_with: Any) -> None:
     client = client_with()
     (entry,) = client.get("/v1/maps").json()["maps"]

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from service.errors import BundleError
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.map_registry import MapRegistry
@@ -78,6 +79,28 @@ def test_a_worker_opens_what_another_one_has_found(start: Start, write: Write) -
     until(lambda: workers[1].registry.table.others_offer() == frozenset())
     write(1)
     workers[0].watcher.scan()
+    until(lambda: [each.serving for each in workers] == ["v1", "v1"])
+    workers[1].watcher.stop()
+
+
+def test_what_failed_in_one_worker_for_a_while_is_tried_again_as_the_others_wait(start: Start, write: Write) -> None:
+    """Its memory was full, or a network disk was away: the files are as they were, so no change of theirs says to try again."""
+    workers = [start(number) for number in range(2)]
+    failures = []
+
+    def fails_once(localizer: Any) -> None:
+        if not failures:
+            failures.append(localizer)
+            raise BundleError("no memory")
+
+    workers[1].watcher._warm = fails_once
+    write(1)
+    workers[0].watcher.scan()
+    workers[1].watcher.scan()
+    workers[1].watcher.scan()
+    assert len(failures) == 1
+    assert [each.serving for each in workers] == ["v0", "v0"]
+    workers[1].watcher.start(0.01)
     until(lambda: [each.serving for each in workers] == ["v1", "v1"])
     workers[1].watcher.stop()
 
