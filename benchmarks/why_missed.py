@@ -144,7 +144,8 @@ WHY_MISSED: dict[str, Reason] = {
     "cpu_over_bare.retrieval.grpc": Reason(1.1925513, _OVER_BARE),
     "retrieval.cpu_ms": Reason(
         11.1234705,
-        "the bare pipeline alone took 9.1 ms in this run (7.2 in the run before, on another machine), so 0.4 ms would be left for all of the service; "
+        "the bare pipeline alone took 9.1 ms in this run (7.2 in the run before, on another machine), so 0.4 ms would be left for all of "
+        "the service; "
         "what it adds is as in cpu_over_bare.retrieval.rest",
     ),
     "retrieval.cpu_ms_fast_depth": Reason(
