@@ -103,6 +103,35 @@ def test_a_message_beyond_the_limit_is_refused(stub: LocalizationServiceStub, re
     assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
 
 
+@pytest.mark.parametrize(
+    ("limits", "accepted"),
+    [
+        (Limits(max_message_bytes=1024), False),
+        (Limits(max_message_bytes=2**20, max_request_bytes=1024), False),
+        (Limits(max_message_bytes=2**20), True),
+    ],
+)
+def test_a_message_may_be_as_long_as_both_limits_say(
+    bundle_path: Path, request_of: Any, limits: Limits, accepted: bool
+) -> None:
+    """The same good request of about 10 KiB."""
+    assert 1024 < request_of().ByteSize() < 2**20
+    engine = Engine.open(Settings(maps=(bundle_path,), threads=1, limits=limits))
+    server = GrpcServer(engine, host="127.0.0.1", port=0)
+    server.start()
+    try:
+        with grpc.insecure_channel(f"127.0.0.1:{server.port}") as channel:
+            if accepted:
+                assert LocalizationServiceStub(channel).Localize(request_of()).map.name == "tiny"
+            else:
+                with pytest.raises(grpc.RpcError) as caught:
+                    LocalizationServiceStub(channel).Localize(request_of())
+                assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+    finally:
+        server.stop(grace_s=0)
+        engine.close()
+
+
 @pytest.mark.parametrize("count", [0, 17])
 def test_a_batch_of_none_or_of_too_many_is_refused(stub: LocalizationServiceStub, count: int) -> None:
     with pytest.raises(grpc.RpcError) as caught:
