@@ -6,6 +6,7 @@ import numpy as np
 
 from model_training.calibration.fit import RIGHT_M, Asked
 from model_training.calibration.plans import BOTH, SEQUENCE
+from model_training.calibration.rigs import Rig
 from model_training.calibration.strangers import KINDS, strangers
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.predict import Predictions, predict
@@ -18,18 +19,24 @@ from service.maps.calibration import FEATURES
 Report = Callable[[str, int, int], None]
 
 
-def in_the_map(localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = ()) -> list[Asked]:
-    """Query sets of the map's own city; all of them, where none are named."""
+def in_the_map(
+    localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = (), *, rig: Rig | None = None
+) -> list[Asked]:
+    """Query sets of the map's own city, by the simulated camera or another rig; all of them, where none are named."""
     return [
-        asked_of(_predicted(localizer, dataset, name, report), name, known=True)
+        asked_of(_predicted(localizer, dataset, name, report, rig), _by(rig, name), known=True)
         for name in names or dataset.query_sets(with_truth=True)
     ]
 
 
-def of_another_city(localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = ()) -> list[Asked]:
-    """Query sets of a city that the map does not show; all of them, where none are named."""
+def of_another_city(
+    localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = (), *, rig: Rig | None = None
+) -> list[Asked]:
+    """Query sets of a city that the map does not show, by the simulated camera or another rig; all of them, where none are named."""
     return [
-        asked_of(_predicted(localizer, dataset, name, report), f"other_city.{preset_of(name)}", known=False)
+        asked_of(
+            _predicted(localizer, dataset, name, report, rig), _by(rig, f"other_city.{preset_of(name)}"), known=False
+        )
         for name in names or dataset.query_sets(with_truth=True)
     ]
 
@@ -49,19 +56,19 @@ def where_streets_are_missing(
 
 
 def walls_and_rooms(
-    localizer: Localizer, camera: PinholeCamera, seed: int, report: Report, *, count: int = 100
+    localizer: Localizer, camera: PinholeCamera, seed: int, report: Report, *, count: int = 100, rig: Rig | None = None
 ) -> list[Asked]:
-    """Pictures of what is in no map, so many of each kind and depth preset."""
+    """Pictures of what is in no map, so many of each kind and depth preset, by the simulated camera or another rig."""
     found = []
     for number, kind in enumerate(KINDS):
         for preset in BOTH:
             rng = np.random.default_rng([seed, number, BOTH.index(preset)])
             evidence = np.full((count, len(FEATURES)), np.nan)
             for k, query in enumerate(strangers(kind, camera, preset, count, rng)):
-                evidence[k] = _evidence(localizer, query)
-                report(f"strangers {kind}_{preset}", k + 1, count)
+                evidence[k] = _evidence(localizer, query if rig is None else rig.seen(query))
+                report(_by(rig, f"strangers {kind}_{preset}"), k + 1, count)
             nowhere = np.zeros(count, bool)
-            found.append(Asked(evidence, nowhere, nowhere, np.full(count, f"{kind}.{preset}")))
+            found.append(Asked(evidence, nowhere, nowhere, np.full(count, _by(rig, f"{kind}.{preset}"))))
     return found
 
 
@@ -74,11 +81,19 @@ def _evidence(localizer: Localizer, query: Query) -> np.ndarray | float:
     return np.nan if evidence is None else evidence
 
 
-def _predicted(localizer: Localizer, dataset: Dataset, name: str, report: Report) -> Predictions:
+def _predicted(
+    localizer: Localizer, dataset: Dataset, name: str, report: Report, rig: Rig | None = None
+) -> Predictions:
     """Sets of sequences are asked sequence by sequence."""
     return predict(
-        localizer, dataset, name, frames_each=SEQUENCE if name.startswith("sequences_") else 1, report=report
-    )
+        localizer, dataset, name, frames_each=SEQUENCE if name.startswith("sequences_") else 1,
+        seen_by=None if rig is None else rig.seen, report=report,
+    )  # fmt: skip
+
+
+def _by(rig: Rig | None, kind: str) -> str:
+    """Kinds of other rigs are kinds of their own; the preset stays their last part."""
+    return kind if rig is None else f"{rig.name}_{kind}"
 
 
 def preset_of(query_set: str) -> str:

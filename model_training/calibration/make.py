@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from model_training.calibration.collect import in_the_map, of_another_city, walls_and_rooms, where_streets_are_missing
 from model_training.calibration.fit import Asked, expected_calibration_error, fit, pooled
 from model_training.calibration.plans import CITIES, calibration_plan, repeating_plan
+from model_training.calibration.rigs import RIGS
 from model_training.calibration.strangers import KINDS
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.files import read_arrays
@@ -112,11 +113,16 @@ def _kept(work: Path, encoder: Path, city: Dataset, ask: Callable[[], list[Asked
 def _ask(work: Path, encoder: Path, cities: list[Dataset], index: int, report: Report) -> list[Asked]:
     own, other = cities[index], cities[(index + 1) % len(cities)]
     partial = WithoutStreets(own.folder)
-    found = in_the_map(_localizer(work, encoder, own, own.name, report), own, report)
-    found += walls_and_rooms(
-        _localizer(work, encoder, own, own.name, report), own.description.sensors.cameras[0].pinhole(), index, report
-    )
-    found += of_another_city(_localizer(work, encoder, other, other.name, report), own, report)
+    here = _localizer(work, encoder, own, own.name, report)
+    elsewhere = _localizer(work, encoder, other, other.name, report)
+    camera = own.description.sensors.cameras[0].pinhole()
+    found = in_the_map(here, own, report)
+    found += walls_and_rooms(here, camera, index, report)
+    found += of_another_city(elsewhere, own, report)
+    for rig in RIGS:
+        found += in_the_map(here, own, report, CLEAR_SETS, rig=rig)
+        found += walls_and_rooms(here, camera, index, report, rig=rig)
+        found += of_another_city(elsewhere, own, report, CLEAR_SETS, rig=rig)
     found += in_the_map(_sparse(work, encoder, own, report), own, report, CLEAR_SETS)
     found += of_another_city(_sparse(work, encoder, other, report), own, report, CLEAR_SETS)
     without = _localizer(work, encoder, partial, f"{own.name}-without-streets", report)

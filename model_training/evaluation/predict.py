@@ -18,6 +18,7 @@ from service.geometry.rigid import Transform, heading_of_camera
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
+from service.localization.query import Query
 from service.maps.calibration import FEATURES
 
 RANKED = 10
@@ -26,6 +27,8 @@ HYPOTHESES, CANDIDATES = 8, 4
 Report = Callable[[str, int, int], None]
 #: What a robot believes, from T_map_camera as it is and from chance.
 PriorOf = Callable[[Transform, np.random.Generator], Prior]
+#: The same query by another rig.
+SeenBy = Callable[[Query], Query]
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -104,12 +107,12 @@ def joined(parts: list[Predictions]) -> Predictions:
 
 def predict(
     localizer: Localizer, dataset: Dataset, name: str, *, refine: bool = True, workers: int = 2, frames_each: int = 1,
-    prior_of: PriorOf | None = None, report: Report = lambda *_: None,
+    prior_of: PriorOf | None = None, seen_by: SeenBy | None = None, report: Report = lambda *_: None,
 ) -> Predictions:  # fmt: skip
     """Ask every query of a set that has truth; ``refine=False`` asks retrieval alone.
 
     ``frames_each`` takes so many frames in a row as one question about the last of them, with an odometry that errs;
-    ``prior_of`` says what the robot believes beforehand of a query's pose, with chance of its own.
+    ``prior_of`` says what the robot believes beforehand of a query's pose, with chance of its own; ``seen_by`` changes the rig.
 
     Raises:
         DatasetError: the set has no truth or no frames.
@@ -125,7 +128,7 @@ def predict(
         for done, answer in enumerate(
             _in_order(
                 pool,
-                lambda k: _ask(localizer, groups[k], k, refine=refine, prior_of=prior_of),
+                lambda k: _ask(localizer, groups[k], k, refine=refine, prior_of=prior_of, seen_by=seen_by),
                 range(len(groups)),
                 ahead=4 * workers,
             ),
@@ -146,8 +149,9 @@ def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[
 
 
 def _ask(
-    localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool, prior_of: PriorOf | None
-) -> tuple[Answer | None, float]:
+    localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool, prior_of: PriorOf | None,
+    seen_by: SeenBy | None,
+) -> tuple[Answer | None, float]:  # fmt: skip
     began = time.perf_counter()
     queries, poses = as_query(
         frames, np.random.default_rng([77, number]), grid=localizer.bundle.grid, ranked=RANKED, refine=refine
@@ -156,6 +160,8 @@ def _ask(
     if prior_of is not None and T_map_camera is not None:
         prior = prior_of(T_map_camera, np.random.default_rng([78, number]))
         queries = (replace(queries[0], prior=prior), *queries[1:])
+    if seen_by is not None:
+        queries = tuple(seen_by(query) for query in queries)
     try:
         answer: Answer | None = localizer.localize_frames(queries, poses)
     except NoDepthError:

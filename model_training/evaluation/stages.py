@@ -201,8 +201,9 @@ def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, hea
 def _from_truth(localizer: Localizer, cloud: SurfelMap, frame: Frame, truth: Transform) -> tuple[float, float, float]:
     """How far registration goes that starts at the truth (m), and the share of inliers before and after it."""
     settings = localizer.refining
-    if frame.query.baseline_m is not None:
-        settings = settings_for_rig(settings, frame.focal_px * frame.query.baseline_m)
+    rig_px_m = frame.query.focal_baseline_px_m
+    if rig_px_m is not None:
+        settings = settings_for_rig(settings, rig_px_m)
     blocks = blocks_of(frame.query.depth_m, frame.query.camera, settings.points, noise=frame.noise)
     points = points_from(
         blocks, frame.R_level_camera, frame.views.height_m, settings.points, noise=frame.noise,

@@ -49,7 +49,12 @@ def depth_from_stereo(
 
     Returns:
         z of the left camera, metres; 0 where nothing was matched.
+
+    StereoSGBM leaves out as many columns on the left as disparities are searched, a tenth of KITTI's pictures, although what is far
+    away there has its match in the right picture. So both pictures are widened on the left, and what matches the added part is dropped.
     """
+    added = matching.disparities
+    wide = [cv2.copyMakeBorder(each, 0, 0, added, 0, cv2.BORDER_REPLICATE) for each in (left, right)]
     channels = left.shape[2]
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -62,7 +67,8 @@ def depth_from_stereo(
         speckleRange=matching.speckle_range,
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
-    disparity = matcher.compute(left, right).astype(np.float32) / _STEPS_PER_PIXEL
+    disparity = matcher.compute(*wide)[:, added:].astype(np.float32) / _STEPS_PER_PIXEL
+    disparity[disparity > np.arange(disparity.shape[1])] = 0
     depth_m = np.zeros(disparity.shape, np.float32)
     np.divide(np.float32(focal_baseline_px_m), disparity, out=depth_m, where=disparity > 0)
     return depth_m

@@ -86,8 +86,7 @@ def mapped_depth(
     depth_m = frame.query.depth_m
     if registered is None:
         return depth_m
-    baseline_m = frame.query.baseline_m
-    unit = settings.focal_baseline_px_m if baseline_m is None else frame.focal_px * baseline_m
+    unit = frame.query.focal_baseline_px_m or settings.focal_baseline_px_m
     return (depth_m * registered.scale / (1.0 + registered.offset * depth_m / unit)).astype(np.float32)
 
 

@@ -39,12 +39,6 @@ class Frame:
     search_s: float = 0.0
 
     @property
-    def focal_px(self) -> float:
-        """Horizontal focal length of the depth picture."""
-        camera = self.query.camera
-        return float(camera.fx * self.query.depth_m.shape[1] / camera.width)
-
-    @property
     def R_level_camera(self) -> Rotation:
         """From the optical to the frame's level frame."""
         return self.views.R_level_camera

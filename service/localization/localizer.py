@@ -114,7 +114,7 @@ class Localizer:
             self.bundle, descriptors, turns_rad=views.turns_rad, places=_places_of(query), fewest=self.clusters.views
         )
         # Without registration nobody asks for it, but a later frame of a stream may be registered together with this one.
-        noise = inverse_depth_noise(query.depth_m)
+        noise = inverse_depth_noise(query.depth_m, focal_baseline_px_m=query.focal_baseline_px_m)
         return Frame(
             query, np.eye(4), views, descriptors, matches, noise,
             fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,

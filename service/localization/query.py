@@ -31,7 +31,8 @@ class Query:
         refine: register the picture on the map's cloud, where the map has one.
         ranked: answer at least this many places, beyond the k that vote; evaluation wants R@10.
         prior: what is known of the pose beforehand.
-        baseline_m: of the stereo rig that measured the depth; its disparity offset is then estimated along with the pose.
+        baseline_m: of the stereo rig that measured the depth; its disparity offset is then estimated along with the pose, and its
+            noise is that of matching at least.
         false_accept_rate: share of the queries taken outside the map that one can live with being accepted.
     """
 
@@ -46,3 +47,10 @@ class Query:
     prior: Prior | None = None
     baseline_m: float | None = None
     false_accept_rate: float = FALSE_ACCEPT_RATE
+
+    @property
+    def focal_baseline_px_m(self) -> float | None:
+        """Horizontal focal length of the depth picture times the baseline; None where no stereo rig is known."""
+        if self.baseline_m is None:
+            return None
+        return float(self.camera.fx * self.depth_m.shape[1] / self.camera.width * self.baseline_m)

@@ -115,8 +115,9 @@ def refine(
         settings: how many starts, points and refinements.
     """
     reference = frames[0]
-    if reference.query.baseline_m is not None:
-        settings = settings_for_rig(settings, reference.focal_px * reference.query.baseline_m)
+    rig_px_m = reference.query.focal_baseline_px_m
+    if rig_px_m is not None:
+        settings = settings_for_rig(settings, rig_px_m)
     blocks = [blocks_of(f.query.depth_m, f.query.camera, settings.points, noise=f.noise) for f in frames]
     each = [_points(frame, own, settings) for frame, own in zip(frames, blocks, strict=True)]
     merged = each[0] if len(each) == 1 else _merged(frames, each)

@@ -438,10 +438,11 @@ def test_settings_for_a_rig_free_the_offset_once_the_pose_is_roughly_known():
 
 
 @pytest.mark.parametrize(("width", "focal_px"), [(80, 50.0), (40, 25.0)])
-def test_the_focal_length_is_that_of_the_depth_picture(here, seen_in, width, focal_px):
-    frame = seen_in(np.ones((60, 80), np.float32), here)
+def test_the_unit_of_disparity_is_that_of_the_depth_picture(here, seen_in, width, focal_px):
+    query = seen_in(np.ones((60, 80), np.float32), here).query
+    assert query.focal_baseline_px_m is None
     depth_m = np.ones((width * 3 // 4, width), np.float32)
-    assert replace(frame, query=replace(frame.query, depth_m=depth_m)).focal_px == focal_px
+    assert replace(query, depth_m=depth_m, baseline_m=0.5).focal_baseline_px_m == 0.5 * focal_px
 
 
 def test_starts_of_several_frames_are_asked_where_each_frame_stood(bundle_at, frame_with, matches_at, monkeypatch):
