@@ -68,7 +68,7 @@ def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.
         depth_m, camera, truth = frame.depth_m(), frame.camera.pinhole(), frame.T_map_camera
         level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.65)
         began = time.process_time()
-        noise = inverse_depth_noise(depth_m, focal_baseline_px_m=FOCAL_BASELINE_PX_M)
+        noise = inverse_depth_noise(depth_m, focal_baseline_px_m=FOCAL_BASELINE_PX_M).total
         blocks = blocks_of(depth_m, camera, refining.points, noise=noise)
         points = points_from(
             blocks, level.R_level_camera, level.height_m, refining.points, noise=noise, focal_baseline_px_m=FOCAL_BASELINE_PX_M

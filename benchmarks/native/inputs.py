@@ -151,7 +151,7 @@ def _level(rng: np.random.Generator, height: int, width: int) -> list[NDArray[An
 
 def _points(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
     depth, camera = depth_of(rng, height, width), camera_of(rng, height, width)
-    noise = inverse_depth_noise(depth)
+    noise = inverse_depth_noise(depth).total
     settings = PointSettings(columns=int(rng.choice([1, 8, 128, 5000])))
     blocks = blocks_of(depth, camera, settings, noise=noise)
     points = points_of(depth, camera, R_BODY_OPTICAL, 1.5, PointSettings())

@@ -22,7 +22,8 @@ class Frame:
         views: of the view grid.
         descriptors: of the views, a row a turn.
         matches: the most similar views of the map, the best first.
-        noise: standard deviation of one pixel's inverse depth, 1/m.
+        noise: standard deviation of one pixel's inverse depth, 1/m;
+        independent_noise: and that of the part which near pixels do not share.
         fuse_s: seconds that its views took;
         encode_s: their descriptors;
         search_s: and their neighbours.
@@ -34,6 +35,7 @@ class Frame:
     descriptors: Float32[NDArray[np.float32], "T D"]
     matches: ViewMatches
     noise: float
+    independent_noise: float
     fuse_s: float = 0.0
     encode_s: float = 0.0
     search_s: float = 0.0

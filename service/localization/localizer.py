@@ -116,7 +116,7 @@ class Localizer:
         # Without registration nobody asks for it, but a later frame of a stream may be registered together with this one.
         noise = inverse_depth_noise(query.depth_m, focal_baseline_px_m=query.focal_baseline_px_m)
         return Frame(
-            query, np.eye(4), views, descriptors, matches, noise,
+            query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent,
             fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,
         )  # fmt: skip
 

@@ -138,7 +138,8 @@ def refine(
     )
     candidates = judge.with_brightness(judge.candidates(found))
     noise = float(np.median([frame.noise for frame in frames]))
-    if cloud.brightness is not None and noise >= settings.around.from_noise:
+    independent = float(np.median([frame.independent_noise for frame in frames]))
+    if cloud.brightness is not None and independent >= settings.around.from_noise:
         near = poses_around(
             cloud, merged, candidates[0].registered, reference.views.height_m, settings.registration, settings.around
         )

@@ -9,6 +9,7 @@ from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -79,24 +80,37 @@ class PointSettings:
             raise ValueError(f"ground_share: {self.ground_share:g} is not at least 0 and less than 1")
 
 
+class DepthNoise(NamedTuple):
+    """Standard deviations of one pixel's inverse depth, 1/m.
+
+    Attributes:
+        independent: what near pixels do not share.
+        total: with what they share.
+    """
+
+    independent: float
+    total: float
+
+
 def inverse_depth_noise(
     depth_m: Float32[NDArray[np.float32], "H W"], *, focal_baseline_px_m: float | None = None
-) -> float:
-    """Standard deviation of one pixel's inverse depth, 1/m.
-
-    Estimated from second differences along rows: on a plane the inverse depth is linear in the pixel.
+) -> DepthNoise:
+    """Noise of a depth picture, from second differences along rows: on a plane the inverse depth is linear in the pixel.
 
     Args:
         depth_m: z, metres, 0 where nothing was measured.
-        focal_baseline_px_m: focal length times baseline, of a stereo rig; None where the depth has no disparity. The estimate is then
+        focal_baseline_px_m: focal length times baseline, of a stereo rig; None where the depth has no disparity. The total is then
             combined with ``MATCHING_PX``.
 
     Returns:
         ``LEAST_NOISE`` at least; that of a quarter of a pixel at 80 px m where the picture has too few measurements.
     """
-    found = max(_noise_between(depth_m, step) for step in NOISE_STEPS)
-    own = found if found > 0 else 0.25 / 80.0
-    return own if focal_baseline_px_m is None else float(np.hypot(own, MATCHING_PX / focal_baseline_px_m))
+    near, far = (_noise_between(depth_m, step) for step in NOISE_STEPS)
+    near = near or far or 0.25 / 80.0
+    total = max(near, far)
+    if focal_baseline_px_m is not None:
+        total = float(np.hypot(total, MATCHING_PX / focal_baseline_px_m))
+    return DepthNoise(near, total)
 
 
 def _noise_between(depth_m: Float32[NDArray[np.float32], "H W"], step: int) -> float:
@@ -170,7 +184,7 @@ def points_of(
         noise: standard deviation of one pixel's inverse depth, 1/m; read off the picture where it is not given.
         focal_baseline_px_m: of the camera; only scales the unit of the disparity offset.
     """
-    noise = inverse_depth_noise(depth_m) if noise is None else noise
+    noise = inverse_depth_noise(depth_m).total if noise is None else noise
     blocks = blocks_of(depth_m, camera, settings, noise=noise)
     return points_from(blocks, R_level_camera, height_m, settings, noise=noise, focal_baseline_px_m=focal_baseline_px_m)
 

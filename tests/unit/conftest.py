@@ -48,7 +48,7 @@ def frame_of(
     planes = np.zeros((len(turned), 6, ViewGrid().rows, ViewGrid().columns), np.float32)
     views = QueryViews(planes, (0.0,) * len(turned), np.array(R_level_camera), height_m, 0.75)
     T = np.eye(4) if T_reference_camera is None else T_reference_camera
-    return Frame(query, T, views, turned, matches, noise)
+    return Frame(query, T, views, turned, matches, noise=noise, independent_noise=noise)
 
 
 def calibration_document(**changed: Any) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def depths_of(points):
 
 @pytest.mark.parametrize("noise", [1e-4, 5e-4, 3e-3])
 def test_the_noise_of_the_inverse_depth_is_read_off_a_plane(noise):
-    assert inverse_depth_noise(tilted_plane(320, 240, noise=noise)) == pytest.approx(noise, rel=0.05)
+    assert inverse_depth_noise(tilted_plane(320, 240, noise=noise)).total == pytest.approx(noise, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_the_noise_of_the_inverse_depth_is_read_off_a_plane(noise):
     ],
 )
 def test_no_picture_is_free_of_noise(depth):
-    assert inverse_depth_noise(depth) == LEAST_NOISE
+    assert inverse_depth_noise(depth).total == LEAST_NOISE
 
 
 def test_the_least_noise_is_lost_in_the_least_deviation_of_a_point():
@@ -62,13 +62,13 @@ def test_holes_and_edges_do_not_change_the_noise():
     depth[:, 100:140] *= 0.5
     depth[np.random.default_rng(1).uniform(size=depth.shape) < 0.2] = 0
     # Between pixels 8 apart, a tenth of the differences cross one of the two edges.
-    assert inverse_depth_noise(depth) == pytest.approx(1e-3, rel=0.2)
+    assert inverse_depth_noise(depth).total == pytest.approx(1e-3, rel=0.2)
 
 
 def test_too_few_pixels_tell_no_noise_and_a_quarter_of_a_disparity_is_taken():
     depth = np.zeros((240, 320), np.float32)
     depth[:8, :20] = tilted_plane(20, 8, noise=1e-3)
-    assert inverse_depth_noise(depth) == 0.25 / 80
+    assert inverse_depth_noise(depth).total == 0.25 / 80
 
 
 def test_every_block_gives_the_point_in_its_middle():
@@ -271,7 +271,7 @@ def test_noise_is_read_as_plain_numpy_reads_it():
         inverse = np.where(depth_m > 0, 1 / depth_m, np.nan)[::8]
     each = [np.abs(inverse[:, : -2 * k] - 2 * inverse[:, k:-k] + inverse[:, 2 * k :]) for k in (2, 8)]
     expected = max(1.4826 * np.nanmedian(second) / np.sqrt(6) for second in each)
-    assert inverse_depth_noise(depth_m) == pytest.approx(expected, rel=1e-5)
+    assert inverse_depth_noise(depth_m).total == pytest.approx(expected, rel=1e-5)
 
 
 def test_errors_that_neighbours_share_count_as_noise():
@@ -280,12 +280,14 @@ def test_errors_that_neighbours_share_count_as_noise():
     own = rng.normal(0, 1, (240, 320 + size - 1))
     shared = 2e-3 * np.apply_along_axis(np.convolve, 1, own, np.full(size, size**-0.5), mode="valid")
     inverse = 1 / tilted_plane(320, 240) + shared
-    assert inverse_depth_noise((1 / inverse).astype(np.float32)) == pytest.approx(2e-3, rel=0.1)
+    found = inverse_depth_noise((1 / inverse).astype(np.float32))
+    assert found.total == pytest.approx(2e-3, rel=0.1)
+    assert found.independent < 0.6 * found.total
 
 
 def test_a_stereo_rigs_noise_is_that_of_matching_at_least():
     """Half a pixel of 80 px m is 1 / 160 in inverse depth; independent errors add as squares."""
     floor = 0.5 / 80
-    assert inverse_depth_noise(tilted_plane(320, 240), focal_baseline_px_m=80.0) == pytest.approx(floor, rel=1e-5)
+    assert inverse_depth_noise(tilted_plane(320, 240), focal_baseline_px_m=80.0).total == pytest.approx(floor, rel=1e-5)
     noisy = tilted_plane(320, 240, noise=floor)
-    assert inverse_depth_noise(noisy, focal_baseline_px_m=80.0) == pytest.approx(floor * 2**0.5, rel=0.05)
+    assert inverse_depth_noise(noisy, focal_baseline_px_m=80.0).total == pytest.approx(floor * 2**0.5, rel=0.05)
