@@ -50,7 +50,7 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
     for street in streets:
         found = predict(street.localizer, street.dataset, QUERIES)
         answer_rows(report, f"real.{street.name}", found)
-        _inlier_rows(report, street)
+        _stage_rows(report, street)
         if street.name == "kitti_0013":
             _sequence_rows(report, street)
     accepted = [
@@ -64,7 +64,7 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
 
 
 def answer_rows(report: Report, row: str, found: Predictions) -> None:
-    """Rows of a query set: retrieval, answers by their status, and beside them the same answers forced."""
+    """Rows of a query set: places as they are answered, answers by their status, and beside them the same answers forced."""
     true_xy, errors = found.T_true[:, :2, 3], position_errors(found)
     report.share(f"{row}.recall_at_1_5m", recall_at(found.ranked_xy, true_xy, 1), bar=_RECALL_5M)
     report.share(f"{row}.recall_at_5_5m", recall_at(found.ranked_xy, true_xy, 5))
@@ -121,11 +121,13 @@ def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:
     return Street(name, dataset, Localizer.open(MapBundle.open(folders["map"])))
 
 
-def _inlier_rows(report: Report, street: Street) -> None:
+def _stage_rows(report: Report, street: Street) -> None:
+    """Retrieval before any place was verified, and what share of the depth fits the map at the true pose."""
     found = stages_of(street.localizer, street.dataset, QUERIES)
     at_truth = [each.inliers_at_truth for each in found if np.isfinite(each.inliers_at_truth)]
     from_truth = [each.inliers_from_truth for each in found if np.isfinite(each.inliers_from_truth)]
     bar = _INLIERS if street.name == "kitti_0013" else None
+    report.share(f"real.{street.name}.retrieval_at_1_5m", np.array([each.rank == 1 for each in found]))
     report.row(f"real.{street.name}.inliers_at_truth", float(np.median(at_truth)), "share", bar=bar, n=len(at_truth))
     report.row(f"real.{street.name}.inliers_from_truth", float(np.median(from_truth)), "share", n=len(from_truth))
 

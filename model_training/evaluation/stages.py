@@ -16,8 +16,9 @@ from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import Rotation, Transform, heading_of_camera, transform_from, wrap_angle
 from service.localization.answer import Answer
 from service.localization.frames import Frame
-from service.localization.localizer import Localizer
+from service.localization.localizer import RANKED, Localizer
 from service.localization.refine import settings_for_rig
+from service.localization.search import distinct_places
 from service.localization.starts import starts_from
 from service.registration.kernel import STATE, QueryPoints
 from service.registration.points import blocks_of, points_from
@@ -65,7 +66,7 @@ class QueryStages:
         number: of the query in its set.
         tilt_deg: angle between the estimated vertical and the normal of the map's ground.
         height_error_m: estimated camera height above the ground less the true one.
-        rank: of the first place within 5 m, from 1; 0 where none was found.
+        rank: of the first place within 5 m among the retrieved ones, from 1; 0 where none was found.
         start_m: of the nearest start that looks the right way.
         candidate_m: of the nearest registered pose that looks the right way.
         from_truth_m: where registration ends that starts at the true pose.
@@ -138,7 +139,8 @@ def _stages(localizer: Localizer, cloud: SurfelMap, asked: QueryFrame, truth: Tr
     starts = starts_from(
         (frame,), None, lidar_height_m=bundle.manifest.lidar_height_m, settings=localizer.refining.starts
     )
-    away_m = [float(np.hypot(*(place.position_m[:2] - truth[:2, 3]))) for place in answer.neighbours]
+    retrieved = distinct_places(frame.matches, RANKED)
+    away_m = [float(np.hypot(*(place.position_m[:2] - truth[:2, 3]))) for place in retrieved]
     near = [rank for rank, away in enumerate(away_m, 1) if away <= RIGHT_PLACE_M]
     from_truth_m, at_truth, from_truth = _from_truth(localizer, cloud, frame, truth)
     found = QueryStages(

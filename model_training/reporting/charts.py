@@ -56,7 +56,7 @@ def _median(errors: NDArray[np.float64]) -> float:
 
 
 def recall_curves(runs: Mapping[str, Predictions]) -> str:
-    """Share of queries with the right place among the k most similar ones."""
+    """Share of queries with the right place among the first k neighbours."""
     k = np.arange(1, RANKED + 1)
     recalls = {name: [recall_at(p.ranked_xy, p.T_true[:, :2, 3], int(n)).mean() for n in k] for name, p in runs.items()}
     axis = Axis("most similar places that are looked at", 1, RANKED, tuple((float(n), str(n)) for n in k))

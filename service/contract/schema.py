@@ -385,7 +385,10 @@ class LocalizeAnswer(BaseModel):
         "registration"
     )
     spread: Spread | None = Field(description="where the camera may be; null for a LOCALIZED answer")
-    neighbours: list[Neighbour]
+    neighbours: list[Neighbour] = Field(
+        description="k distinct places: those nearest to the registered poses first, the best supported pose's before all, then the most "
+        "similar ones; by similarity alone without registration"
+    )
     map: MapVersion
     timings_ms: TimingsMs
 

@@ -52,7 +52,7 @@ class Answer:
         spread: where the camera may be; None for a LOCALIZED answer.
         frames: so many were asked together.
         T_map_vehicle_guess: best guess of the vehicle's pose, where the query said how the camera sits on it.
-        neighbours: the k most similar distinct places, the best first.
+        neighbours: k distinct places, those nearest to the registered poses first, then the most similar.
         hypotheses: all clusters of the most similar views, the heaviest first; with a prior, what it believes most.
         measured_share: share of the view grid's cells with a measurement.
         height_m: of the camera above the ground.

@@ -18,6 +18,7 @@ from service.localization.hypotheses import ClusterSettings, Hypothesis, believe
 from service.localization.judge import Candidate
 from service.localization.query import Query
 from service.localization.refine import RefineSettings, refine
+from service.localization.rerank import reranked
 from service.localization.rivals import distinct_candidates, shares_of
 from service.localization.search import distinct_places, search_views
 from service.localization.spread import Extent, Spread, spread_of
@@ -177,7 +178,7 @@ class Localizer:
             T_map_vehicle_guess=None
             if query.T_vehicle_camera is None
             else T_map_camera @ inverse(query.T_vehicle_camera),
-            neighbours=neighbours[: max(query.neighbours, query.ranked)],
+            neighbours=reranked(neighbours, candidates or ())[: max(query.neighbours, query.ranked)],
             hypotheses=hypotheses,
             measured_share=frames[0].views.measured_share,
             height_m=frames[0].views.height_m,

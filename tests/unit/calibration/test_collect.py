@@ -5,6 +5,7 @@ import pytest
 
 from model_training.calibration import collect
 from model_training.calibration.collect import asked_of, in_the_map, of_another_city, preset_of, walls_and_rooms
+from model_training.calibration.rigs import RIGS
 from model_training.evaluation.predict import RANKED, Predictions
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
@@ -58,8 +59,9 @@ def predicted(monkeypatch):
     """What was asked of whom, in order; each set is answered by as many right answers as its name has letters."""
     asked = []
 
-    def predict(localizer, dataset, name, *, frames_each, report):
+    def predict(localizer, dataset, name, *, frames_each, seen_by, report):
         asked.append((localizer, dataset, name, report))
+        assert seen_by is None or seen_by == RIGS[0].seen
         assert frames_each == (5 if name.startswith("sequences") else 1)
         return predictions([0.0] * len(name))
 
@@ -93,6 +95,14 @@ def test_sets_of_the_maps_own_city_keep_their_names_and_those_of_another_only_th
     assert not any(each.known.any() or each.right.any() for each in other)
 
 
+def test_kinds_of_another_rig_are_told_by_its_name(predicted):
+    names = ("clear_precise", "clear_stereo")
+    own = in_the_map("localizer", City(), print, names, rig=RIGS[0])
+    other = of_another_city("localizer", City(), print, names, rig=RIGS[0])
+    assert [set(each.kind.tolist()) for each in own] == [{"wide_clear_precise"}, {"wide_clear_stereo"}]
+    assert [set(each.kind.tolist()) for each in other] == [{"wide_other_city.precise"}, {"wide_other_city.stereo"}]
+
+
 class Wherever:
     """Registers two pictures of three, refuses every fourth."""
 
@@ -120,6 +130,18 @@ def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
         np.testing.assert_array_equal(rows, [4 * part, np.nan, 4 * part + 2, np.nan])
     assert told[3] == ("strangers wall_precise", 4, 4)
     assert len(told) == len(localizer.asked) == 16
+
+
+def test_another_rig_sees_the_same_walls_and_rooms():
+    whole, cut = Wherever(), Wherever()
+    camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
+    walls_and_rooms(whole, camera, 3, lambda *_: None, count=2)
+    found = walls_and_rooms(cut, camera, 3, lambda *_: None, count=2, rig=RIGS[0])
+    assert [set(each.kind.tolist()) for each in found] == [
+        {"wide_wall.precise"}, {"wide_wall.stereo"}, {"wide_room.precise"}, {"wide_room.stereo"},
+    ]  # fmt: skip
+    for query, seen in zip(whole.asked, cut.asked, strict=True):
+        np.testing.assert_array_equal(seen.depth_m, RIGS[0].seen(query).depth_m)
 
 
 def test_every_city_draws_walls_and_rooms_of_its_own():

@@ -70,6 +70,10 @@ def _dataset(name, folder):
     )
 
 
+def _name_of(rig):
+    return () if rig is None else (rig.name,)
+
+
 class Work:
     """Cities that are never simulated, maps that are never built, questions that are never asked: who would have asked what."""
 
@@ -95,8 +99,8 @@ class Work:
         self.built.append((dataset.name, hasattr(dataset, "partial"), settings.name, settings.spacing_m))
 
     def asking(self, how):
-        def ask(localizer, dataset, report, names=()):
-            self.asked.append((how, localizer, dataset.name, tuple(names)))
+        def ask(localizer, dataset, report, names=(), *, rig=None):
+            self.asked.append((how, localizer, dataset.name, tuple(names), *_name_of(rig)))
             return [city(len(self.asked), count=10)]
 
         return ask
@@ -106,9 +110,9 @@ class Work:
         self.asked.append(("where_streets_are_missing", localizer, dataset.name, tuple(names)))
         return [city(len(self.asked), count=10)]
 
-    def walls_and_rooms(self, localizer, camera, seed, report):
+    def walls_and_rooms(self, localizer, camera, seed, report, *, rig=None):
         assert (camera, report) == ("camera", print)
-        self.asked.append(("walls_and_rooms", localizer, seed))
+        self.asked.append(("walls_and_rooms", localizer, seed, *_name_of(rig)))
         return [city(len(self.asked), count=10)]
 
     def all_of(self, index, *, anew=False):
@@ -124,17 +128,23 @@ CLEAR = ("clear_precise", "clear_stereo")
 
 
 def test_a_city_is_asked_of_its_own_map_the_next_ones_sparse_ones_of_both_and_where_streets_are_missing(work):
-    """Who comes to a sparse survey looks less like its places, whether he is a stranger or not."""
+    """Who comes to a sparse survey looks less like its places, whether he is a stranger or not; so does a rig that sees less."""
     found = work.all_of(1)
     assert work.asked == [
         ("in_the_map", "two", "two", ()),
         ("walls_and_rooms", "two", 1),
         ("of_another_city", "three", "two", ()),
+        ("in_the_map", "two", "two", CLEAR, "wide"),
+        ("walls_and_rooms", "two", 1, "wide"),
+        ("of_another_city", "three", "two", CLEAR, "wide"),
+        ("in_the_map", "two", "two", CLEAR, "narrow"),
+        ("walls_and_rooms", "two", 1, "narrow"),
+        ("of_another_city", "three", "two", CLEAR, "narrow"),
         ("in_the_map", "two-sparse", "two", CLEAR),
         ("of_another_city", "three-sparse", "two", CLEAR),
         ("where_streets_are_missing", "two-without-streets", "two", CLEAR),
     ]
-    np.testing.assert_array_equal(found.evidence, pooled([city(k, count=10) for k in (1, 2, 3, 4, 5, 6)]).evidence)
+    np.testing.assert_array_equal(found.evidence, pooled([city(k, count=10) for k in range(1, 13)]).evidence)
 
 
 def test_a_sparse_map_has_a_place_every_five_metres_and_any_other_every_metre(work):
@@ -159,7 +169,7 @@ def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work):
 
 def test_the_last_city_is_asked_of_the_first_ones_maps(work):
     work.all_of(2)
-    assert [row[1] for row in work.asked if row[0] == "of_another_city"] == ["one", "one-sparse"]
+    assert [row[1] for row in work.asked if row[0] == "of_another_city"] == ["one", "one", "one", "one-sparse"]
 
 
 def test_maps_and_answers_are_kept_and_questions_asked_anew_only_on_demand(work):

@@ -119,10 +119,18 @@ def test_the_vehicles_pose_follows_from_where_the_camera_sits(localizer: Localiz
 
 @pytest.mark.parametrize("k", [1, 5, 12])
 def test_neighbours_are_distinct_places_the_best_first(localizer: Localizer, query: Query, k: int) -> None:
-    neighbours = localizer.localize(replace(query, neighbours=k)).neighbours
+    neighbours = localizer.localize(replace(query, neighbours=k, refine=False)).neighbours
     similarities = [each.similarity for each in neighbours]
     assert len({each.place for each in neighbours}) == k
     assert similarities == sorted(similarities, reverse=True)
+
+
+def test_registered_places_come_first_and_no_place_is_lost(localizer: Localizer, query: Query) -> None:
+    retrieved = localizer.localize(replace(query, neighbours=12, refine=False)).neighbours
+    answer = localizer.localize(replace(query, neighbours=12))
+    away = [np.hypot(*(each.position_m[:2] - answer.T_map_camera_guess[:2, 3])) for each in answer.neighbours]
+    assert away[0] == min(away)
+    assert {each.place for each in answer.neighbours} == {each.place for each in retrieved}
 
 
 def test_more_neighbours_than_places_gives_every_place(localizer: Localizer, query: Query) -> None:

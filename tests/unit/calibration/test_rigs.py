@@ -1,0 +1,46 @@
+"""Another rig is a window of the simulated picture: every ray of it sees what it saw before."""
+
+import numpy as np
+import pytest
+
+from model_training.calibration.rigs import RIGS, Rig
+from service.geometry.camera import PinholeCamera
+from service.localization.query import Query
+
+CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
+
+
+@pytest.fixture
+def query() -> Query:
+    rng = np.random.default_rng(0)
+    depth_m = rng.uniform(1, 40, (48, 64)).astype(np.float32)
+    return Query(rgb=rng.integers(0, 255, (48, 64, 3), np.uint8), depth_m=depth_m, camera=CAMERA)
+
+
+def test_a_window_is_cut_out_of_the_middle(query: Query) -> None:
+    """Half of 64 columns are 16 to 47, a quarter of 48 rows 18 to 29."""
+    seen = Rig("half", 0.5, 0.25, stereo=False).seen(query)
+    np.testing.assert_array_equal(seen.depth_m, query.depth_m[18:30, 16:48])
+    np.testing.assert_array_equal(seen.rgb, query.rgb[18:30, 16:48])
+    assert seen.camera == PinholeCamera(32, 12, 32.0, 32.0, 15.5, 5.5)
+    assert seen.baseline_m is None
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_every_pixel_keeps_its_ray(query: Query, rig: Rig) -> None:
+    seen = rig.seen(query)
+    rays = query.camera.rays_of_pixels()
+    v, u = np.argwhere(query.depth_m == seen.depth_m[0, 0])[0]
+    height, width = seen.depth_m.shape
+    np.testing.assert_allclose(seen.camera.rays_of_pixels(), rays[v : v + height, u : u + width])
+
+
+def test_a_stereo_rig_says_its_baseline(query: Query) -> None:
+    """80 px m over a focal length of 32 px are 2.5 m."""
+    assert Rig("wide", 1.0, 0.41, stereo=True).seen(query).focal_baseline_px_m == pytest.approx(80.0)
+
+
+@pytest.mark.parametrize(("width", "height"), [(0.0, 0.5), (0.5, 1.1)])
+def test_a_window_beyond_the_picture_is_refused(width: float, height: float) -> None:
+    with pytest.raises(ValueError, match="rig odd"):
+        Rig("odd", width, height, stereo=False)
