@@ -47,7 +47,9 @@ def write_comparison_page(
 def _curves(found: Comparison) -> str:
     runs = {"A": found.first, "B": found.second}
     curve = figure(error_curve(runs), "Share of all queries whose answer, accepted or not, lies within a distance.")
-    return curve + figure(recall_curves(runs), "Share of queries with the right place among the first k neighbours: with registration those it verified come first.")
+    return curve + figure(
+        recall_curves(runs), "Share of queries with the right place among the first k neighbours, verified ones first."
+    )
 
 
 def _lead(first: SavedRun, second: SavedRun, found: Comparison) -> str:

@@ -142,7 +142,7 @@ def _search(runs: dict[str, Predictions], everything: Predictions) -> str:
     parts = [
         figure(
             recall_curves(series_of(runs)),
-            "Share of queries with a place within 5 m of the truth among the first k neighbours: with registration those it verified come first.",
+            "Share of queries with a place within 5 m of the truth among the first k neighbours, verified ones first.",
         )
     ]
     drawn = reliability(everything)
