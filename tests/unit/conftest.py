@@ -95,8 +95,9 @@ def refused_answer(answer: dict[str, Any], status: str = "AMBIGUOUS", **changed:
         "mean": pose["position"] | {"y": pose["position"]["y"] + 30.0}, "covariance": [1.0, 0, 0, 0, 900.0, 0, 0, 0, 1.0],
         "heading_std_deg": 20.0, "hypotheses_weight": 0.75,
     }  # fmt: skip
+    reasons = [{"check": "baseline", "evidence": {"log_noise": 4.0, "points": -3.5}, "remedy": "check the baseline"}]
     gone = {"pose": None, "vehicle_pose": None, "geopose": None, "street": None}
-    return answer | gone | {"status": status, "hypotheses": hypotheses, "spread": spread} | changed
+    return answer | gone | {"status": status, "hypotheses": hypotheses, "spread": spread, "reasons": reasons} | changed
 
 
 @pytest.fixture(scope="session")
@@ -212,6 +213,24 @@ def calibration_file_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..
         return path
 
     return made
+
+
+@pytest.fixture(scope="session")
+def refusing_map(
+    small_dataset: Any, encoder_file: Path, calibration_file_of: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> Path:  # fmt: skip
+    """``small_map`` with a calibration that is right at even odds and accepts from 0.9 on: no answer is LOCALIZED."""
+    from model_training.mapping.build import BuildSettings, build_map
+    from service.localization.encoder import Encoder
+
+    out: Path = tmp_path_factory.mktemp("maps") / "refusing"
+    thresholds = [{"false_accept_rate": 0.001, "confidence": 0.9}]
+    settings = BuildSettings(
+        name="refusing", headings=6, spacing_m=5.0, align_survey=False, traffic_vote=False,
+        calibration=calibration_file_of(Encoder.open(encoder_file).sha256, thresholds=thresholds),
+    )  # fmt: skip
+    build_map(small_dataset, encoder_file, out, settings, threads=1)
+    return out
 
 
 @pytest.fixture(scope="session")
