@@ -67,7 +67,9 @@ def out_of_range(calibration: Calibration, evidence: NDArray[np.float64]) -> lis
     """
     known = evidence[np.isfinite(evidence).all(axis=1)]
     if not len(known):
-        return [Cause(f"no query had enough {reason.check}", reason.remedy) for reason in reasons_of(calibration, None)]
+        return [
+            Cause("no query had enough depth to be registered", each.remedy) for each in reasons_of(calibration, None)
+        ]
     found = []
     for reason in reasons_of(calibration, np.median(known, axis=0)):
         told = ", ".join(f"{name} {size:+.1f}" for name, size in reason.evidence)

@@ -59,15 +59,18 @@ def _why(answer: dict[str, Any]) -> list[str]:
     found, factor = [], answer.get("focal_length_factor")
     if factor is not None:
         found.append(
-            f"the focal length is off by a factor of two: fx and fy times {factor:g} fit the map; check the intrinsics, and whether they "
-            "are of pictures of this size"
+            f"the focal length is probably off by a factor of two: fx and fy times {factor:g} fit the map better; check the intrinsics, "
+            "and whether they are of pictures of this size"
         )  # fmt: skip
     for reason in answer.get("reasons", []):  # an earlier service sends none
         told = ", ".join(f"{name} {size:+.1f}" for name, size in reason["evidence"].items())
         where = f" (standard deviations from what calibration saw: {told})" if told else ""
         found.append(f"{reason['check']}{where}: {reason['remedy']}")
     if found:
-        return ["why it may not be LOCALIZED, the likeliest cause first", *(f"  {k}. {each}" for k, each in enumerate(found, 1))]
+        return [
+            "why it may not be LOCALIZED, the likeliest cause first",
+            *(f"  {k}. {each}" for k, each in enumerate(found, 1)),
+        ]
     if "reasons" not in answer:
         return ["why: this service does not say"]
     return [

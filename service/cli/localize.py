@@ -49,7 +49,8 @@ def command(
     as_json: Annotated[
         bool,
         typer.Option(
-            "--json", help="Print the answer as it came; with focal_length_factor (null: neither fits) if that was tried."
+            "--json",
+            help="Print the answer as it came; with focal_length_factor (null: neither fits) if that was tried.",
         ),
     ] = False,
 ) -> None:
@@ -83,16 +84,17 @@ def command(
 
 def _fitting_factor(answer: dict[str, Any], ask: Callable[[float], dict[str, Any]]) -> float | None:
     """The factor of fx and fy that fits the map clearly better than the camera as it was given; None: there is none."""
-    from service.localization.reasons import FOCAL_FACTORS, GAIN
+    from service.localization.reasons import FOCAL_FACTORS, GAIN_OF_ONE
 
-    before, best, most = _support(answer), None, (False, GAIN)
+    before, best, most = _support(answer), None, (False, GAIN_OF_ONE)
     for factor in FOCAL_FACTORS:
         try:
             changed = ask(factor)
         except StreetfixError as error:  # the answer itself stands
             typer.echo(f"streetfix: fx and fy times {factor:g} could not be tried: {error}", err=True)
             continue
-        fit = (changed["status"] == "LOCALIZED", _support(changed) - before)
+        gained = _support(changed) - before
+        fit = (changed["status"] == "LOCALIZED" and gained > 0, gained)
         if fit >= most:
             best, most = factor, fit
     return best

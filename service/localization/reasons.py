@@ -13,8 +13,9 @@ from service.maps.calibration import FEATURES, Calibration
 FAR = 3.0
 #: Focal lengths that are tried: a camera's intrinsics are often those of pictures of half or twice the size.
 FOCAL_FACTORS = (0.5, 2.0)
-#: A change of the question is named as the remedy if it raises the support of the best pose by so many nats.
-GAIN = 3.0
+#: A change of the question is named as the remedy if it raises the support of the best pose by so many nats: the median of several
+#: queries, or a single query. A picture from outside the map may fit it a little better with any focal length (decision log).
+GAIN, GAIN_OF_ONE = 3.0, 6.0
 _WEIGHTS = SupportWeights()
 
 

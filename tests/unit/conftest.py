@@ -216,20 +216,16 @@ def calibration_file_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..
 
 
 @pytest.fixture(scope="session")
-def refusing_map(
-    small_dataset: Any, encoder_file: Path, calibration_file_of: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> Path:  # fmt: skip
-    """``small_map`` with a calibration that is right at even odds and accepts from 0.9 on: no answer is LOCALIZED."""
+def stock_map(small_dataset: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``small_map`` by the stock encoder, with its calibration."""
     from model_training.mapping.build import BuildSettings, build_map
-    from service.localization.encoder import Encoder
+    from model_training.stock import CALIBRATION, ENCODER
 
-    out: Path = tmp_path_factory.mktemp("maps") / "refusing"
-    thresholds = [{"false_accept_rate": 0.001, "confidence": 0.9}]
+    out: Path = tmp_path_factory.mktemp("maps") / "stock"
     settings = BuildSettings(
-        name="refusing", headings=6, spacing_m=5.0, align_survey=False, traffic_vote=False,
-        calibration=calibration_file_of(Encoder.open(encoder_file).sha256, thresholds=thresholds),
-    )  # fmt: skip
-    build_map(small_dataset, encoder_file, out, settings, threads=1)
+        name="stock", headings=6, spacing_m=5.0, calibration=CALIBRATION, align_survey=False, traffic_vote=False
+    )
+    build_map(small_dataset, ENCODER, out, settings, threads=1)
     return out
 
 
