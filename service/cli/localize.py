@@ -193,8 +193,8 @@ def _camera_parts(path: Path, focal_factor: float) -> dict[str, Any]:
         raise RequestError(f"{path}: this is no JSON ({error})", field="camera") from error
     if not isinstance(parts, dict) or "camera" not in parts:
         raise RequestError(f'{path}: it must be an object like {{"camera": {{"width": 640, ...}}}}', field="camera")
-    if focal_factor != 1.0:  # what is asked first goes as it stands, for the service to judge
-        parts["camera"] |= {name: parts["camera"][name] * focal_factor for name in ("fx", "fy")}
+    if focal_factor != 1.0:  # the first question goes as it stands, for the service to judge
+        parts["camera"] |= {name: float(parts["camera"][name]) * focal_factor for name in ("fx", "fy")}
     return parts
 
 
