@@ -16,21 +16,16 @@ from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
 from service.localization.query import Query
+from service.localization.reasons import FOCAL_FACTORS, GAIN, reasons_of, support_of
 from service.maps.calibration import FEATURES, Calibration
 
 #: Nearly nothing is answered: a smaller share of the queries than this is accepted.
 FEW = 0.1
-#: Factors that are tried, and so many queries at most for each.
-FOCAL_FACTORS = (0.5, 2.0)
+#: Factors of depth that are tried, and so many queries at most for each factor.
 DEPTH_FACTORS = (0.001, 0.1, 10.0, 1000.0)
 TRIED = 6
 #: Median depth of a picture of a street, metres. Inside it the unit is right, and no other is tried: tiny depth fits any ground.
 USUAL_DEPTH_M = (1.5, 30.0)
-#: A factor is named if it raises the support of most queries, and the median one by so many nats (inliers and similarity).
-GAIN = 3.0
-_INLIERS, _SIMILARITY = 20.0, 68.0  # as the judge weighs them
-#: Evidence so many standard deviations from calibration's mean is out of its range.
-FAR = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,26 +37,6 @@ class Cause:
 
     def __str__(self) -> str:
         return f"{self.what}: {self.check}"
-
-
-#: What out-of-range evidence speaks of, by the order of likelihood: intrinsics and depth unit are tried, the rest is read off.
-_OF_EVIDENCE: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    ("intrinsics", ("similarity", "facings"), "compare fx, fy, cx, cy and the picture's size with the camera's own calibration"),
-    ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
-    (
-        "field of view or depth range", ("measured", "far"),
-        "the pictures measure another share of the view grid than those that confidence was fitted on; check the range of the depth",
-    ),
-    ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m), and how noisy the depth is"),
-    (
-        "traffic in the map", ("through", "front", "inliers", "unmapped", "likelihood"),
-        "build the map with the traffic vote, and look for what has been built or has moved since the survey",
-    ),
-    (
-        "calibration", ("margin", "similarity_margin", "votes", "entropy", "pose_spread", "residual", "edges", "place_m"),
-        "the map's confidence was calibrated on queries unlike these: calibrate on queries like them (streetfix calibrate)",
-    ),
-)  # fmt: skip
 
 
 def causes(localizer: Localizer, frames: Sequence[QueryFrame], answers: Predictions) -> list[Cause]:
@@ -93,25 +68,21 @@ def out_of_range(calibration: Calibration, evidence: NDArray[np.float64]) -> lis
     known = evidence[np.isfinite(evidence).all(axis=1)]
     if not len(known):
         return [
-            Cause(
-                "no query had enough depth to be registered",
-                "check depth.scale_m and that depth belongs to the colour picture",
-            )
+            Cause("no query had enough depth to be registered", each.remedy) for each in reasons_of(calibration, None)
         ]
-    away = (np.median(known, axis=0) - np.array(calibration.right.mean)) / np.array(calibration.right.spread)
     found = []
-    for what, names, check in _OF_EVIDENCE:
-        far = [(name, away[FEATURES.index(name)]) for name in names if abs(away[FEATURES.index(name)]) > FAR]
-        if far:
-            told = ", ".join(f"{name} {size:+.1f}" for name, size in far)
-            found.append(Cause(f"{what} (standard deviations from what calibration saw: {told})", check))
+    for reason in reasons_of(calibration, np.median(known, axis=0)):
+        told = ", ".join(f"{name} {size:+.1f}" for name, size in reason.evidence)
+        what = f"{reason.check} (standard deviations from what calibration saw: {told})"
+        found.append(Cause(what, reason.remedy))
     return found
 
 
 def _tried(localizer: Localizer, queries: list[Query]) -> list[Cause]:
     """The one change of focal length or depth unit that makes most queries fit much better, if there is one.
 
-    A wrong focal length looks a little like a wrong unit, so only the change that helps most is named.
+    It has to raise the support of the median query by ``GAIN``. A wrong focal length looks a little like a wrong unit, so only the change
+    that helps most is named.
     """
     before = np.array([_support(localizer, query) for query in queries])
     best, gained = None, GAIN
@@ -146,7 +117,7 @@ def _support(localizer: Localizer, query: Query) -> float:
         return 0.0
     if evidence is None:
         return 0.0
-    return float(_INLIERS * evidence[FEATURES.index("inliers")] + _SIMILARITY * evidence[FEATURES.index("similarity")])
+    return support_of(float(evidence[FEATURES.index("inliers")]), float(evidence[FEATURES.index("similarity")]))
 
 
 def _changed(query: Query, kind: str, factor: float) -> Query:

@@ -8,10 +8,10 @@ from rich.table import Table
 
 
 def print_answer(answer: dict[str, Any], console: Console | None = None) -> None:
-    """Print status, street, pose, neighbours and timings.
+    """Print status, street, pose, why there is none, neighbours and timings.
 
     Args:
-        answer: as in the REST contract.
+        answer: as in the REST contract; with ``focal_length_factor`` where another focal length was tried, None if none fits.
         console: where to; standard output by default.
     """
     out = console or Console(highlight=False)
@@ -20,6 +20,10 @@ def print_answer(answer: dict[str, Any], console: Console | None = None) -> None
         facts.add_row(name, value)
     out.print(facts)
     out.print()
+    if answer["pose"] is None:
+        for line in _why(answer):
+            out.print(line, markup=False)
+        out.print()
     if answer["pose"] is None and answer["hypotheses"]:
         out.print(_hypotheses(answer["hypotheses"]))
     out.print(_neighbours(answer["neighbours"]))
@@ -48,6 +52,30 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
         vehicle = answer["vehicle_pose"]
         facts.append(("vehicle", f"{_metres(vehicle['position'])}, heading {vehicle['heading_deg']:.1f} degrees"))
     return [*facts, version]
+
+
+def _why(answer: dict[str, Any]) -> list[str]:
+    """What to check, the likeliest cause first."""
+    found, factor = [], answer.get("focal_length_factor")
+    if factor is not None:
+        found.append(
+            f"the focal length is probably off by a factor of two: fx and fy times {factor:g} fit the map better; check the intrinsics, "
+            "and whether they are of pictures of this size"
+        )  # fmt: skip
+    for reason in answer.get("reasons", []):  # an earlier service sends none
+        told = ", ".join(f"{name} {size:+.1f}" for name, size in reason["evidence"].items())
+        where = f" (standard deviations from what calibration saw: {told})" if told else ""
+        found.append(f"{reason['check']}{where}: {reason['remedy']}")
+    if found:
+        return [
+            "why it may not be LOCALIZED, the likeliest cause first",
+            *(f"  {k}. {each}" for k, each in enumerate(found, 1)),
+        ]
+    if "reasons" not in answer:
+        return ["why: this service does not say"]
+    return [
+        "why: all evidence lies in the range that calibration saw; the place may be outside the map, or look like another place of it"
+    ]
 
 
 def _doubt(spread: dict[str, Any]) -> str:

@@ -1,13 +1,14 @@
 """``streetfix localize``: ask a running service, print its answer for people or programs."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from service.cli.tls_options import Ca, Cert, Key
-from service.errors import RequestError
+from service.errors import RequestError, StreetfixError
 
 _TIMEOUT_S = 60.0
 #: Exit code for an answer that is not LOCALIZED, so that a script does not take it for a pose. 1 and 2 are errors.
@@ -38,19 +39,39 @@ def command(
     ca: Ca = None,
     cert: Cert = None,
     key: Key = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the answer as it came.")] = False,
+    try_focal: Annotated[
+        bool,
+        typer.Option(
+            "--try-focal/--no-try-focal",
+            help="If the answer is not LOCALIZED, ask twice more, with fx and fy halved and doubled, and say so if that fits the map.",
+        ),
+    ] = True,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json",
+            help="Print the answer as it came; with focal_length_factor (null: neither fits) if that was tried.",
+        ),
+    ] = False,
 ) -> None:
     """Ask where two pictures were taken.
 
-    Exit code: 0 if the answer is LOCALIZED; 3 if it is AMBIGUOUS or OUT_OF_MAP, then there is no pose; 1 for an error, 2 for wrong
-    options.
+    Exit code: 0 if the answer is LOCALIZED; 3 if it is AMBIGUOUS or OUT_OF_MAP, then there is no pose, and the command says what to check,
+    the likeliest cause first; 1 for an error, 2 for wrong options.
 
     Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json --near 12,-40
     """
     prior = _prior(near, heading)
-    answer = localize(
-        url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior, api_key=api_key, ca=ca, cert=cert, key=key
-    )  # fmt: skip
+
+    def ask(focal_factor: float) -> dict[str, Any]:
+        return localize(
+            url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior, api_key=api_key, ca=ca, cert=cert, key=key,
+            focal_factor=focal_factor,
+        )  # fmt: skip
+
+    answer = ask(1.0)
+    if try_focal and answer["status"] != "LOCALIZED":
+        answer["focal_length_factor"] = _fitting_factor(answer, ask)
     if as_json:
         typer.echo(json.dumps(answer))
     else:
@@ -59,6 +80,31 @@ def command(
         print_answer(answer)
     if answer["status"] != "LOCALIZED":
         raise typer.Exit(NOT_LOCALIZED)
+
+
+def _fitting_factor(answer: dict[str, Any], ask: Callable[[float], dict[str, Any]]) -> float | None:
+    """The factor of fx and fy that fits the map clearly better than the camera as it was given; None: there is none."""
+    from service.localization.reasons import FOCAL_FACTORS, GAIN_OF_ONE
+
+    before, best, most = _support(answer), None, (False, GAIN_OF_ONE)
+    for factor in FOCAL_FACTORS:
+        try:
+            changed = ask(factor)
+        except StreetfixError as error:  # the answer itself stands
+            typer.echo(f"streetfix: fx and fy times {factor:g} could not be tried: {error}", err=True)
+            continue
+        gained = _support(changed) - before
+        fit = (changed["status"] == "LOCALIZED" and gained > 0, gained)
+        if fit >= most:
+            best, most = factor, fit
+    return best
+
+
+def _support(answer: dict[str, Any]) -> float:
+    """What speaks for the first hypothesis, nats; 0 where nothing could be registered."""
+    from service.localization.reasons import support_of
+
+    return max((support_of(each["inliers"], each["similarity"]) for each in answer["hypotheses"][:1]), default=0.0)
 
 
 def _prior(near: str | None, heading_deg: float | None) -> dict[str, Any] | None:
@@ -86,6 +132,7 @@ def localize(
     ca: Path | None = None,
     cert: Path | None = None,
     key: Path | None = None,
+    focal_factor: float = 1.0,
 ) -> dict[str, Any]:
     """Post a pair of pictures.
 
@@ -100,6 +147,7 @@ def localize(
         ca: PEM file of the authorities of the service's certificate, as in ``Client``.
         cert: PEM file of the client's certificate.
         key: PEM file of its private key.
+        focal_factor: of the camera file's fx and fy.
 
     Raises:
         RequestError: a file cannot be read, the camera file is no JSON object, or the address is none.
@@ -109,7 +157,7 @@ def localize(
     """
     from service.client import Client, RetryPolicy, rest
 
-    request = _camera_parts(camera) | ({} if map_name is None else {"map": map_name})
+    request = _camera_parts(camera, focal_factor) | ({} if map_name is None else {"map": map_name})
     request |= {} if prior is None else {"prior": prior}
     files = {
         "rgb": (rgb.name, _bytes_of(rgb, "rgb"), "application/octet-stream"),
@@ -138,13 +186,15 @@ def _answer(body: bytes) -> dict[str, Any]:
     return answer
 
 
-def _camera_parts(path: Path) -> dict[str, Any]:
+def _camera_parts(path: Path, focal_factor: float) -> dict[str, Any]:
     try:
         parts = json.loads(_bytes_of(path, "camera"))
     except (ValueError, RecursionError) as error:
         raise RequestError(f"{path}: this is no JSON ({error})", field="camera") from error
     if not isinstance(parts, dict) or "camera" not in parts:
         raise RequestError(f'{path}: it must be an object like {{"camera": {{"width": 640, ...}}}}', field="camera")
+    if focal_factor != 1.0:  # the first question goes as it stands, for the service to judge
+        parts["camera"] |= {name: float(parts["camera"][name]) * focal_factor for name in ("fx", "fy")}
     return parts
 
 

@@ -60,6 +60,9 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
                 for each in message.hypotheses
             ],
             "spread": _spread_content(message.spread) if message.HasField("spread") else None,
+            "reasons": [
+                {"check": each.check, "evidence": dict(each.evidence), "remedy": each.remedy} for each in message.reasons
+            ],
             "neighbours": [
                 {
                     "place": each.place, "distance": each.distance, "similarity": each.similarity,

@@ -23,6 +23,7 @@ from service.geometry.uncertainty import covariance_at
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
+from service.localization.reasons import Reason
 from service.localization.rivals import distinct_candidates, shares_of
 from service.localization.search import Neighbour
 from service.localization.spread import Spread
@@ -166,6 +167,7 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         geopose=geopose_of(T_map_posed, bundle) if localized else None,
         hypotheses=_hypotheses(answer),
         spread=None if spread is None else _spread(spread),
+        reasons=[_reason(each) for each in answer.reasons],
         neighbours=[_neighbour(each, bundle) for each in answer.neighbours],
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(
@@ -299,6 +301,10 @@ def _spread(spread: Spread) -> schema.Spread:
         heading_std_deg=math.degrees(spread.heading_std_rad),
         hypotheses_weight=spread.hypotheses_weight,
     )
+
+
+def _reason(reason: Reason) -> schema.Reason:
+    return schema.Reason(check=reason.check, evidence=dict(reason.evidence), remedy=reason.remedy)
 
 
 def _direction(vector: schema.Direction, field: str) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, field_validator, model_validator
 
 from service.errors import NotLocalizedError, RequestError
 from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS
@@ -337,6 +337,19 @@ class Spread(BaseModel):
     hypotheses_weight: float = Field(description="probability that one of the hypotheses is right, 0 to 1")
 
 
+class Reason(BaseModel):
+    """What may be wrong with the question or the map. It is read off the evidence, so it is a place to look, not a finding."""
+
+    check: str = Field(
+        description="intrinsics, depth unit, field of view or depth range, baseline, traffic in the map, calibration; depth: too few "
+        "pixels have one"
+    )
+    evidence: dict[str, FiniteFloat] = Field(
+        description="evidence out of the range that calibration saw: name, and distance from calibration's mean in standard deviations"
+    )
+    remedy: str = Field(description="what to do")
+
+
 class MapVersion(BaseModel):
     """Which map answered."""
 
@@ -385,6 +398,11 @@ class LocalizeAnswer(BaseModel):
         "registration"
     )
     spread: Spread | None = Field(description="where the camera may be; null for a LOCALIZED answer")
+    reasons: list[Reason] = Field(
+        default_factory=list,  # an earlier service sends none
+        description="why it may not be LOCALIZED, the likeliest first; empty for a LOCALIZED answer. Empty in another answer: all "
+        "evidence lies in the range that calibration saw, so the place may be outside the map, or look like another",
+    )
     neighbours: list[Neighbour] = Field(
         description="k distinct places: those nearest to the registered poses first, the best supported pose's before all, then the most "
         "similar ones; by similarity alone without registration"
@@ -400,6 +418,8 @@ class LocalizeAnswer(BaseModel):
             raise ValueError("a LOCALIZED answer has a pose and no spread, every other one a spread and no pose")
         if not localized and (self.vehicle_pose, self.geopose, self.street) != (None, None, None):
             raise ValueError("an answer that is not LOCALIZED has no vehicle_pose, geopose or street")
+        if localized and self.reasons:
+            raise ValueError("a LOCALIZED answer has no reasons for not being LOCALIZED")
         if any(each.confirmed != (localized and number == 0) for number, each in enumerate(self.hypotheses)):
             raise ValueError("only the first hypothesis of a LOCALIZED answer is confirmed")
         return self

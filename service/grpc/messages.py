@@ -156,6 +156,7 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
             for each in answer.hypotheses
         ],
         spread=None if answer.spread is None else _spread(answer.spread),
+        reasons=[pb.Reason(check=each.check, evidence=each.evidence, remedy=each.remedy) for each in answer.reasons],
     )  # fmt: skip
     return message
 

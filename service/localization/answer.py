@@ -12,6 +12,7 @@ from service.errors import NotFiniteError
 from service.geometry.rigid import Transform
 from service.localization.hypotheses import Hypothesis
 from service.localization.judge import Candidate
+from service.localization.reasons import Reason
 from service.localization.search import Neighbour
 from service.localization.spread import Spread
 from service.localization.street_vote import StreetVote
@@ -50,6 +51,8 @@ class Answer:
         candidates: the registered poses, the best supported first; None where nothing was registered. Where the answer is not
             LOCALIZED, each of those that exclude each other has its covariance, else only the first.
         spread: where the camera may be; None for a LOCALIZED answer.
+        reasons: what may be wrong with the question or the map, the likeliest first; empty for a LOCALIZED answer, and where all
+            evidence lies in the range that calibration saw.
         frames: so many were asked together.
         T_map_vehicle_guess: best guess of the vehicle's pose, where the query said how the camera sits on it.
         neighbours: k distinct places, those nearest to the registered poses first, then the most similar.
@@ -66,6 +69,7 @@ class Answer:
     covariance: Float64[NDArray[np.float64], "6 6"] | None
     candidates: tuple[Candidate, ...] | None
     spread: Spread | None
+    reasons: tuple[Reason, ...]
     frames: int
     evidence: Float64[NDArray[np.float64], " F"] | None
     T_map_vehicle_guess: Transform | None

@@ -17,6 +17,7 @@ from service.localization.frames import Frame
 from service.localization.hypotheses import ClusterSettings, Hypothesis, believed, cluster
 from service.localization.judge import Candidate
 from service.localization.query import Query
+from service.localization.reasons import Reason, reasons_of
 from service.localization.refine import RefineSettings, refine
 from service.localization.rerank import reranked
 from service.localization.rivals import distinct_candidates, shares_of
@@ -153,8 +154,11 @@ class Localizer:
                 )
             )
         decision = None
+        reasons: tuple[Reason, ...] = ()
         if registers and self.bundle.calibration is not None:
             decision = decide(self.bundle.calibration, evidence, query.false_accept_rate)
+            if decision.status != "LOCALIZED":
+                reasons = reasons_of(self.bundle.calibration, evidence)
         candidates, spread = None if refined is None else refined.candidates, None
         if decision is not None and decision.status != "LOCALIZED":
             candidates = None if refined is None else refined.with_covariances()
@@ -173,6 +177,7 @@ class Localizer:
             covariance=None if refined is None else refined.covariance,
             candidates=candidates,
             spread=spread,
+            reasons=reasons,
             frames=len(frames),
             evidence=evidence,
             T_map_vehicle_guess=None

@@ -47,6 +47,49 @@ def test_ones_own_files_are_sorted_and_asked(url: str, demo_map: Demo, page_of: 
     shoot(page, "upload_dark")
 
 
+def test_an_answer_that_is_refused_says_what_to_check(url: str, page_of: Pages, shoot: Shoot) -> None:
+    """Reasons in their order with their remedies; then an answer without any. Both are put in place of the service's own."""
+    reasons = [
+        {"check": "intrinsics", "evidence": {"similarity": -4.25}, "remedy": "compare fx and fy"},
+        {"check": "baseline", "evidence": {"log_noise": 3.5, "points": -6.0}, "remedy": "check the stereo baseline"},
+    ]
+    spread = {
+        "mean": {"x": 0, "y": 0, "z": 0},
+        "covariance": [900.0, 0, 0, 0, 900.0, 0, 0, 0, 1],
+        "heading_std_deg": 40,
+        "hypotheses_weight": 0.2,
+    }
+    page = page_of()
+    open_console(page, url)
+    for number, told in (("01", reasons), ("02", [])):
+
+        def refused(route: Any, told: list[dict[str, Any]] = told) -> None:
+            response = route.fetch()
+            content = response.json()
+            content["answer"] |= {
+                "status": "OUT_OF_MAP",
+                "pose": None,
+                "street": None,
+                "spread": spread,
+                "reasons": told,
+            }
+            route.fulfill(response=response, json=content)
+
+        page.route("**/v1/explain", refused)
+        click_sample(page, number)
+        page.unroute("**/v1/explain")
+        assert page.inner_text(".verdict .status").upper() == "OUT OF MAP"
+        items = page.locator(".why li")
+        assert items.count() == len(told)
+        for k, each in enumerate(told):
+            text = items.nth(k).inner_text()
+            assert each["check"] in text
+            assert each["remedy"] in text
+    assert "outside the map" in page.inner_text(".why")
+    shoot(page, "refused")
+    page.unroute_all()
+
+
 def test_a_wrong_file_is_told_with_what_to_do(url: str, demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
     page = page_of()
     open_console(page, url)
@@ -75,6 +118,7 @@ def test_an_ambiguous_answer_shows_its_hypotheses(url: str, demo_map: Demo, page
     page.click("button.primary")
     page.wait_for_selector(".verdict.ambiguous", timeout=ANSWER_MS)
     assert page.locator("section:has(h2:text('Hypotheses')) tbody tr").count() >= 2
+    assert page.locator(".why").count() == 1
     shoot(page, "ambiguous")
 
 

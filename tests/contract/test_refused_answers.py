@@ -85,6 +85,8 @@ def require_refused(answer: dict[str, Any], status: str) -> None:
     assert answer["map"]["name"] == "tiny"
     assert answer["hypotheses"], "the candidates are kept"
     assert not any(each["confirmed"] for each in answer["hypotheses"])
+    assert answer["reasons"], "evidence lies far from this calibration's means of 0"
+    assert all(each["evidence"] and each["remedy"] for each in answer["reasons"])
     assert all(len(each["pose"]["covariance"]) == 36 for each in answer["hypotheses"])
     LocalizeAnswer.model_validate(answer)
 
@@ -119,7 +121,7 @@ def test_the_same_question_less_strict_has_its_pose(refusing: Any, parts_of: Par
     answer = posted(refusing.client, "/v1/localize", parts).json()
     assert answer["status"] == "LOCALIZED"
     assert all(answer[name] is not None for name in NONE)
-    assert answer["spread"] is None
+    assert (answer["spread"], answer["reasons"]) == (None, [])
     assert [each["confirmed"] for each in answer["hypotheses"]] == [True] + [False] * (len(answer["hypotheses"]) - 1)
     assert answer["hypotheses"][0]["pose"] == answer["pose"]
 
@@ -144,6 +146,29 @@ def test_grpc(refusing: Any, parts_of: Parts) -> None:
         assert answer.HasField("spread")
         assert answer.hypotheses
         assert not any(each.confirmed for each in answer.hypotheses)
+
+
+def test_both_faces_and_clients_give_the_same_reasons(refusing: Any, parts_of: Parts, pictures: Any) -> None:
+    """All evidence more than 3 standard deviations from 0 is told with its size, and no number is infinite or not one."""
+    parts = parts_of()
+    response = posted(refusing.client, "/v1/localize", parts)
+    json.loads(response.text, parse_constant=pytest.fail)
+    reasons = response.json()["reasons"]
+    message = refusing.stub.Localize(pb.LocalizeRequest(
+        rgb=parts["rgb"], depth=parts["depth"], camera=CAMERA, depth_format=pb.DepthFormat(scale_m=1)
+    ))  # fmt: skip
+    assert [(each.check, dict(each.evidence), each.remedy) for each in message.reasons] == [
+        (each["check"], each["evidence"], each["remedy"]) for each in reasons
+    ]
+    sizes = [size for each in reasons for size in each["evidence"].values()]
+    assert min(map(abs, sizes)) > 3
+    rgb, depth_m, camera = pictures
+    with Client(refusing.url) as rest, GrpcClient(refusing.address) as messages:
+        told = [
+            [each.model_dump() for each in client.localize(rgb, depth_m, camera).reasons] for client in (rest, messages)
+        ]
+    assert [[each["check"] for each in found] for found in told] == [[each["check"] for each in reasons]] * 2
+    assert told[0] == told[1]
 
 
 def test_geopose_in_both_formats_is_a_problem_and_no_position(refusing: Any, parts_of: Parts) -> None:

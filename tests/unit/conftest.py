@@ -95,8 +95,9 @@ def refused_answer(answer: dict[str, Any], status: str = "AMBIGUOUS", **changed:
         "mean": pose["position"] | {"y": pose["position"]["y"] + 30.0}, "covariance": [1.0, 0, 0, 0, 900.0, 0, 0, 0, 1.0],
         "heading_std_deg": 20.0, "hypotheses_weight": 0.75,
     }  # fmt: skip
+    reasons = [{"check": "baseline", "evidence": {"log_noise": 4.0, "points": -3.5}, "remedy": "check the baseline"}]
     gone = {"pose": None, "vehicle_pose": None, "geopose": None, "street": None}
-    return answer | gone | {"status": status, "hypotheses": hypotheses, "spread": spread} | changed
+    return answer | gone | {"status": status, "hypotheses": hypotheses, "spread": spread, "reasons": reasons} | changed
 
 
 @pytest.fixture(scope="session")
@@ -212,6 +213,20 @@ def calibration_file_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..
         return path
 
     return made
+
+
+@pytest.fixture(scope="session")
+def stock_map(small_dataset: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``small_map`` by the stock encoder, with its calibration."""
+    from model_training.mapping.build import BuildSettings, build_map
+    from model_training.stock import CALIBRATION, ENCODER
+
+    out: Path = tmp_path_factory.mktemp("maps") / "stock"
+    settings = BuildSettings(
+        name="stock", headings=6, spacing_m=5.0, calibration=CALIBRATION, align_survey=False, traffic_vote=False
+    )
+    build_map(small_dataset, ENCODER, out, settings, threads=1)
+    return out
 
 
 @pytest.fixture(scope="session")

@@ -57,7 +57,7 @@ def answer_of(refused_of: Callable[..., dict[str, Any]]) -> Callable[..., Locali
         content = {
             "status": "LOCALIZED", "confidence": 0.95,
             "street": {"id": "s2", "name": "End", "street": "4", "section": "end", "class_index": 6, "vote": 0.5},
-            "pose": pose, "vehicle_pose": None, "geopose": None, "hypotheses": [], "spread": None, "neighbours": [],
+            "pose": pose, "vehicle_pose": None, "geopose": None, "hypotheses": [], "spread": None, "reasons": [], "neighbours": [],
             "map": {"name": "tiny", "version": "abc"},
             "timings_ms": {"decode": 1, "fuse": 1, "encode": 1, "search": 1, "register": 1, "total": 5},
         }  # fmt: skip

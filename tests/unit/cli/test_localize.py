@@ -31,6 +31,7 @@ ANSWER: dict[str, Any] = {
          "share": 0.375, "inliers": 0.25, "similarity": 0.875},
     ],
     "spread": None,
+    "reasons": [],
     "neighbours": [
         {"place": 8, "distance": 0.1, "similarity": 0.995, "street": None, "position": {"x": 1, "y": 2, "z": 3},
          "heading_deg": 90.0},
@@ -48,6 +49,10 @@ REFUSED: dict[str, Any] = {
         "mean": {"x": 35, "y": -40, "z": 1.5}, "covariance": [9.0, 0, 0, 0, 2025.0, 0, 0, 0, 1.0], "heading_std_deg": 70.0,
         "hypotheses_weight": 0.6,
     },
+    "reasons": [
+        {"check": "baseline", "evidence": {"log_noise": 4.25, "points": -3.5}, "remedy": "check the stereo baseline"},
+        {"check": "depth", "evidence": {}, "remedy": "check [depth.scale_m]"},
+    ],
 }  # fmt: skip
 
 
@@ -56,6 +61,47 @@ def files(tmp_path: Path) -> dict[str, Path]:
     for name, data in {"rgb": b"r", "depth": b"d", "camera": b'{"camera": {}, "map": "a"}'}.items():
         (tmp_path / name).write_bytes(data)
     return {name: tmp_path / name for name in ("rgb", "depth", "camera")}
+
+
+@pytest.fixture
+def given(files: dict[str, Path]) -> list[str]:
+    """The same as options; the camera has a focal length."""
+    files["camera"].write_text('{"camera": {"fx": 32, "fy": 30, "cx": 31.5}}')
+    return [part for name, path in files.items() for part in (f"--{name}", str(path))]
+
+
+@pytest.fixture
+def by_focal(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, Any]]]:
+    """Answer by the fx that was asked with; the cameras are in the list."""
+
+    def put(answers: dict[float, tuple[int, dict[str, Any]]]) -> list[dict[str, Any]]:
+        asked: list[dict[str, Any]] = []
+
+        def request(client: httpx.Client, method: str, path: str, **sent: Any) -> httpx.Response:
+            camera = json.loads(sent["files"]["request"][1])["camera"]
+            asked.append(camera)
+            status, content = answers[camera["fx"]]
+            return httpx.Response(status, json=content, request=httpx.Request(method, f"http://x{path}"))
+
+        monkeypatch.setattr(httpx.Client, "request", request)
+        return asked
+
+    return put
+
+
+def refused_with(*, inliers: float = 0.5, similarity: float = 0.5) -> dict[str, Any]:
+    best = REFUSED["hypotheses"][0] | {"inliers": inliers, "similarity": similarity}
+    return ANSWER | REFUSED | {"hypotheses": [best, REFUSED["hypotheses"][1]]}
+
+
+def localized_with(*, similarity: float) -> dict[str, Any]:
+    return ANSWER | {"hypotheses": [ANSWER["hypotheses"][0] | {"similarity": similarity}]}
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(["localize", *arguments])
+    return int(end.value.code or 0)
 
 
 @pytest.fixture
@@ -219,6 +265,7 @@ def test_people_read_where_else_it_may_be_when_it_is_not_sure(status: str) -> No
 
 def test_people_are_not_told_of_other_places_when_it_is_sure_or_when_there_are_none() -> None:
     assert "where it may be" not in text_of(confidence=0.999)
+    assert "why" not in text_of(confidence=0.999)
     assert "where it may be" not in text_of(**REFUSED | {"hypotheses": []})
 
 
@@ -233,14 +280,90 @@ def test_the_exit_code_says_whether_there_is_a_pose(
 ) -> None:  # fmt: skip
     answering(httpx.Response(200, json=ANSWER | changed))
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
-    with pytest.raises(SystemExit) as end:
-        main(["localize", *given, *flags])
-    assert (end.value.code or 0) == code
+    assert run(*given, *flags, "--no-try-focal") == code
     told = capsys.readouterr().out
     if flags:
         assert json.loads(told) == ANSWER | changed
     else:
         assert told.split()[:2] == ["status", (ANSWER | changed)["status"]]
+
+
+def test_people_read_why_and_what_to_do() -> None:
+    lines = text_of(**REFUSED).splitlines()
+    start = lines.index("why it may not be LOCALIZED, the likeliest cause first")
+    told = " ".join(" ".join(lines[start + 1 : start + 4]).split())
+    assert told.startswith(
+        "1. baseline (standard deviations from what calibration saw: log_noise +4.2, points -3.5): check the stereo baseline "
+        "2. depth: check [depth.scale_m]"
+    )
+
+
+def test_people_read_that_all_evidence_is_in_range() -> None:
+    told = " ".join(text_of(**REFUSED | {"reasons": []}).split())
+    assert (
+        "why: all evidence lies in the range that calibration saw; the place may be outside the map, or look like another"
+        in told
+    )
+
+
+def test_an_earlier_service_gives_no_reasons() -> None:
+    answer = {name: value for name, value in (ANSWER | REFUSED).items() if name != "reasons"}
+    stream = io.StringIO()
+    print_answer(answer, Console(file=stream, width=120))
+    assert "why: this service does not say" in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("halved", "doubled", "factor"),
+    [
+        (refused_with(), refused_with(), None),
+        (refused_with(inliers=0.79), refused_with(similarity=0.58), None),  # 5.8 and 5.44 nats more
+        (refused_with(inliers=0.81), refused_with(), 0.5),  # 6.2
+        (refused_with(), refused_with(similarity=0.59), 2.0),  # 6.12
+        (refused_with(inliers=0.85), refused_with(inliers=0.95), 2.0),
+        (ANSWER, refused_with(inliers=1.0, similarity=1.0), 0.5),  # ANSWER has a similarity of 0.9
+        (refused_with(inliers=0.0, similarity=0.0), ANSWER, 2.0),
+        (localized_with(similarity=0.51), refused_with(), 0.5),
+        (localized_with(similarity=0.49), refused_with(), None),
+        (ANSWER | REFUSED | {"hypotheses": []}, refused_with(), None),
+    ],
+)
+def test_a_focal_length_that_fits_the_map_clearly_better_is_named_first(
+    given: list[str], by_focal: Callable[..., Any], capsys: pytest.CaptureFixture[str], halved: dict[str, Any],
+    doubled: dict[str, Any], factor: float | None,
+) -> None:  # fmt: skip
+    asked = by_focal({32: (200, refused_with()), 16: (200, halved), 64: (200, doubled)})
+    assert run(*given, "--json") == 3
+    assert json.loads(capsys.readouterr().out) == refused_with() | {"focal_length_factor": factor}
+    assert asked == [{"fx": 32 * f, "fy": 30 * f, "cx": 31.5} for f in (1, 0.5, 2)]
+    assert run(*given) == 3
+    text = " ".join(capsys.readouterr().out.split())
+    named = (
+        f"1. the focal length is probably off by a factor of two: fx and fy times {factor or 0:g} fit the map better"
+    )
+    assert (named in text) == (factor is not None)
+    assert f"{1 if factor is None else 2}. baseline" in text
+
+
+@pytest.mark.parametrize(("answer", "flags"), [(ANSWER, []), (refused_with(), ["--no-try-focal"])])
+def test_no_other_focal_length_is_tried_for_a_good_answer_or_where_that_is_switched_off(
+    given: list[str], by_focal: Callable[..., Any], capsys: pytest.CaptureFixture[str], answer: dict[str, Any], flags: list[str]
+) -> None:  # fmt: skip
+    asked = by_focal({32: (200, answer)})
+    run(*given, "--json", *flags)
+    assert json.loads(capsys.readouterr().out) == answer
+    assert len(asked) == 1
+
+
+def test_a_focal_length_that_is_refused_is_told_and_the_answer_stands(
+    given: list[str], by_focal: Callable[..., Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = {"title": "Too few.", "detail": "no depth", "code": "no-depth"}
+    by_focal({32: (200, refused_with()), 16: (422, problem), 64: (200, refused_with(inliers=0.9))})
+    assert run(*given, "--json") == 3
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["focal_length_factor"] == 2.0
+    assert captured.err.startswith("streetfix: fx and fy times 0.5 could not be tried: the service refused: Too few.")
 
 
 def test_an_answer_of_an_older_service_that_has_a_pose_in_doubt_is_refused(

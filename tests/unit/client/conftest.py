@@ -16,6 +16,7 @@ ANSWER: dict[str, Any] = {
     "geopose": None,
     "hypotheses": [],
     "spread": None,
+    "reasons": [],
     "neighbours": [],
     "map": {"name": "tiny", "version": "abc"},
     "timings_ms": {"decode": 1.0, "fuse": 1.0, "encode": 1.0, "search": 1.0, "register": 1.0, "total": 5.0},

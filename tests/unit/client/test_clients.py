@@ -144,6 +144,7 @@ def test_an_answer_that_is_not_localized_has_no_pose_to_use(
     {"status": "OUT_OF_MAP"},  # a pose all the same, as before
     {"pose": None},
     {"spread": {"mean": {"x": 0, "y": 0, "z": 0}, "covariance": [0.0] * 9, "heading_std_deg": 0, "hypotheses_weight": 1}},
+    {"reasons": [{"check": "baseline", "evidence": {"log_noise": 4.0}, "remedy": "check it"}]},
 ])  # fmt: skip
 def test_an_answer_whose_status_and_pose_contradict_each_other_is_none(
     ask: Asking, answer_json: Json, lie: dict[str, Any]

@@ -37,8 +37,8 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     answer = response.json()
     assert response.status_code == 200
     assert list(answer) == [
-        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "spread", "neighbours", "map",
-        "timings_ms",
+        "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "spread", "reasons", "neighbours",
+        "map", "timings_ms",
     ]  # fmt: skip
     assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
     assert answer["street"] | {"vote": 1} == {

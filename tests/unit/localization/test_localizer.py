@@ -14,6 +14,7 @@ from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
 from service.localization.query import Query
+from service.localization.reasons import reasons_of
 from service.localization.search import distinct_places, search_views
 from service.localization.street_vote import StreetVote
 from service.maps.calibration import FEATURES
@@ -209,7 +210,7 @@ def test_the_evidence_has_a_number_for_every_feature(localizer: Localizer, query
 
 def test_a_map_that_is_not_calibrated_answers_without_confidence(localizer: Localizer, query: Query) -> None:
     answer = localizer.localize(query)
-    assert (answer.status, answer.confidence) == ("LOCALIZED", None)
+    assert (answer.status, answer.confidence, answer.reasons) == ("LOCALIZED", None, ())
 
 
 @pytest.mark.parametrize(("rate", "status"), [(0.01, "LOCALIZED"), (0.001, "AMBIGUOUS")])
@@ -226,8 +227,13 @@ def test_a_calibrated_map_says_how_sure_it_is_and_accepts_by_the_rate_asked_for(
     localizer = Localizer.open(MapBundle.open(tmp_path / "m"))
     answer = localizer.localize(replace(query, false_accept_rate=rate))
     assert (answer.status, answer.confidence) == (status, 0.5)
+    assert answer.evidence is not None
+    assert localizer.bundle.calibration is not None
+    out_of_range = reasons_of(localizer.bundle.calibration, answer.evidence)
+    assert out_of_range  # of a calibration whose means are all 0
+    assert answer.reasons == (() if status == "LOCALIZED" else out_of_range)
     retrieved = localizer.localize(replace(query, false_accept_rate=rate, refine=False))
-    assert (retrieved.status, retrieved.confidence) == ("LOCALIZED", None)
+    assert (retrieved.status, retrieved.confidence, retrieved.reasons) == ("LOCALIZED", None, ())
 
 
 @pytest.fixture
@@ -257,6 +263,7 @@ def test_a_calibrated_map_believes_nothing_of_a_picture_that_is_too_empty_to_reg
     few[20:23, 20:24] = query.depth_m[20:23, 20:24]
     answer = calibrated.localize(replace(query, depth_m=few))
     assert (answer.status, answer.confidence, answer.evidence, answer.candidates) == ("OUT_OF_MAP", 0.0, None, None)
+    assert [reason.check for reason in answer.reasons] == ["depth"]
 
 
 def test_one_frame_of_a_sequence_is_answered_like_a_single_query(localizer: Localizer, query: Query) -> None:

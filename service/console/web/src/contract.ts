@@ -50,7 +50,15 @@ export interface Spread {
   hypotheses_weight: number;
 }
 
-/** Street and pose are null unless the answer is LOCALIZED, the spread is null if it is. */
+/** What may be wrong with the question or the map. */
+export interface Reason {
+  check: string;
+  /** Standard deviations from the mean of calibration. */
+  evidence: Record<string, number>;
+  remedy: string;
+}
+
+/** Street and pose are null unless the answer is LOCALIZED, the spread is null and the reasons are empty if it is. */
 export interface Answer {
   status: Status;
   confidence: number | null;
@@ -58,6 +66,7 @@ export interface Answer {
   pose: Pose | null;
   hypotheses: Hypothesis[];
   spread: Spread | null;
+  reasons: Reason[];
   neighbours: Neighbour[];
   map: MapVersion;
   timings_ms: { decode: number; fuse: number; encode: number; search: number; register: number; total: number };

@@ -41,6 +41,7 @@ export class AnswerPanel {
     this.#pictures.show(rgb, explanation);
     this.element.replaceChildren(
       this.#head(answer, truth),
+      answer.pose === null ? this.#why(answer) : '',
       answer.pose === null ? this.#spread(answer) : this.#pose(answer, answer.pose),
       answer.hypotheses.length > (answer.pose === null ? 0 : 1) ? this.#hypotheses(answer) : '',
       element('section', {}, element('h2', {}, 'What the machine saw'), this.#pictures.element),
@@ -80,6 +81,23 @@ export class AnswerPanel {
         error === null ? null : figure(metres(error.metres), error.degrees === null ? 'from the truth' : `and ${degrees(error.degrees)} from the truth`, error.metres > WRONG_M),
       ),
     );
+  }
+
+  #why(answer: Answer): HTMLElement {
+    if (answer.reasons.length === 0) {
+      return element(
+        'section',
+        { class: 'why' },
+        element('h2', {}, 'Why there is no pose'),
+        element('p', {}, 'All evidence lies in the range that calibration saw. The place may be outside the map, or look like another place of it.'),
+      );
+    }
+    const list = element('ol');
+    for (const { check, evidence, remedy } of answer.reasons) {
+      const away = Object.entries(evidence).map(([name, deviations]) => `${name} ${deviations > 0 ? '+' : '−'}${Math.abs(deviations).toFixed(1)} σ`);
+      list.append(element('li', {}, element('b', {}, check), element('span', {}, remedy), away.length === 0 ? null : element('span', { class: 'hint' }, away.join(', '))));
+    }
+    return element('section', { class: 'why' }, element('h2', {}, 'What to check, the likeliest first'), list);
   }
 
   #spread(answer: Answer): HTMLElement {
