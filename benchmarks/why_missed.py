@@ -56,15 +56,15 @@ _BORDERS = (
 )
 _OVER_BARE = (
     "medians of runs differ by up to 10 %: full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29. A full request takes "
-    "29 ms. Of that the event loop takes 1.0 ms, splitting the body 0.12 to 0.2 ms, writing the answer 0.12 to 0.28 ms, and the framework's "
-    "own dispatch 0.1 ms. Tried without gain: httptools and uvloop, fewer copies, no proxy headers. Tried without gain: bodies in one "
+    "29 ms. Of that the event loop takes 1.0 ms, splitting the body 0.12 to 0.2 ms, writing the answer 0.12 to 0.28 ms, and the "
+    "framework's own dispatch 0.1 ms. Tried without gain: httptools and uvloop, fewer copies, no proxy headers. Tried without gain: bodies in one "
     "piece that the system holds until they are whole. Tried without gain: other intervals of thread switches and of garbage collection, "
     "one arena of malloc. Parsing the headers of parts once gained 0.1 ms. Answering in the loop's thread is ruled out, since a stuck "
     "request would stop all others. Next: fewer reads of a body, each of which wakes the loop while the worker computes"
 )
 _PEERS = (
-    "the best peer is MLServer. With eight clients its processor time is 35.3 ms for a full request and 10.0 ms for retrieval. Ours is 38.2 "
-    "and 11.6 ms. The others take 39.5 to 40.4 and 11.7 to 13.2 ms. MLServer's handler runs in the event loop's own thread, as its "
+    "the best peer is MLServer. With eight clients its processor time is 35.3 ms for a full request and 10.0 ms for retrieval. Ours is "
+    "38.2 and 11.6 ms. The others take 39.5 to 40.4 and 11.7 to 13.2 ms. MLServer's handler runs in the event loop's own thread, as its "
     "documentation advises without workers, so it changes no thread. Ours hands work to another thread. So health and refusals are "
     "answered meanwhile, and a stuck request stops no other. That the change of threads is the difference is a guess, not measured"
 )
