@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -15,6 +14,7 @@ import pytest
 
 from service.contract.convert import geopose_of
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+from service.maps.calibration import Calibration
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
@@ -201,14 +201,13 @@ def test_a_map_without_a_place_on_the_earth_is_told(bundle_path: Path, parts_of:
 
 
 def test_doubt_is_a_problem_where_the_format_has_no_word_for_it(
-    client: httpx.Client, parts_of: Parts, monkeypatch: pytest.MonkeyPatch
+    client: httpx.Client, parts_of: Parts, calibration_of: Callable[..., Calibration], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from service.localization import localizer
     from service.localization.decide import Decision
 
     monkeypatch.setattr(localizer, "decide", lambda *_: Decision("AMBIGUOUS", 0.4))
-    calibration = SimpleNamespace(least_false_accept_rate=0.001)
-    monkeypatch.setattr(MapBundle, "calibration", calibration, raising=False)
+    monkeypatch.setattr(MapBundle, "calibration", calibration_of(), raising=False)
     refused = post(client, parts_of(), Accept="application/geopose+json")
     assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")
     assert "AMBIGUOUS" in refused.json()["detail"]
