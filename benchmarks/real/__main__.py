@@ -6,6 +6,7 @@ from pathlib import Path
 
 from benchmarks.real.kitti import drive_rows, stereo_rows
 from benchmarks.real.loops import loop_rows
+from benchmarks.real.matcher import matcher_rows
 from benchmarks.real.resume import identical_bundles
 from benchmarks.real.ros2 import answers_over_dds
 from benchmarks.real.round_trips import QUERIES, import_rows, round_trip_rows, simulated
@@ -40,6 +41,7 @@ def main() -> None:
     parts: dict[str, Callable[[Report, argparse.Namespace], None]] = {
         "drive": lambda report, a: drive_rows(report, a.data, a.work),
         "stereo": lambda report, a: stereo_rows(report, a.data, a.work),
+        "matcher": lambda report, a: matcher_rows(report, a.data, a.work),
         "streets": lambda report, a: street_rows(report, a.data, a.work, tuple(a.drives)),
         "round-trips": lambda report, a: round_trip_rows(report, a.work),
         "import": lambda report, a: import_rows(report, a.work),

@@ -99,26 +99,35 @@ def status_rows(
     report.row(f"{row}.forced_median_m", float(np.median(finite)) if len(finite) else None, "m", n=len(finite))
 
 
-def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:
-    """The drive's map, made anew; None where the recording is not there, which the report then says."""
+def imported(data: Path, work: Path, name: str) -> Dataset | None:
+    """The drive as a user imports it, made anew; None where the recording is not there."""
     if not (data / name).exists():
-        report.row(
-            f"real.{name}.answered_within_1_m", None, "share", bar=_ANSWERED, why=f"no recordings at {data.name}"
-        )
         return None
-    folders = {kind: work / f"{name}_{kind}" for kind in ("raw", "data", "map")}
-    for folder in folders.values():
-        shutil.rmtree(folder, ignore_errors=True)
-    subprocess.run([sys.executable, str(data / "unpack.py"), str(data / name), str(folders["raw"])], check=True)
-    (drive,) = folders["raw"].glob("*/*_sync")
+    raw, folder = work / f"{name}_raw", work / f"{name}_data"
+    for each in (raw, folder):
+        shutil.rmtree(each, ignore_errors=True)
+    subprocess.run([sys.executable, str(data / "unpack.py"), str(data / name), str(raw)], check=True)
+    (drive,) = raw.glob("*/*_sync")
     recording = open_recording("kitti-raw", drive, OpenSettings(depth="sgbm"))
     trajectory = recording.trajectory()
     if trajectory is None:
         raise FileNotFoundError(f"{drive} has no poses (oxts)")
-    take(recording, trajectory, folders["data"], TakeSettings())
-    dataset = Dataset(folders["data"])
-    build_map(dataset, ENCODER, folders["map"], BuildSettings(name=name))
-    return Street(name, dataset, Localizer.open(MapBundle.open(folders["map"])))
+    take(recording, trajectory, folder, TakeSettings())
+    return Dataset(folder)
+
+
+def _street(report: Report, data: Path, work: Path, name: str) -> Street | None:
+    """The drive's map, made anew; None where the recording is not there, which the report then says."""
+    dataset = imported(data, work, name)
+    if dataset is None:
+        report.row(
+            f"real.{name}.answered_within_1_m", None, "share", bar=_ANSWERED, why=f"no recordings at {data.name}"
+        )
+        return None
+    folder = work / f"{name}_map"
+    shutil.rmtree(folder, ignore_errors=True)
+    build_map(dataset, ENCODER, folder, BuildSettings(name=name))
+    return Street(name, dataset, Localizer.open(MapBundle.open(folder)))
 
 
 def _stage_rows(report: Report, street: Street) -> None:

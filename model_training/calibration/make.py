@@ -8,8 +8,16 @@ from numpy.typing import NDArray
 
 from model_training.calibration.collect import in_the_map, of_another_city, walls_and_rooms, where_streets_are_missing
 from model_training.calibration.fit import Asked, expected_calibration_error, fit, pooled
-from model_training.calibration.plans import CITIES, calibration_plan, repeating_plan
-from model_training.calibration.rigs import RIGS
+from model_training.calibration.plans import (
+    CITIES,
+    PAIR_CITIES,
+    PAIR_RIGS,
+    PairRig,
+    calibration_plan,
+    pair_plan,
+    repeating_plan,
+)
+from model_training.calibration.rigs import RIGS, Rig
 from model_training.calibration.strangers import KINDS
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.files import read_arrays
@@ -54,15 +62,17 @@ def calibrate(
         simulate(plan, work / plan.name, report=report)
         cities.append(Dataset(work / plan.name))
     parts = [_asked(work, encoder, cities, k, anew=anew, report=report) for k in range(CITIES)]
+    pairs = [_asked_pairs(work, encoder, rig, anew=anew, report=report) for rig in PAIR_RIGS]
     street = repeating_plan()
     simulate(street, work / street.name, report=report)
     alike = _asked_repeating(work, encoder, Dataset(work / street.name), anew=anew, report=report)
     measured_on: dict[str, str | float] = {
         "cities": ", ".join(f"seed {city.description.seed}" for city in cities)
-        + f", repeating blocks of seed {street.seed}",
+        + f", repeating blocks of seed {street.seed}"
+        + "".join(f", {rig.name} of seed {pair_plan(rig, k).seed}" for rig in PAIR_RIGS for k in range(PAIR_CITIES)),
         "encoder_sha256": sha256,
     }
-    return fit(pooled([*parts, alike]), measured_on=measured_on), cross_checks(parts, alike)
+    return fit(pooled([*parts, *pairs, alike]), measured_on=measured_on), cross_checks(parts, pooled([*pairs, alike]))
 
 
 def _localizer(
@@ -84,6 +94,30 @@ def _sparse(work: Path, encoder: Path, dataset: Dataset, report: Report) -> Loca
 def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew: bool, report: Report) -> Asked:
     """One city: its queries of its map, the next city's, sparse ones of both, its own without a third of the streets; walls and rooms."""
     return _kept(work, encoder, cities[index], lambda: _ask(work, encoder, cities, index, report), anew=anew)
+
+
+def _asked_pairs(work: Path, encoder: Path, rig: PairRig, *, anew: bool, report: Report) -> Asked:
+    """A stereo rig: its cities' queries of their own maps and of each other's; walls and rooms."""
+    cities = []
+    for index in range(PAIR_CITIES):
+        plan = pair_plan(rig, index)
+        simulate(plan, work / plan.name, report=report)
+        cities.append(Dataset(work / plan.name))
+
+    def ask() -> list[Asked]:
+        found = []
+        of_rig = Rig(rig.name, 1.0, 1.0, stereo=False)
+        for index, own in enumerate(cities):
+            other = cities[(index + 1) % PAIR_CITIES]
+            here = _localizer(work, encoder, own, own.name, report)
+            found += in_the_map(here, own, report, rig=of_rig)
+            found += of_another_city(_localizer(work, encoder, other, other.name, report), own, report, rig=of_rig)
+        walls_by = Rig(rig.name, 1.0, 1.0, stereo=True)
+        return found + walls_and_rooms(
+            here, cities[-1].description.sensors.cameras[0].pinhole(), PAIR_RIGS.index(rig), report, rig=walls_by
+        )
+
+    return _kept(work, encoder, cities[0], ask, anew=anew)
 
 
 def _asked_repeating(work: Path, encoder: Path, street: Dataset, *, anew: bool, report: Report) -> Asked:

@@ -1,7 +1,7 @@
 """Cameras of other shapes than the simulated one, cut out of its pictures: confidence must hold for what robots carry.
 
 A rig that sees less of the view grid shows less evidence at the same place. A calibration that has only met one shape takes every
-other one for a stranger: pictures of KITTI's shape measure 0.4 of the grid, those of the simulated camera 0.8.
+other one for a stranger. Stereo rigs of other shapes are simulated as they are (``plans.PAIR_RIGS``).
 """
 
 from dataclasses import dataclass, replace
@@ -49,8 +49,8 @@ class Rig:
         return replace(query, rgb=rgb, depth_m=depth_m, camera=cut, baseline_m=baseline_m)
 
 
-#: KITTI's cameras see 81 x 29 degrees; those of small RGB-D cameras 69 x 42. Of the simulated 90 x 74 degrees (640 x 480 pixels).
-RIGS = (Rig("wide", 1.0, 0.41, stereo=True), Rig("narrow", 0.69, 0.51, stereo=False))
+#: Small RGB-D cameras see 69 x 42 of the simulated 90 x 74 degrees (640 x 480 pixels).
+RIGS = (Rig("narrow", 0.69, 0.51, stereo=False),)
 
 
 def _window(pixels: int, share: float) -> tuple[int, int]:

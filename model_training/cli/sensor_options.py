@@ -2,18 +2,28 @@
 
 from pydantic import BaseModel, ValidationError
 
-from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters, RgbParameters
+from model_training.simulation.sensor_parameters import (
+    DepthParameters,
+    LidarParameters,
+    RgbParameters,
+    StereoParameters,
+    SurveyParameters,
+)
 from service.errors import DatasetError
 
 _MODELS: dict[str, type[BaseModel]] = {
     "lidar": LidarParameters,
     "rgb": RgbParameters,
     "depth": DepthParameters,
+    "stereo": StereoParameters,
+    "survey": SurveyParameters,
 }
 
 
-def sensor_parameters(settings: list[str]) -> tuple[LidarParameters, RgbParameters, DepthParameters]:
-    """What the settings say of the LiDAR, the RGB camera and the depth camera.
+def sensor_parameters(
+    settings: list[str],
+) -> tuple[LidarParameters, RgbParameters, DepthParameters, StereoParameters, SurveyParameters]:
+    """What the settings say of the LiDAR, the RGB camera, the depth camera, the stereo rig and the survey's drive.
 
     Args:
         settings: texts such as ``lidar.channels=64``.
@@ -40,6 +50,8 @@ def sensor_parameters(settings: list[str]) -> tuple[LidarParameters, RgbParamete
             LidarParameters.model_validate(given["lidar"]),
             RgbParameters.model_validate(given["rgb"]),
             DepthParameters.model_validate(given["depth"]),
+            StereoParameters.model_validate(given["stereo"]),
+            SurveyParameters.model_validate(given["survey"]),
         )
     except ValidationError as error:
         first = error.errors(include_url=False)[0]

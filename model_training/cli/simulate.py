@@ -8,8 +8,9 @@ from rich.console import Console
 
 from model_training.cli.progress import bars
 from model_training.cli.sensor_options import sensor_parameters
+from model_training.simulation.lidar import LIDARS
 from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
-from model_training.simulation.sensor_parameters import DepthParameters, RgbParameters
+from model_training.simulation.sensor_parameters import DepthParameters, RgbParameters, StereoParameters
 from model_training.simulation.simulate import simulate
 from service.errors import DatasetError
 
@@ -20,6 +21,9 @@ Examples:
   streetfix simulate --city paper --table1 --drives 5 --depth precise --depth stereo --out data/paper
 
   streetfix simulate --seed 9001 --queries 334 --out data/unseen1
+
+\b
+  streetfix simulate --lidar hdl_64 --camera 1242x376 --hfov 81.4 --depth sgbm --set stereo.focal_baseline_px_m=384 --out data/pairs
 
 \b
   streetfix simulate --lidar os1_128 --rgb small --set lidar.channels=64 --set rgb.noise=2 --set depth.noise_px=0.3 --out data/others
@@ -39,7 +43,7 @@ def command(
         str | None, typer.Option(help="extent of a random city, metres, 30 to 10000 each [default: 300x400]")
     ] = None,
     streets: Annotated[str, typer.Option(help="drive only these streets, e.g. 1,5,between")] = "",
-    lidar: Annotated[str, typer.Option(help="paper_32, vlp_16, hdl_64 or os1_128")] = "paper_32",
+    lidar: Annotated[str, typer.Option(help=", ".join(LIDARS))] = "paper_32",
     spacing: Annotated[float, typer.Option(help="metres between scans", min=0.02)] = 1.0,
     queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none", min=0)] = 200,
     drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light", min=1)] = 1,
@@ -53,7 +57,11 @@ def command(
         ),
     ] = 0,
     depth: Annotated[
-        list[str] | None, typer.Option(help="ideal, precise or stereo; repeat for several [default: precise]")
+        list[str] | None,
+        typer.Option(
+            help="ideal, precise or stereo: errors drawn by a model; sgbm, sgbm3way or bm: a stereo pair is rendered and matched; "
+            "repeat for several of one sort [default: precise]"
+        ),
     ] = None,
     rgb: Annotated[str, typer.Option(help="automatic, small or fixed")] = "automatic",
     sun_elevation: Annotated[
@@ -81,6 +89,10 @@ def command(
     ] = 15.0,
     turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees", min=-180, max=180)] = 0.0,
     pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees", min=-45, max=45)] = 0.0,
+    followed: Annotated[
+        float | None,
+        typer.Option(help="share of pictures with a vehicle driving ahead (not --blocked)", min=0, max=1),
+    ] = None,
     blocked: Annotated[
         float, typer.Option(help="share of the columns that a lorry right ahead hides", min=0, max=0.9)
     ] = 0.0,
@@ -90,7 +102,7 @@ def command(
         typer.Option(
             "--set",
             metavar="SENSOR.NUMBER=VALUE",
-            help="a number of lidar, rgb or depth in place of its preset's; repeat",
+            help="a number of lidar, rgb, depth, stereo or survey in place of its preset's; repeat",
         ),
     ] = None,
     camera: Annotated[str, typer.Option(help="picture size in pixels, up to 4096x4096")] = "640x480",
@@ -98,10 +110,13 @@ def command(
     workers: Annotated[int | None, typer.Option(help="processes [default: one a core]", min=1)] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
-    lidar_parameters, rgb_parameters, depth_parameters = sensor_parameters(settings or [])
+    lidar_parameters, rgb_parameters, depth_parameters, stereo_parameters, survey_parameters = sensor_parameters(
+        settings or []
+    )
     of_all: dict[str, object] = {
         "depths": tuple(depth or ["precise"]), "condition": condition, "turn_deg": turn, "pitch_deg": pitch,
-        "blocked": blocked, "max_depth_m": max_depth, "depth_parameters": depth_parameters,
+        "blocked": blocked, "followed": followed, "max_depth_m": max_depth, "depth_parameters": depth_parameters,
+        "stereo_parameters": stereo_parameters,
         "rgb": None if rgb == "automatic" else rgb, "rgb_parameters": rgb_parameters,
         "sun_elevation_deg": sun_elevation, "sun_azimuth_deg": sun_azimuth,
     }  # fmt: skip
@@ -120,7 +135,8 @@ def command(
             raise DatasetError(
                 f"{option}: without queries nothing takes pictures; ask for some, or leave it out", field=option
             )
-    if not plans and (depth_parameters, rgb_parameters) != (DepthParameters(), RgbParameters()):
+    untaken = (depth_parameters, rgb_parameters, stereo_parameters)
+    if not plans and untaken != (DepthParameters(), RgbParameters(), StereoParameters()):
         raise DatasetError(
             "set: without queries nothing takes pictures or measures depth; ask for some, or set numbers of lidar only",
             field="set",
@@ -135,7 +151,7 @@ def command(
         size_m=_pair(size or "300x400", "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
         survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),
-        queries=tuple(plans), lidar_parameters=lidar_parameters,
+        queries=tuple(plans), lidar_parameters=lidar_parameters, survey_parameters=survey_parameters,
     )  # fmt: skip
     with bars() as report:
         simulate(plan, out, workers=workers, report=report)

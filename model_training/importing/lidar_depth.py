@@ -37,7 +37,7 @@ def depth_from_scan(
         z in metres; 0 outside the scan, in its gaps and across edges of depth.
     """
     depth_m = np.zeros((camera.height, camera.width), np.float32)
-    uv, z_m = _visible(points, T_camera_lidar, camera)
+    uv, z_m = visible_points(points, T_camera_lidar, camera)
     if len(z_m) < 4:
         return depth_m
     try:
@@ -60,7 +60,7 @@ def depth_from_scan(
     return depth_m
 
 
-def _visible(
+def visible_points(
     points: Float64[NDArray[np.float64], "N 3"], T_camera_lidar: Transform, camera: PinholeCamera
 ) -> tuple[Pixels, NDArray[np.float64]]:
     """Pixels (u, v) and z of the points that the camera sees, one a pixel: the nearest."""

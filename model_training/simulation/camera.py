@@ -37,9 +37,9 @@ def unit_rays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.fl
 def take(
     scene: Scene, ground: GroundPicture, camera: PinholeCamera, T_map_camera: NDArray[np.float64], light: Light,
     condition: Condition, model: RgbModel, rng: np.random.Generator, *, rays_camera: NDArray[np.float32], z_of_ray: NDArray[np.float32],
-    blocker: Blocker | None = None,
+    blocker: Blocker | None = None, metering: float | None = None,
 ) -> Picture:  # fmt: skip
-    """Take a picture; ``rays_camera`` and ``z_of_ray`` are those of ``unit_rays``."""
+    """Take a picture; ``rays_camera`` and ``z_of_ray`` are those of ``unit_rays``, ``metering`` is as in ``exposed``."""
     R = T_map_camera[:3, :3].astype(np.float32)
     origin = T_map_camera[:3, 3]
     rays = rays_camera @ R.T
@@ -54,7 +54,7 @@ def take(
         distance = np.where(stopped, near, distance)
         material = np.where(stopped, Material.METAL, material)
         linear = np.where(stopped[:, None], albedo * light.sky, linear)
-    rgb = exposed(linear.reshape(*shape, 3), model, condition, rng)
+    rgb = exposed(linear.reshape(*shape, 3), model, condition, rng, metering=metering)
     depth = (distance * z_of_ray).reshape(shape)
     blank = ((material == Material.GLASS) | (material == Material.METAL) | (material == Material.MATTE)).reshape(shape)
     return Picture(rgb, depth, blank & (depth > 0))

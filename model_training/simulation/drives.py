@@ -56,7 +56,13 @@ def survey_of(city: City, plan: SimulationPlan) -> Survey:
     true = np.array([lidar_pose(city, station, rng, height_m=plan.lidar_height_m) for station in track])
     written = true.copy()
     if plan.survey_error:
-        errors = survey_error(np.array([station.travelled for station in track]), rng)
+        model = plan.survey_parameters.model()
+        errors = survey_error(
+            np.array([station.travelled for station in track]),
+            rng,
+            position_m=model.position_m,
+            angle_deg=model.angle_deg,
+        )
         written = np.array([T @ error for T, error in zip(true, errors, strict=True)])
     return Survey(track, true, written)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from model_training.simulation.conditions import Condition
 from model_training.simulation.shading import to_srgb
 
+METERING = (0.8, 1.25)  # factors by which metering errs
 _MEAN_LIGHT = 0.26  # what metering brings the darkest channel's mean to (linear)
 
 
@@ -39,11 +40,12 @@ RGBS = {
 
 
 def exposed(
-    linear: NDArray[np.float32], model: RgbModel, condition: Condition, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """The picture (H, W, 3) of linear light (H, W, 3)."""
+    linear: NDArray[np.float32], model: RgbModel, condition: Condition, rng: np.random.Generator, *, metering: float | None = None
+) -> NDArray[np.uint8]:  # fmt: skip
+    """The picture (H, W, 3) of linear light (H, W, 3); ``metering`` is the factor by which metering errs, by chance if not given."""
     mean = float(np.mean(linear[::4, ::4].min(axis=2))) + 1e-4
-    metered = min(_MEAN_LIGHT * 2.0**model.exposure_ev / mean, model.most_gain) * rng.uniform(0.8, 1.25)
+    metering = rng.uniform(*METERING) if metering is None else metering
+    metered = min(_MEAN_LIGHT * 2.0**model.exposure_ev / mean, model.most_gain) * metering
     gain = model.fixed_gain * 2.0**model.exposure_ev or metered
     picture = to_srgb(linear, gain)
     sigma = model.noise + model.noise_per_gain * min(gain, 40.0)

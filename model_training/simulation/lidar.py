@@ -5,16 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from model_training.simulation.blocker import Blocker
 from model_training.simulation.conditions import Condition
 from model_training.simulation.meshes import Material
 from model_training.simulation.reflectance import reflectance_of
 from model_training.simulation.scene import Scene
+from model_training.simulation.survey_drive import SurveyModel, moved_m
 from model_training.simulation.terrain import GroundPicture
 
 
 @dataclass(frozen=True, slots=True)
 class LidarModel:
-    """Geometry and errors of a LiDAR; metres, degrees, shares."""
+    """Geometry and errors of a LiDAR; metres, degrees, shares. ``beams_deg`` is empty where the beams are evenly spaced."""
 
     name: str
     channels: int
@@ -24,10 +26,12 @@ class LidarModel:
     range_noise_m: float = 0.02
     dropout: float = 0.03
     max_range_m: float = 100.0
+    beams_deg: tuple[float, ...] = ()
 
     def rays(self) -> NDArray[np.float32]:
         """Unit rays (channels * columns, 3) in the LiDAR frame, row by row from the top, azimuth from -pi upwards."""
-        elevation = np.deg2rad(np.linspace(self.top_deg, self.bottom_deg, self.channels))[:, None]
+        beams_deg = self.beams_deg or np.linspace(self.top_deg, self.bottom_deg, self.channels)
+        elevation = np.deg2rad(np.asarray(beams_deg))[:, None]
         azimuth = (np.arange(self.columns) / self.columns * 2 * np.pi - np.pi)[None, :]
         flat = np.cos(elevation) * np.ones_like(azimuth)
         rays = np.stack(
@@ -36,16 +40,33 @@ class LidarModel:
         return rays.reshape(-1, 3).astype(np.float32)
 
 
+#: Beams of the HDL-64E: two blocks of 32, a third of a degree and half a degree apart (Velodyne, HDL-64E S2 manual).
+_HDL_64 = tuple(2.0 - k / 3 for k in range(32)) + tuple(-8.83 - k / 2 for k in range(32))
+#: Beams of the Pandar64: dense about the horizon, sparse above and below it (Hesai, Pandar64 manual; rounded to 0.01 degrees).
+_PANDAR_64 = (
+    (14.88, 11.03, 8.06, 5.06, 3.04) + tuple(2.03 - k * 8.09 / 48 for k in range(49))
+    + (-7.06, -8.06, -9.06, -9.89, -11.03, -12.01, -12.97, -13.93, -18.89, -24.9)
+)  # fmt: skip
+
+
+def _with_beams(name: str, beams_deg: tuple[float, ...]) -> LidarModel:
+    return LidarModel(name, len(beams_deg), 1024, beams_deg[0], beams_deg[-1], beams_deg=beams_deg)
+
+
 LIDARS = {
     m.name: m
     for m in (
         LidarModel("paper_32", 32, 1024, 15.0, -15.0),
         LidarModel("vlp_16", 16, 1024, 15.0, -15.0, 0.03),
-        LidarModel("hdl_64", 64, 1024, 2.0, -24.8),
-        LidarModel("os1_128", 128, 1024, 22.5, -22.5, 0.02),
+        LidarModel("hdl_32", 32, 1024, 10.67, -30.67),
+        _with_beams("hdl_64", _HDL_64),
+        LidarModel("os1_64", 64, 1024, 16.6, -16.6),
+        LidarModel("os1_128", 128, 1024, 22.5, -22.5),
+        _with_beams("pandar_64", _PANDAR_64),
     )
 }
 
+STANDING = SurveyModel()
 INTENSITY_NOISE = np.float32(0.08)  # of the logarithm: speckle and the pulse's own scatter
 #: Glass mostly lets the beam through or mirrors it away.
 _RETURNS = np.ones(len(Material), np.float32)
@@ -54,9 +75,20 @@ _RETURNS[Material.GLASS] = 0.75
 
 def scan(
     scene: Scene, ground: GroundPicture, model: LidarModel, rays: NDArray[np.float32], T_map_lidar: NDArray[np.float64],
-    condition: Condition, rng: np.random.Generator,
+    condition: Condition, rng: np.random.Generator, *, survey: SurveyModel = STANDING, ahead: Blocker | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """One revolution from a standing sensor.
+    """One revolution.
+
+    Args:
+        scene: what stands there.
+        ground: cover of the ground.
+        model: of the LiDAR.
+        rays: its rays, as ``LidarModel.rays`` has them.
+        T_map_lidar: its pose; of a moving one, in the middle of the turn.
+        condition: the weather.
+        rng: of this scan.
+        survey: how the vehicle moves.
+        ahead: a vehicle that drives ahead.
 
     Returns:
         Points (n, 4): x, y, z in the LiDAR frame (m) and intensity (0..1), as KITTI lays them out. The intensity is made up
@@ -64,15 +96,26 @@ def scan(
     """
     R = T_map_lidar[:3, :3].astype(np.float32)
     rays_map = rays @ R.T
-    hits = scene.hits(T_map_lidar[:3, 3], rays_map)
+    origin, offsets = T_map_lidar[:3, 3], None
+    if survey.speed_m_s > 0:
+        offsets = moved_m(rays, survey.speed_m_s)
+        origin = origin + (offsets @ R.T).astype(np.float64)
+    hits = scene.hits(origin, rays_map)
     met = hits.primitive >= 0
     primitive = np.maximum(hits.primitive, 0)
     reflectance = np.zeros(len(rays), np.float32)
-    reflectance[met] = reflectance_of(scene, ground, T_map_lidar[:3, 3], rays_map[met], hits.of(met), condition)
+    reflectance[met] = reflectance_of(
+        scene, ground, origin if offsets is None else origin[met], rays_map[met], hits.of(met), condition
+    )
     distance = hits.distance.copy()
     count = len(distance)
     chance = rng.random(count, dtype=np.float32)
     keep_share = (1.0 - model.dropout) * _RETURNS[scene.mesh.material[primitive]]
+    if ahead is not None:
+        stopped, near, albedo = ahead.over(origin, rays_map, hits)
+        distance, met = np.where(stopped, near, distance), met | stopped
+        reflectance = np.where(stopped, albedo.mean(axis=1), reflectance).astype(np.float32)
+        keep_share = np.where(stopped, 1.0 - model.dropout, keep_share)
     if condition.extinction_per_m > 0:
         # A return is heard while reflectance / r^2 * exp(-2 a r) stays over that of a 10 % target at the nominal range.
         heard = reflectance / np.maximum(distance, 0.5) ** 2 * np.exp(-2 * condition.extinction_per_m * distance)
@@ -87,6 +130,9 @@ def scan(
         met |= false
     reflectance *= np.exp(INTENSITY_NOISE * rng.standard_normal(count, dtype=np.float32))
     np.minimum(reflectance, np.float32(1), out=reflectance)
-    points = np.concatenate([rays * distance[:, None], reflectance[:, None]], axis=1, dtype=np.float32)
+    xyz = rays * distance[:, None]
+    if offsets is not None and survey.deskewed:
+        xyz = xyz + offsets
+    points = np.concatenate([xyz, reflectance[:, None]], axis=1, dtype=np.float32)
     result: NDArray[np.float32] = points[met]
     return result

@@ -10,7 +10,14 @@ from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import DEPTHS
 from model_training.simulation.exposure import RGBS, RgbModel
 from model_training.simulation.lidar import LIDARS
-from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters, RgbParameters
+from model_training.simulation.sensor_parameters import (
+    DepthParameters,
+    LidarParameters,
+    RgbParameters,
+    StereoParameters,
+    SurveyParameters,
+)
+from model_training.simulation.stereo_pair import STEREOS
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
@@ -60,8 +67,10 @@ class QueryPlan(_Model):
     turn_deg: float = Field(0.0, ge=-180, le=180)
     pitch_deg: float = Field(0.0, ge=-45, le=45)
     blocked: float = Field(0.0, ge=0, le=0.9)
+    followed: float | None = Field(None, ge=0, le=1, description="share of pictures with a vehicle driving ahead")
     max_depth_m: float | None = Field(None, ge=1)
-    depth_parameters: DepthParameters = DepthParameters()  # in place of those of each of ``depths``
+    depth_parameters: DepthParameters = DepthParameters()  # in place of those of each of ``depths`` that a model draws
+    stereo_parameters: StereoParameters = StereoParameters()  # in place of those of each of ``depths`` that is matched
     rgb: str | None = None  # None: the preset ``automatic``
     rgb_parameters: RgbParameters = RgbParameters()  # in place of those of ``rgb``
     sun_elevation_deg: float | None = Field(None, ge=1, le=90)  # None: by the condition, differing from drive to drive
@@ -74,6 +83,10 @@ class QueryPlan(_Model):
         """The RGB camera of this drive."""
         return self.rgb_parameters.on(self.rgb or "automatic")
 
+    def matched(self) -> bool:
+        """Whether depth comes from pairs that are rendered and matched."""
+        return any(depth in STEREOS for depth in self.depths)
+
     def refuse_what_does_nothing(self) -> None:
         """Refuse a field that was changed and that this traversal would pass over in silence.
 
@@ -84,6 +97,21 @@ class QueryPlan(_Model):
         refused = [("aside_m", poses), ("heading_deg", poses)] if self.on_track else []
         refused += [("parked_changed", vehicles)] if self.traversal == 0 else []
         refused += [("step_m", "has no sequence")] if self.sequence is None else []
+        if self.depth_parameters != DepthParameters() and self.matched():
+            raise DatasetError(
+                f"depth_parameters: they would do nothing, since {self.name!r} has depth of matched pairs; set numbers of stereo",
+                field="depth_parameters",
+            )
+        if self.stereo_parameters != StereoParameters() and not self.matched():
+            raise DatasetError(
+                f"stereo_parameters: they would do nothing, since {self.name!r} matches no pairs; "
+                f"take a depth of {', '.join(STEREOS)}", field="stereo_parameters",
+            )  # fmt: skip
+        if self.followed is not None and self.blocked > 0:
+            raise DatasetError(
+                f"followed: {self.name!r} has pictures that are blocked by a vehicle already; leave out one of blocked and followed",
+                field="followed",
+            )
         sunless = f"has no sun, being of the condition {self.condition!r}"
         if CONDITIONS[self.condition].sun_strength == 0:
             refused += [("sun_elevation_deg", sunless), ("sun_azimuth_deg", sunless)]
@@ -112,6 +140,7 @@ class SimulationPlan(_Model):
     camera_height_m: float = Field(1.5, gt=0, le=20)
     queries: tuple[QueryPlan, ...] = ()
     lidar_parameters: LidarParameters = LidarParameters()  # in place of those of ``lidar``
+    survey_parameters: SurveyParameters = SurveyParameters()
 
     def checked(self) -> "SimulationPlan":
         """Itself, if every preset it names exists and every field does something.
@@ -126,16 +155,24 @@ class SimulationPlan(_Model):
         for query in self.queries:
             named.append(("condition", query.condition, CONDITIONS))
             named.append(("rgb", query.rgb or "automatic", RGBS))
-            named += [("depth", depth, DEPTHS) for depth in query.depths]
+            named += [("depth", depth, (*DEPTHS, *STEREOS)) for depth in query.depths]
         for field, value, known in named:
             if value not in set(known):
                 raise DatasetError(f"{field}: {value!r} is no preset; there are: {', '.join(known)}", field=field)
         self.lidar_parameters.on(self.lidar)
+        survey = self.survey_parameters
+        survey.model()
+        if not self.survey_error and (survey.position_m, survey.angle_deg) != (None, None):
+            raise DatasetError(
+                "survey_error: it is off, so survey.position_m and survey.angle_deg would do nothing; leave them out",
+                field="survey_error",
+            )
         for query in self.queries:
             query.refuse_what_does_nothing()
             for depth in query.depths:
-                query.depth_parameters.on(depth)
+                query.stereo_parameters.on(depth) if depth in STEREOS else query.depth_parameters.on(depth)
             query.rgb_model()
+        self._refuse_two_rigs()
         names = [query.name for query in self.queries]
         if len(set(names)) != len(names):
             raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")
@@ -144,3 +181,20 @@ class SimulationPlan(_Model):
                 "table1: only the paper's city has the classes of Table I; add --city paper", field="per_class"
             )
         return self
+
+    def focal_baseline_px_m(self) -> float | None:
+        """Of the stereo rig whose pairs are matched; None where depth is drawn by a model."""
+        for query in self.queries:
+            if query.matched():
+                return query.stereo_parameters.on(query.depths[0]).focal_baseline_px_m
+        return None
+
+    def _refuse_two_rigs(self) -> None:
+        """A dataset describes one camera, with one baseline."""
+        if len({depth in STEREOS for query in self.queries for depth in query.depths}) > 1:
+            raise DatasetError(
+                f"depth: matched pairs ({', '.join(STEREOS)}) and depth drawn by a model ({', '.join(DEPTHS)}) do not go into one "
+                "dataset, whose camera has one baseline or none; simulate two", field="depth",
+            )  # fmt: skip
+        if len({query.stereo_parameters for query in self.queries}) > 1:
+            raise DatasetError("stereo_parameters: the drives differ; a dataset has one rig", field="stereo_parameters")

@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler
 from model_training.simulation.depth_noise import DEPTHS, DepthModel
 from model_training.simulation.exposure import RGBS, RgbModel
 from model_training.simulation.lidar import LIDARS, LidarModel
+from model_training.simulation.stereo_pair import STEREOS, StereoModel
+from model_training.simulation.survey_drive import SurveyModel
 from service.errors import DatasetError
 
 
@@ -37,7 +39,12 @@ class LidarParameters(_Parameters):
         Raises:
             DatasetError: the vertical field is empty.
         """
-        model = replace(LIDARS[preset], **self.model_dump())
+        own = LIDARS[preset]
+        model = replace(own, **self.model_dump())
+        if (model.channels, model.top_deg, model.bottom_deg) != (own.channels, own.top_deg, own.bottom_deg):
+            model = replace(
+                model, beams_deg=()
+            )  # of another vertical field the preset's table says nothing: evenly spaced
         if model.top_deg <= model.bottom_deg:
             raise DatasetError(
                 f"lidar.top_deg: {model.top_deg:g} is not above lidar.bottom_deg, {model.bottom_deg:g}; change one of them",
@@ -92,9 +99,58 @@ class DepthParameters(_Parameters):
             DatasetError: no range is left.
         """
         model = replace(DEPTHS[preset], **self.model_dump())
-        if model.max_range_m <= model.min_range_m:
-            raise DatasetError(
-                f"depth.max_range_m: {model.max_range_m:g} is not beyond depth.min_range_m, {model.min_range_m:g}; "
-                "change one of them", field="depth.max_range_m",
-            )  # fmt: skip
+        _refuse_no_range("depth", model.min_range_m, model.max_range_m)
         return model
+
+
+class SurveyParameters(_Parameters):
+    """Of the survey's drive; metres, degrees, metres a second, shares, as in ``SurveyModel``."""
+
+    position_m: float | None = Field(None, ge=0, le=5)
+    angle_deg: float | None = Field(None, ge=0, le=5)
+    speed_m_s: float | None = Field(None, ge=0, le=40)
+    deskewed: bool | None = None
+    followed: float | None = Field(None, ge=0, le=1)
+
+    def model(self) -> SurveyModel:
+        """The survey with these numbers.
+
+        Raises:
+            DatasetError: nothing moves that could be taken out.
+        """
+        model = SurveyModel(**self.model_dump())
+        if self.deskewed is not None and model.speed_m_s == 0:
+            raise DatasetError(
+                "survey.deskewed: it would do nothing, since survey.speed_m_s is 0; set a speed, or leave it out",
+                field="survey.deskewed",
+            )
+        return model
+
+
+class StereoParameters(_Parameters):
+    """Of a stereo rig whose pairs are matched; metres and pixels, as in ``StereoModel``."""
+
+    focal_baseline_px_m: float | None = Field(None, ge=1, le=10_000)
+    offset_px: float | None = Field(None, ge=0, le=10)
+    vertical_px: float | None = Field(None, ge=0, le=10)
+    roll_px: float | None = Field(None, ge=0, le=10)
+    min_range_m: float | None = Field(None, ge=0.05, le=10)
+    max_range_m: float | None = Field(None, ge=1, le=65)  # 16 bits of millimetres end at 65.535 m
+
+    def on(self, preset: str) -> StereoModel:
+        """The preset with these numbers.
+
+        Raises:
+            DatasetError: no range is left.
+        """
+        model = replace(STEREOS[preset], **self.model_dump())
+        _refuse_no_range("stereo", model.min_range_m, model.max_range_m)
+        return model
+
+
+def _refuse_no_range(sensor: str, min_range_m: float, max_range_m: float) -> None:
+    if max_range_m <= min_range_m:
+        raise DatasetError(
+            f"{sensor}.max_range_m: {max_range_m:g} is not beyond {sensor}.min_range_m, {min_range_m:g}; change one of them",
+            field=f"{sensor}.max_range_m",
+        )

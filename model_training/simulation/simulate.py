@@ -30,17 +30,19 @@ from model_training.datasets.dataset import (
     write_tum,
 )
 from model_training.simulation.blocker import Blocker
-from model_training.simulation.camera import take, unit_rays
+from model_training.simulation.camera import Picture, take, unit_rays
 from model_training.simulation.city import City
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import measured_depth
 from model_training.simulation.drives import Quota, Survey, followed, query_candidates, quota_of, survey_of
+from model_training.simulation.exposure import METERING
 from model_training.simulation.lidar import scan
 from model_training.simulation.meshes import joined
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.repeating import RepeatingCity
 from model_training.simulation.scene import Scene
 from model_training.simulation.shading import Light
+from model_training.simulation.stereo_pair import STEREOS, StereoRig
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
@@ -151,18 +153,25 @@ def _one_scan(number: int) -> int:
     job = _job
     if job is None or job.survey is None or job.rays is None:
         raise RuntimeError("a worker was started without its job")
-    rng = np.random.default_rng([job.plan.seed, 31, number])
+    plan, survey, T = job.plan, job.plan.survey_parameters.model(), job.survey.T_map_lidar[number]
+    ahead = None
+    if survey.followed > 0:
+        station = job.survey.stations[number]
+        ahead = _vehicle_ahead(job, T[:2, 3], station.heading, station.travelled, 0, survey.followed)
     points = scan(
-        job.scene,
-        job.city.ground,
-        job.plan.lidar_parameters.on(job.plan.lidar),
-        job.rays,
-        job.survey.T_map_lidar[number],
-        CONDITIONS[job.plan.survey_condition],
-        rng,
-    )
+        job.scene, job.city.ground, plan.lidar_parameters.on(plan.lidar), job.rays, T, CONDITIONS[plan.survey_condition],
+        np.random.default_rng([plan.seed, 31, number]), survey=survey, ahead=ahead,
+    )  # fmt: skip
     _write(scan_path(job.out, number), points.tobytes())
     return number
+
+
+def _vehicle_ahead(
+    job: _Job, xy: NDArray[np.float64], heading: float, along_m: float, traversal: int, share: float
+) -> Blocker | None:
+    place = np.array([*xy, job.city.height(*xy)])
+    drive = np.random.default_rng([job.plan.seed, 14, traversal])
+    return Blocker.driving_ahead(place, heading, along_m, share, drive)
 
 
 def _queries(
@@ -271,14 +280,35 @@ def _one_pair(number: int) -> int:
     blocker = None
     if query.blocked > 0:
         blocker = Blocker.before(T, job.city.height(T[0, 3], T[1, 3]), query.blocked, rng)
-    picture = take(job.scene, job.city.ground, job.camera, T, job.light, condition, query.rgb_model(), rng,
-                   rays_camera=job.rays, z_of_ray=job.z_of_ray, blocker=blocker)  # fmt: skip
+    elif query.followed is not None:
+        # Queries stand anywhere along the way, in no order: how far along is drawn.
+        heading = float(np.arctan2(T[1, 2], T[0, 2])) - float(np.deg2rad(query.turn_deg))
+        along_m = float(rng.uniform(0, 10_000))
+        blocker = _vehicle_ahead(job, T[:2, 3], heading, along_m, query.traversal, query.followed)
+    metering = float(rng.uniform(*METERING)) if query.matched() else None  # both cameras of a rig are exposed alike
+
+    camera, light, rays, z_of_ray = job.camera, job.light, job.rays, job.z_of_ray
+
+    def taken(T_map_eye: NDArray[np.float64], rng: np.random.Generator) -> Picture:
+        return take(job.scene, job.city.ground, camera, T_map_eye, light, condition, query.rgb_model(), rng,
+                    rays_camera=rays, z_of_ray=z_of_ray, blocker=blocker, metering=metering)  # fmt: skip
+
+    picture = taken(T, rng)
     encoded = cv2.imencode(".jpg", picture.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+    right: Picture | None = None
     for index, name in enumerate(query.depths):
         folder = query_folder(job.out, f"{query.name}_{name}")
         rgb_path, depth_path = _pair(folder, number)
-        model = query.depth_parameters.on(name)
-        depth = measured_depth(picture.depth_m, picture.blank, model, condition, np.random.default_rng([*key, index]))
+        if name in STEREOS:
+            drive = np.random.default_rng([plan.seed, 34, query.traversal])
+            rig = StereoRig.drawn(query.stereo_parameters.on(name), camera, drive)
+            right = right or taken(T @ rig.T_left_right, np.random.default_rng([*key, 35]))
+            depth = rig.depth(picture.rgb, right.rgb)
+        else:
+            model = query.depth_parameters.on(name)
+            depth = measured_depth(
+                picture.depth_m, picture.blank, model, condition, np.random.default_rng([*key, index])
+            )
         if query.max_depth_m is not None:
             depth[depth > query.max_depth_m] = 0
         steps = np.rint(depth / DEPTH_SCALE_M).clip(0, 65535).astype(np.uint16)
@@ -300,6 +330,8 @@ def _streets(city: City, out: Path) -> None:
 
 def _description(plan: SimulationPlan) -> DatasetDescription:
     lidar, camera = plan.lidar_parameters.on(plan.lidar), plan.camera.pinhole()
+    focal_baseline = plan.focal_baseline_px_m()
+    baseline_m = None if focal_baseline is None else focal_baseline / camera.fx
     return DatasetDescription(
         name=plan.name,
         source={"kind": "simulation", "plan": plan.model_dump(mode="json")},
@@ -313,7 +345,7 @@ def _description(plan: SimulationPlan) -> DatasetDescription:
             cameras=[
                 CameraSensor(
                     name="front", width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
-                    depth=DepthSpec(scale_m=DEPTH_SCALE_M, kind="z", max_range_m=None),
+                    depth=DepthSpec(scale_m=DEPTH_SCALE_M, kind="z", max_range_m=None, baseline_m=baseline_m),
                 )
             ],
         ),

@@ -99,8 +99,8 @@ def test_kinds_of_another_rig_are_told_by_its_name(predicted):
     names = ("clear_precise", "clear_stereo")
     own = in_the_map("localizer", City(), print, names, rig=RIGS[0])
     other = of_another_city("localizer", City(), print, names, rig=RIGS[0])
-    assert [set(each.kind.tolist()) for each in own] == [{"wide_clear_precise"}, {"wide_clear_stereo"}]
-    assert [set(each.kind.tolist()) for each in other] == [{"wide_other_city.precise"}, {"wide_other_city.stereo"}]
+    assert [set(each.kind.tolist()) for each in own] == [{"narrow_clear_precise"}, {"narrow_clear_stereo"}]
+    assert [set(each.kind.tolist()) for each in other] == [{"narrow_other_city.precise"}, {"narrow_other_city.stereo"}]
 
 
 class Wherever:
@@ -138,7 +138,7 @@ def test_another_rig_sees_the_same_walls_and_rooms():
     walls_and_rooms(whole, camera, 3, lambda *_: None, count=2)
     found = walls_and_rooms(cut, camera, 3, lambda *_: None, count=2, rig=RIGS[0])
     assert [set(each.kind.tolist()) for each in found] == [
-        {"wide_wall.precise"}, {"wide_wall.stereo"}, {"wide_room.precise"}, {"wide_room.stereo"},
+        {"narrow_wall.precise"}, {"narrow_wall.stereo"}, {"narrow_room.precise"}, {"narrow_room.stereo"},
     ]  # fmt: skip
     for query, seen in zip(whole.asked, cut.asked, strict=True):
         np.testing.assert_array_equal(seen.depth_m, RIGS[0].seen(query).depth_m)

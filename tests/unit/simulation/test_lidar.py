@@ -5,6 +5,7 @@ import pytest
 
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.lidar import LIDARS, scan
+from model_training.simulation.sensor_parameters import LidarParameters
 
 CLEAR = CONDITIONS["clear"]
 MODEL = LIDARS["paper_32"]
@@ -58,11 +59,39 @@ def test_a_wall_beyond_the_limit_is_not_seen(wall):
     assert len(scan_of(wall, replace(MODEL, max_range_m=15.0))) == 0
 
 
-@pytest.mark.parametrize(("name", "channels"), [("vlp_16", 16), ("paper_32", 32), ("hdl_64", 64), ("os1_128", 128)])
+@pytest.mark.parametrize(
+    ("name", "channels"),
+    [
+        ("vlp_16", 16),
+        ("paper_32", 32),
+        ("hdl_32", 32),
+        ("hdl_64", 64),
+        ("os1_64", 64),
+        ("os1_128", 128),
+        ("pandar_64", 64),
+    ],
+)
 def test_presets_have_their_channels(name, channels):
     rays = LIDARS[name].rays()
     assert rays.shape == (channels * 1024, 3)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-6)
+
+
+def elevations_deg(model):
+    return np.rad2deg(np.arcsin(model.rays().reshape(model.channels, model.columns, 3)[:, 0, 2]))
+
+
+def test_beams_of_a_table_are_where_the_manual_has_them():
+    """Two blocks of 32: a third of a degree apart from +2, half a degree apart from -8.83."""
+    beams = elevations_deg(LIDARS["hdl_64"])
+    np.testing.assert_allclose(beams[[0, 1, 31, 32, 33, 63]], [2, 1.6667, -8.3333, -8.83, -9.33, -24.33], atol=1e-3)
+    assert (np.diff(elevations_deg(LIDARS["pandar_64"])) < 0).all()
+
+
+def test_another_vertical_field_has_evenly_spaced_beams():
+    model = LidarParameters(bottom_deg=-29.5).on("hdl_64")
+    np.testing.assert_allclose(np.diff(elevations_deg(model)), -0.5, atol=1e-3)
+    assert LidarParameters(columns=512).on("hdl_64").beams_deg == LIDARS["hdl_64"].beams_deg
 
 
 def test_fog_shortens_the_range(wall):

@@ -1,0 +1,71 @@
+"""Does simulated stereo matching err as real matching does? Both against scans, by the same procedure.
+
+The simulated pairs are of cities that confidence and encoder are watched on, not calibrated, trained or evaluated on; the survey passes
+the same way among the same vehicles, as in a recorded drive.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.real.streets import QUERIES, imported
+from benchmarks.report import Report
+from model_training.calibration.plans import PAIR_RIGS
+from model_training.datasets.dataset import Dataset
+from model_training.evaluation.disparity_errors import DisparityErrors, disparity_errors
+from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.sensor_parameters import StereoParameters
+from model_training.simulation.simulate import simulate
+from model_training.training.recipe import WATCH_SEEDS
+
+DRIVES, FRAMES, FIRST_SEED = 6, 6, 20
+RATIO = (0.8, 1.25)
+RANGES_M = ((5, 10), (10, 20), (20, 40))
+
+
+def simulated_errors(work: Path) -> DisparityErrors:
+    """Pairs of KITTI's rig from several cities, each with its own errors of rectification."""
+    (rig,) = (rig for rig in PAIR_RIGS if rig.name == "car")
+    found = []
+    for k in range(DRIVES):
+        query = QueryPlan(
+            name="own", traversal=0, count=FRAMES, depths=("sgbm",), aside_m=0.3, heading_deg=3.0,
+            stereo_parameters=StereoParameters(focal_baseline_px_m=rig.focal_baseline_px_m),
+        )  # fmt: skip
+        plan = SimulationPlan(
+            name=f"matcher-{k}", seed=WATCH_SEEDS[FIRST_SEED + k], size_m=(120.0, 120.0), lidar=rig.lidar,
+            lidar_height_m=rig.lidar_height_m, spacing_m=rig.spacing_m, survey_error=False, camera=rig.camera,
+            camera_height_m=rig.camera_height_m, queries=(query,),
+        )  # fmt: skip
+        simulate(plan, work / plan.name)
+        found.append(disparity_errors(Dataset(work / plan.name), "own_sgbm"))
+    return DisparityErrors(
+        *(np.concatenate([getattr(each, name) for each in found]) for name in ("error_px", "textured"))
+    )
+
+
+def matcher_rows(report: Report, data: Path, work: Path, recording: str = "kitti_0005") -> None:
+    """Sizes of the errors of a recording and of the simulated pairs, and their ratios."""
+    dataset = imported(data, work, recording)
+    if dataset is None:
+        report.row(
+            "real.matcher.error_ratio.textured.median", None, "ratio", bar=RATIO, why=f"no recordings at {data.name}"
+        )
+        return
+    recorded, simulated = disparity_errors(dataset, QUERIES), simulated_errors(work)
+    for textured, kind in ((True, "textured"), (False, "untextured")):
+        real, ours = recorded.sizes(textured=textured), simulated.sizes(textured=textured)
+        for name, measure in (("median", np.median), ("percentile_90", lambda sizes: np.percentile(sizes, 90))):
+            row = f"real.matcher.{kind}.{name}"
+            report.row(f"{row}_px", float(measure(real)), "px", n=len(real))
+            report.row(f"{row}_px.simulated", float(measure(ours)), "px", n=len(ours))
+            report.row(
+                f"real.matcher.error_ratio.{kind}.{name}", float(measure(ours) / measure(real)), "ratio", bar=RATIO
+            )
+        report.row(f"real.matcher.{kind}.unmatched", recorded.unmatched(textured=textured), "share")
+        report.row(f"real.matcher.{kind}.unmatched.simulated", simulated.unmatched(textured=textured), "share")
+    for name, errors in (("", recorded), (".simulated", simulated)):
+        report.row(f"real.matcher.correlation_length{name}", errors.correlation_length_px(), "px")
+        for nearest_m, farthest_m in RANGES_M:
+            share = errors.outliers(nearest_m=nearest_m, farthest_m=farthest_m)
+            report.row(f"real.matcher.outliers_{nearest_m}_to_{farthest_m}_m{name}", share, "share")
