@@ -34,7 +34,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -119,6 +119,9 @@ evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json
 
 evaluate-real: .venv/.torch ## measure on real recordings and round trips -> reports/real_data.json
 	$(BIN)/python -m benchmarks.real $(ARGS)
+
+bench-kitti: .venv/.torch ## place recognition on KITTI that you own: make bench-kitti ROOT=/data/kitti -> reports/kitti.json
+	$(BIN)/python -m benchmarks.kitti $(if $(ROOT),--root $(ROOT)) $(ARGS)
 
 choices: .venv/.torch ## what each design choice brings, in a watch city -> reports/choices.json; hours
 	$(BIN)/python -m benchmarks.choices $(ARGS)

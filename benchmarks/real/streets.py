@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.real.peers import peer_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import position_errors
@@ -51,6 +52,7 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
         found = predict(street.localizer, street.dataset, QUERIES)
         answer_rows(report, f"real.{street.name}", found)
         _stage_rows(report, street)
+        peer_rows(report, street.name, street.dataset, street.localizer, QUERIES)
         if street.name == "kitti_0013":
             _sequence_rows(report, street)
     accepted = [

@@ -1,0 +1,148 @@
+"""``make bench-kitti ROOT=...`` -> reports/kitti.json: place recognition on KITTI by the published protocol and by an honest one.
+
+Published (R@1 within 10 m): every scan of a sequence is a place, and only the scan of the query's own moment is left out, so that scans a
+metre away stay in. Honest: the same street on another day, and loops that close more than a minute later.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.kitti.protocol import (
+    LOOP_S,
+    OWN_SCAN_S,
+    RIGHT_M,
+    found_within,
+    in_the_frame_of,
+    place_similarities,
+)
+from benchmarks.kitti.sources import LOOPS, OTHER_DAY, Drive, drives_below, missing
+from benchmarks.report import ROOT, Report
+from model_training.datasets.dataset import Dataset
+from model_training.importing.kinds import OpenSettings, open_recording
+from model_training.importing.take import TakeSettings, take
+from model_training.mapping.build import BuildSettings, build_map
+from model_training.stock import ENCODER
+from service.errors import StreetfixError
+from service.maps.reader import MapBundle
+
+QUERIES = "recorded"
+EVERY_SCAN_M = 0.05  # every scan is a place unless the vehicle stands still
+#: RangeBEV's table (arXiv 2502.11742), R@1 within 10 m in percent, trained on KITTI's other sequences: for the report's notes.
+PUBLISHED_R1 = {
+    "(LC)2": (31, 23, 40, 40, 53, 38), "VXP": (24, 18, 33, 30, 44, 24), "I2P-Rec": (45, 28, 48, 44, 63, 46),
+    "ModaLink": (90, 70, 90, 86, 97, 87), "CMVM": (93, 77, 91, 89, 98, 91), "RangeBEV": (99, 95, 99, 97, 100, 98),
+}  # fmt: skip
+
+
+def main() -> None:
+    """Find drives, measure each, write the report."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.kitti", description=__doc__)
+    parser.add_argument(
+        "--root", type=Path, default=ROOT.parent / "shared" / "data", help="folder above KITTI's drives"
+    )
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "kitti", help="where datasets and maps are kept")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="these drives, such as 00 or 2011_09_26_drive_0005")
+    arguments = parser.parse_args()
+    if not arguments.root.is_dir():
+        parser.error(f"--root: there is no folder {arguments.root}; give the one above KITTI's sequences or drives")
+    drives = drives_below(arguments.root)
+    for line in missing(drives):
+        print(f"missing: {line}", flush=True)
+    chosen = [drive for drive in drives if not arguments.only or drive.name in arguments.only]
+    if not chosen:
+        parser.error(
+            f"--root: no drive to measure below {arguments.root}; found: {', '.join(d.name for d in drives) or 'none'}"
+        )
+    only = f" --only {' '.join(arguments.only)}" if arguments.only else ""
+    report = Report("kitti", f"python -m benchmarks.kitti{only}")
+    if arguments.only:
+        report.keep_others()
+    maps = dict[str, tuple[Dataset, MapBundle]]()
+    for number, drive in enumerate(chosen, 1):
+        print(f"--- {drive.name} ({number} of {len(chosen)})", flush=True)
+        maps[drive.name] = _mapped(drive, arguments.root, arguments.work)
+        _same_drive(report, drive.name, *maps[drive.name])
+    for mapped, asked, shared in OTHER_DAY:
+        if mapped in maps and asked in maps:
+            _other_day(report, mapped, asked, shared, maps)
+    report.notes["missing"] = missing(drives)
+    report.notes["published_r1_10m_percent_00_02_05_06_07_08"] = {name: list(row) for name, row in PUBLISHED_R1.items()}
+    print(report.write())
+
+
+def _mapped(drive: Drive, root: Path, work: Path) -> tuple[Dataset, MapBundle]:
+    """Imported with SGBM's depth and mapped with every scan as a place, or what an earlier run kept."""
+    folder, bundle = work / f"{drive.name}_data", work / f"{drive.name}_map"
+    if not (folder / "dataset.json").exists():
+        source = drive.folder
+        if drive.packed:
+            raw = work / f"{drive.name}_raw"
+            shutil.rmtree(raw, ignore_errors=True)
+            subprocess.run([sys.executable, str(root / "unpack.py"), str(drive.folder), str(raw)], check=True)
+            (source,) = raw.glob("*/*_sync")
+        recording = open_recording(drive.kind, source, OpenSettings(depth="sgbm"))
+        trajectory = recording.trajectory()
+        if trajectory is None:
+            raise SystemExit(f"{source} has no poses; put poses/{drive.name}.txt beside the sequences")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        take(recording, trajectory, folder, TakeSettings())
+    dataset = Dataset(folder)
+    if not bundle.exists():
+        build_map(dataset, ENCODER, bundle, BuildSettings(name=drive.name, spacing_m=EVERY_SCAN_M), report=_told)
+    return dataset, MapBundle.open(bundle)
+
+
+def _told(stage: str, done: int, of: int) -> None:
+    if done == of or done % 500 == 0:
+        print(f"{stage}: {done} of {of}", flush=True)
+
+
+def _when_and_where(dataset: Dataset, bundle: MapBundle) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Queries' positions and times, places' positions and times; a place has the time of the scan that it was made of."""
+    frames = [frame for frame in dataset.queries(QUERIES) if frame.T_map_camera is not None]
+    query_xy = np.array([frame.T_map_camera[:2, 3] for frame in frames])
+    query_s = np.array([frame.stamp_s for frame in frames], np.float64)
+    stamps, poses = dataset.survey_trajectory()
+    place_xy = np.array(bundle.T_map_place[:, :2, 3])
+    # The survey's poses may have been brought into agreement by centimetres: the nearest scan is the place's own.
+    own = np.array([np.hypot(*(poses[:, :2, 3] - xy).T).argmin() for xy in place_xy])
+    return query_xy, query_s, place_xy, stamps[own]
+
+
+def _same_drive(report: Report, name: str, dataset: Dataset, bundle: MapBundle) -> None:
+    similarity = place_similarities(bundle, dataset, QUERIES)
+    query_xy, query_s, place_xy, place_s = _when_and_where(dataset, bundle)
+    protocols = [("published", OWN_SCAN_S)] + ([("loops", LOOP_S)] if name in LOOPS else [])
+    for protocol, left_out_s in protocols:
+        right, asked = found_within(
+            similarity, query_xy, place_xy, query_s=query_s, place_s=place_s, left_out_s=left_out_s
+        )
+        report.share(f"kitti.{protocol}.{name}.recall_at_1_{RIGHT_M:.0f}m", right[asked])
+
+
+def _other_day(
+    report: Report, mapped: str, asked: str, shared: str, maps: dict[str, tuple[Dataset, MapBundle]]
+) -> None:
+    """Queries of one day on the map of another; those count that have a place of it within 10 m."""
+    (own, bundle), (other, _) = maps[mapped], maps[asked]
+    similarity = place_similarities(bundle, other, QUERIES)
+    xyz = np.array([f.T_map_camera[:3, 3] for f in other.queries(QUERIES) if f.T_map_camera is not None])
+    xy, times = in_the_frame_of(own, other, xyz)[:, :2], np.zeros(len(xyz))
+    place_xy = np.array(bundle.T_map_place[:, :2, 3])
+    right, counted = found_within(
+        similarity, xy, place_xy, query_s=times, place_s=np.zeros(len(place_xy)), left_out_s=-1.0
+    )
+    print(f"{asked} on {mapped}: {shared}", flush=True)
+    report.share(f"kitti.other_day.{mapped}.{asked}.recall_at_1_{RIGHT_M:.0f}m", right[counted])
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except StreetfixError as error:
+        sys.exit(f"bench-kitti: {error}")

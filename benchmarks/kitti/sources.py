@@ -1,0 +1,65 @@
+"""Which KITTI drives lie below a folder, and which of the published and the honest protocol are missing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+PUBLISHED = ("00", "02", "05", "06", "07", "08")
+#: Sequences that come back to where they were: more than a minute later.
+LOOPS = ("00", "05", "06")
+#: The same street on another day: the map's drive, the queries' drive, and what they share.
+OTHER_DAY = (
+    ("2011_09_30_drive_0027", "2011_10_03_drive_0027", "196 m, same direction"),
+    ("2011_09_30_drive_0028", "2011_10_03_drive_0027", "152 m, same direction"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A recorded drive.
+
+    Attributes:
+        name: of an odometry sequence two digits, of a raw drive its date and number.
+        kind: importer that reads it.
+        folder: what the importer takes.
+        packed: it must be unpacked first (``unpack.py`` beside it).
+    """
+
+    name: str
+    kind: Literal["kitti-odometry", "kitti-raw"]
+    folder: Path
+    packed: bool = False
+
+
+def drives_below(root: Path) -> list[Drive]:
+    """Odometry sequences (``sequences/NN`` with poses) and raw drives (``*_sync``), by name; a drive that is there twice, once."""
+    found = dict[str, Drive]()
+    for folder in sorted(root.rglob("sequences/[0-9][0-9]")):
+        if (folder / "velodyne").is_dir() and (folder / "image_3").is_dir():
+            found.setdefault(folder.name, Drive(folder.name, "kitti-odometry", folder))
+    for folder in sorted(root.rglob("*_sync")):
+        scans = folder / "velodyne_points" / "data"
+        if not scans.is_dir() or not (folder / "image_03").is_dir() or not (folder / "oxts").is_dir():
+            continue
+        packed = any(scans.glob("*.xz"))
+        name = folder.name.removesuffix("_sync")
+        if packed:
+            # unpack.py takes the folder that holds the day's
+            found.setdefault(name, Drive(name, "kitti-raw", folder.parent.parent, packed=True))
+        else:
+            found.setdefault(name, Drive(name, "kitti-raw", folder))
+    return [found[name] for name in sorted(found)]
+
+
+def missing(drives: Sequence[Drive]) -> list[str]:
+    """What the protocols want and is not there, in words."""
+    names = {drive.name for drive in drives}
+    lines = [
+        f"odometry sequence {name} (velodyne, image_2, image_3, calib.txt, poses)"
+        for name in PUBLISHED
+        if name not in names
+    ]
+    wanted = dict.fromkeys(name for mapped, asked, _ in OTHER_DAY for name in (mapped, asked))
+    lines += [f"raw drive {name} (velodyne_points, image_02, image_03, oxts)" for name in wanted if name not in names]
+    return [*lines, "KITTI-360: there is no importer for its layout yet"]

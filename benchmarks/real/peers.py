@@ -1,0 +1,128 @@
+"""``real.peers.*``: other methods on the same queries and the same map, forced, beside ours forced and ours with the status applied.
+
+Retrieval methods answer the place that is nearest; registration methods answer a pose. A peer whose library is not installed here has a
+row that says so.
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.report import Report
+from model_training.baselines.cloud_registration import (
+    FpfhMap,
+    GicpMap,
+    by_kiss_matcher,
+    points_of_depth,
+    thinned_to_voxels,
+)
+from model_training.baselines.raw_range import SETTINGS, raw_best_views
+from model_training.baselines.scan_context import ContextSettings, context_of, context_of_depth, similarities
+from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.measures import RIGHT_M
+from model_training.evaluation.predict import predict
+from service.errors import ExtraMissingError
+from service.geometry.rigid import Transform
+from service.localization.localizer import Localizer
+
+NEAR_PLACE_M = 5.0
+Locate = Callable[[QueryFrame, int], Transform | None]
+
+
+def peer_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer, query_set: str) -> None:
+    """Every method on one drive.
+
+    Args:
+        report: where to.
+        name: of the drive, part of the rows' ids.
+        dataset: the drive's.
+        localizer: of its map.
+        query_set: with truth.
+    """
+    frames = list(dataset.queries(query_set))
+    true_xy = np.array([frame.T_map_camera[:2, 3] for frame in frames if frame.T_map_camera is not None])
+    ours = predict(localizer, dataset, query_set)
+    retrieved = predict(localizer, dataset, query_set, refine=False)
+    errors = position_errors(ours)
+    best = ("", -1.0)
+    cloud = localizer.bundle.cloud
+    if cloud is None:
+        raise ValueError(f"the map of {name} has no cloud")
+    points = cloud.origin_m + cloud.surfels["xyz"].astype(np.float64)
+    map_points = thinned_to_voxels(points, 0.25)
+
+    def add(peer: str, xy: NDArray[np.float64], seconds: float | None = None) -> None:
+        nonlocal best
+        off = np.nan_to_num(np.hypot(*(xy - true_xy).T), nan=np.inf)
+        report.share(f"real.peers.{name}.{peer}.within_1_m", off <= RIGHT_M)
+        report.share(f"real.peers.{name}.{peer}.within_5_m", off <= NEAR_PLACE_M)
+        if seconds is not None:
+            report.row(f"real.peers.{name}.{peer}.s_a_query", seconds / len(frames), "s")
+        best = max(best, (peer, float((off <= RIGHT_M).mean())), key=lambda each: each[1])
+
+    add("raw_range_image", _by_raw_range(localizer, dataset, query_set, true_xy))
+    add("scan_context", _by_scan_context(dataset, frames))
+
+    def registered(peer: str, prepare: Callable[[], Locate]) -> None:
+        try:
+            locate = prepare()
+            began = time.perf_counter()
+            poses = [locate(frame, k) for k, frame in enumerate(frames)]
+        except ExtraMissingError as missing:
+            report.row(f"real.peers.{name}.{peer}.within_1_m", None, "share", why=str(missing))
+            return
+        xy = np.array([[np.nan, np.nan] if pose is None else pose[:2, 3] for pose in poses])
+        add(peer, xy, time.perf_counter() - began)
+
+    def points_in(frame: QueryFrame) -> NDArray[np.float64]:
+        return thinned_to_voxels(points_of_depth(frame.depth_m(), frame.camera.pinhole()), 0.1)
+
+    def with_fpfh() -> Locate:
+        prepared = FpfhMap(map_points)
+        return lambda frame, _: prepared.locate(points_in(frame))
+
+    def with_gicp() -> Locate:
+        prepared = GicpMap(map_points)
+        return lambda frame, k: prepared.locate(points_in(frame), retrieved.T_answer[k])
+
+    registered("kiss_matcher", lambda: lambda frame, _: by_kiss_matcher(points_in(frame), map_points))
+    registered("fpfh_ransac", with_fpfh)
+    registered("small_gicp_from_retrieved_place", with_gicp)
+    report.share(f"real.peers.{name}.ours.within_1_m", errors <= RIGHT_M)
+    report.share(f"real.peers.{name}.ours.answered_within_1_m", ours.localized & (errors <= RIGHT_M))
+    report.share(f"real.peers.{name}.ours.within_5_m", errors <= NEAR_PLACE_M)
+    report.row(f"real.peers.{name}.best_within_1_m", best[1], "share", why=f"of {best[0]}")
+    ahead = float((errors <= RIGHT_M).mean()) - best[1]
+    report.row(f"real.peers.{name}.ours_ahead_of_best", ahead, "share", bar=1e-9)
+
+
+def _by_raw_range(
+    localizer: Localizer, dataset: Dataset, query_set: str, true_xy: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The place of the nearest range view, by the setting that does best on these very queries: what an honest method must beat."""
+    found = raw_best_views(localizer.bundle, dataset, [query_set])
+    places = localizer.bundle.T_map_place[:, :2, 3]
+
+    def near(setting: str) -> float:
+        return float((np.hypot(*(places[found[setting]] - true_xy).T) <= RIGHT_M).mean())
+
+    number = found[max(SETTINGS, key=near)]
+    xy: NDArray[np.float64] = np.where((number >= 0)[:, None], places[number], np.nan)
+    return xy
+
+
+def _by_scan_context(dataset: Dataset, frames: list[QueryFrame]) -> NDArray[np.float64]:
+    """The scan whose context is nearest."""
+    settings, poses = ContextSettings(), dataset.survey_poses()
+    contexts = []
+    for number, T_map_lidar in enumerate(poses):
+        points = dataset.scan(number)[:, :3].astype(np.float64) @ T_map_lidar[:3, :3].T
+        low = np.percentile(points[np.hypot(*points[:, :2].T) < 10][:, 2], 5)  # the ground around the vehicle
+        contexts.append(context_of(points - [0.0, 0.0, low], settings))
+    asked = [context_of_depth(frame.depth_m(), frame.camera.pinhole(), settings) for frame in frames]
+    nearest = similarities(np.stack(asked), np.stack(contexts)).argmax(axis=1)
+    xy: NDArray[np.float64] = poses[nearest, :2, 3]
+    return xy
