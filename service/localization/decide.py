@@ -25,19 +25,27 @@ class Decision:
 
 
 def decide(
-    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None, false_accept_rate: float
-) -> Decision:
+    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None, false_accept_rate: float, *,
+    prior_nats: float = 0.0,
+) -> Decision:  # fmt: skip
     """Weigh the evidence.
+
+    Calibration took every second query from outside the map. Whoever sends a prior says that the robot is in it, so the odds of that
+    change by Bayes' rule; how surely a place of the map is the right one does not.
 
     Args:
         calibration: the map's.
         evidence: of the answer; None where the pictures hold too little to register, so nothing speaks for any place.
-        false_accept_rate: share of the queries taken outside the map that one can live with being accepted.
+        false_accept_rate: share of the queries taken outside the map, and without a prior, that one can live with being accepted.
+        prior_nats: what a prior that agrees with the answer adds to the log odds of being in the map (``Prior.known_nats``).
     """
     if evidence is None:
         return Decision("OUT_OF_MAP", 0.0)
     confidence = float(calibration.confidence(evidence))
+    known_odds = calibration.known.log_odds(evidence)
+    unprompted, known = (float(odds) for odds in probability(np.array([known_odds, known_odds + prior_nats])))
+    if prior_nats > 0:
+        confidence = confidence / max(unprompted, confidence) * known
     if confidence >= calibration.threshold(false_accept_rate) and evidence[_SHARE] > _HALF:
         return Decision("LOCALIZED", confidence)
-    known = float(probability(calibration.known.log_odds(evidence)))
     return Decision("AMBIGUOUS" if known >= KNOWN else "OUT_OF_MAP", confidence)

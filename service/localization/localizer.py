@@ -6,7 +6,7 @@ from time import perf_counter
 import numpy as np
 
 from service.errors import BundleError, RequestError
-from service.geometry.rigid import Transform, inverse, transform_from
+from service.geometry.rigid import Transform, heading_of_camera, inverse, transform_from
 from service.imaging.query_view import QueryViews, query_views
 from service.imaging.view_grid import ViewGrid
 from service.localization.answer import Answer, Timings, require_finite
@@ -156,7 +156,11 @@ class Localizer:
         decision = None
         reasons: tuple[Reason, ...] = ()
         if registers and self.bundle.calibration is not None:
-            decision = decide(self.bundle.calibration, evidence, query.false_accept_rate)
+            prior_nats = 0.0
+            if query.prior is not None and refined is not None:
+                T = refined.best.T_map_camera
+                prior_nats = query.prior.known_nats(T[:2, 3], heading_of_camera(T))
+            decision = decide(self.bundle.calibration, evidence, query.false_accept_rate, prior_nats=prior_nats)
             if decision.status != "LOCALIZED":
                 reasons = reasons_of(self.bundle.calibration, evidence)
         candidates, spread = None if refined is None else refined.candidates, None

@@ -40,6 +40,16 @@ class Prior:
         believed -= np.log1p(np.exp(MOST_DOUBT))
         return believed
 
+    def known_nats(self, xy: Float64[NDArray[np.float64], "2"], heading_rad: float) -> float:
+        """What the prior adds to the log odds that the query was taken in the map, where the answer is a pose.
+
+        A position in the map, right in all but one case of some 150, makes a stranger so much rarer. It counts as far as the answer
+        agrees with it; a heading alone says nothing of where the robot is.
+        """
+        if self.position_m is None:
+            return 0.0
+        return max(0.0, float(self.log_weight(xy[None], np.array([heading_rad]))[0]) - MOST_DOUBT)
+
 
 #: One prior in some 150 is taken to be wrong altogether.
 MOST_DOUBT = -5.0

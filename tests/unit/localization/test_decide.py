@@ -15,7 +15,7 @@ def odds(p):
 def decided(calibration_json, calibration_of):
     """What is made of a first feature whose size is the log odds of being right, and of whether the place is known."""
 
-    def made(right, known=0.5, rate=0.01, *, share=1.0, **changed):
+    def made(right, known=0.5, rate=0.01, *, share=1.0, prior_nats=0.0, **changed):
         first = np.eye(1, len(terms(len(FEATURES))))[0].tolist()
         good = calibration_json()
         calibration = calibration_of(
@@ -23,7 +23,7 @@ def decided(calibration_json, calibration_of):
         )
         evidence = np.zeros(len(FEATURES))
         evidence[0], evidence[FEATURES.index("log_share")] = odds(right), np.log(share)
-        return decide(calibration, evidence, rate)
+        return decide(calibration, evidence, rate, prior_nats=prior_nats)
 
     return made
 
@@ -96,3 +96,30 @@ def test_who_holds_no_more_than_half_of_the_support_of_all_places_is_not_accepte
     found = decided(0.95, known, share=share)
     assert found.status == status
     assert found.confidence == pytest.approx(0.95)
+
+
+@pytest.mark.parametrize(
+    ("right", "known", "nats", "confidence"),
+    [
+        # Three to one against being in the map, times e^5: 148.4 / 3 to one. Right given known stays 0.1 / 0.25.
+        (0.1, 0.25, 5.0, 0.4 * 148.413 / 151.413),
+        (0.1, 0.25, np.log(3), 0.4 * 0.5),
+        # As surely right as known: the confidence is that of being known.
+        (0.25, 0.25, np.log(3), 0.5),
+        # More surely right than known is not more than sure.
+        (0.6, 0.25, np.log(3), 0.5),
+    ],
+)
+def test_a_prior_changes_the_odds_of_being_in_the_map_by_bayes_rule(decided, right, known, nats, confidence):
+    assert decided(right, known, prior_nats=nats).confidence == pytest.approx(confidence, rel=1e-4)
+
+
+def test_a_prior_makes_a_doubted_answer_an_accepted_one_and_a_stranger_an_ambiguous_one(decided):
+    assert decided(0.2, 0.25).status == "OUT_OF_MAP"
+    assert decided(0.2, 0.25, prior_nats=5.0).status == "LOCALIZED"
+    assert decided(0.02, 0.25, prior_nats=5.0).status == "AMBIGUOUS"
+
+
+@given(st.floats(0.01, 0.99), st.floats(0.01, 0.99), st.floats(0, 10))
+def test_no_prior_makes_a_confidence_beyond_one(decided, right, known, nats):
+    assert 0 <= decided(right, known, prior_nats=nats).confidence <= 1

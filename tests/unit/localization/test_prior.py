@@ -76,3 +76,13 @@ def test_many_poses_weigh_what_each_weighs_alone(poses):
     together = prior.log_weight(np.stack([x, y], axis=1), heading)
     alone = [weight(prior, *each[:2], np.rad2deg(each[2])) for each in poses]
     np.testing.assert_allclose(together, alone, atol=1e-9)
+
+
+def test_an_answer_at_the_prior_makes_a_stranger_as_rare_as_a_wrong_prior_and_one_far_from_it_changes_nothing():
+    prior = Prior(position_m=np.array([10.0, 20.0]), position_std_m=3.0)
+    assert prior.known_nats(np.array([10.0, 20.0]), 1.0) == pytest.approx(-MOST_DOUBT)
+    assert prior.known_nats(np.array([500.0, 20.0]), 1.0) == 0.0
+
+
+def test_a_heading_alone_says_nothing_of_whether_the_place_is_in_the_map():
+    assert Prior(heading_rad=0.3).known_nats(np.array([1.0, 2.0]), 0.3) == 0.0
