@@ -26,6 +26,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.take import TakeSettings, take
 from model_training.mapping.build import BuildSettings, build_map
+from model_training.odometry.align_poses import usual_poses
 from model_training.stock import ENCODER
 from service.errors import StreetfixError
 from service.maps.reader import MapBundle
@@ -90,7 +91,8 @@ def _mapped(drive: Drive, root: Path, work: Path) -> tuple[Dataset, MapBundle]:
         if trajectory is None:
             raise SystemExit(f"{source} has no poses; put poses/{drive.name}.txt beside the sequences")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        take(recording, trajectory, folder, TakeSettings())
+        poses, _ = usual_poses(recording, trajectory)
+        take(recording, poses, folder, TakeSettings())
     dataset = Dataset(folder)
     if not bundle.exists():
         build_map(dataset, ENCODER, bundle, BuildSettings(name=drive.name, spacing_m=EVERY_SCAN_M), report=_told)

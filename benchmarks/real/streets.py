@@ -24,6 +24,7 @@ from model_training.evaluation.stages import stages_of
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.take import TakeSettings, take
 from model_training.mapping.build import BuildSettings, build_map
+from model_training.odometry.align_poses import usual_poses
 from model_training.stock import ENCODER
 from service.errors import NoDepthError
 from service.localization.localizer import Localizer
@@ -114,7 +115,8 @@ def imported(data: Path, work: Path, name: str) -> Dataset | None:
     trajectory = recording.trajectory()
     if trajectory is None:
         raise FileNotFoundError(f"{drive} has no poses (oxts)")
-    take(recording, trajectory, folder, TakeSettings())
+    poses, _ = usual_poses(recording, trajectory)
+    take(recording, poses, folder, TakeSettings())
     return Dataset(folder)
 
 

@@ -15,6 +15,7 @@ from model_training.importing.recording import Recording
 from model_training.importing.ros_topics import ROLES
 from model_training.importing.take import TakeSettings, TakeSummary, take
 from model_training.importing.trajectory import Sync, Trajectory
+from model_training.odometry.align_poses import ALIGNED_KINDS, usual_poses
 from service.errors import DatasetError
 
 #: Frames without poses, each a place of its own, are imported another way than drives.
@@ -60,6 +61,13 @@ def command(
     ] = None,
     camera: Annotated[
         Path | None, typer.Option(help="JSON with width, height, fx, fy, cx, cy, where the recording lacks them")
+    ] = None,
+    align: Annotated[
+        bool | None,
+        typer.Option(
+            help="mend the recording's poses by matching its scans, step by step; as a whole they stay where they are "
+            f"[default: of {', '.join(sorted(ALIGNED_KINDS))}]"
+        ),
     ] = None,
     odometry: Annotated[
         bool, typer.Option(help="find the poses by LiDAR odometry, the recording's own are not looked at")
@@ -114,6 +122,8 @@ def command(
     )  # fmt: skip
     if odometry and poses is not None:
         raise DatasetError("poses: --odometry finds them; give one of the two", field="poses")
+    if odometry and align:
+        raise DatasetError("align: --odometry finds poses from the scans alone; give one of the two", field="align")
     recording = open_recording(kind, source, told)
     console = Console()
     for line in recording.notes.lines:
@@ -121,11 +131,15 @@ def command(
     if not odometry:
         trajectory = _trajectory(recording, source, poses)
     with bars() as report:
+        told_of_poses: str | None
         if odometry:
-            trajectory, told_of_loops = _by_odometry(recording, loops, lidar_height, report)
+            trajectory, told_of_poses = _by_odometry(recording, loops, lidar_height, report)
+        else:
+            of_file = False if poses is not None and align is None else align
+            trajectory, told_of_poses = usual_poses(recording, trajectory, align=of_file, report=report)
         summary = take(recording, trajectory, out, settings, report=report)
-    if odometry:
-        console.print(told_of_loops, soft_wrap=True)
+    if told_of_poses:
+        console.print(told_of_poses, soft_wrap=True)
     _tell(console, out, summary)
 
 

@@ -13,7 +13,9 @@ from service.geometry.rigid import inverse
 #: Standard deviations, rotation (rad) first as GTSAM has it: of odometry for each square root of a metre, and of a loop.
 ODOMETRY_SIGMAS = np.array([0.0007, 0.0007, 0.0007, 0.01, 0.01, 0.01])
 LOOP_SIGMAS = np.array([0.003, 0.003, 0.003, 0.05, 0.05, 0.05])
-#: Beyond so many standard deviations a loop counts for less and less: it may be another place that looks the same.
+#: Of a given pose. Its errors last for dozens of metres, which the graph takes for independent: so each counts for less than its own.
+GIVEN_SIGMAS = np.array([0.02, 0.02, 0.03, 3.0, 3.0, 3.0])
+#: Beyond so many standard deviations a loop, or a given pose, counts for less and less: it may be another place that looks the same.
 ROBUST = 3.0
 
 Transforms = Float64[NDArray[np.float64], "N 4 4"]
@@ -41,6 +43,32 @@ def disagreement_m(T_first_keyframe: Transforms, loops: list[Loop]) -> float:
         for loop in loops
     ]
     return float(np.mean(np.linalg.norm(away, axis=1))) if away else 0.0
+
+
+def held_near(T_map_steps: Transforms, T_map_given: Transforms) -> Transforms:
+    """Poses whose steps are those of a chain, and whose whole stays where given poses have it.
+
+    Args:
+        T_map_steps: of a drive, by odometry: right from one to the next, drifting as a whole.
+        T_map_given: of the same moments, by GNSS or an inertial system: off by decimetres each, not drifting.
+    """
+    import gtsam
+
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    given_noise = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(ROBUST), gtsam.noiseModel.Diagonal.Sigmas(GIVEN_SIGMAS)
+    )
+    for k, T in enumerate(T_map_given):
+        start.insert(k, gtsam.Pose3(T))
+        graph.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(T), given_noise))
+    for k, (before, after) in enumerate(pairwise(T_map_steps)):
+        step = inverse(before) @ after
+        noise = gtsam.noiseModel.Diagonal.Sigmas(
+            ODOMETRY_SIGMAS * np.sqrt(max(0.1, float(np.linalg.norm(step[:3, 3]))))
+        )
+        graph.add(gtsam.BetweenFactorPose3(k, k + 1, gtsam.Pose3(step), noise))
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    return np.stack([solved.atPose3(k).matrix() for k in range(len(T_map_given))])
 
 
 def _solved(drive: Drive, loops: list[Loop]) -> Transforms:

@@ -52,7 +52,7 @@ def posed(scans: Iterable[RecordedScan]) -> Iterator[PosedScan]:
 
     config = load_config(None)
     config.data.max_range, config.mapping.voxel_size, config.data.deskew = MAX_RANGE_M, VOXEL_M, False
-    coarse, fine = KissICP(config), _FineMap()
+    coarse, fine = KissICP(config), FineMap()
     last_s: float | None = None
     for scan in scans:
         middle = _at_its_middle(scan)
@@ -86,8 +86,8 @@ def _steady(delta: NDArray[np.float64], stamp_s: float, step_s: float) -> Trajec
     return Trajectory(stamps, np.stack([inverse(delta), np.eye(4), delta]), "constant speed")
 
 
-class _FineMap:
-    """Distributions of the points around the vehicle, and where the last scan was found in them."""
+class FineMap:
+    """Distributions of the points around the vehicle, and where the last scan was found in them; the first one stays where it is given."""
 
     def __init__(self) -> None:
         import small_gicp
@@ -111,6 +111,8 @@ class _FineMap:
             T = np.asarray(found.T_target_source, np.float64)
             moved_m = float(np.linalg.norm(T[:3, 3] - guess[:3, 3]))
             self._T = T if found.converged and moved_m <= MOST_M else guess
+        else:
+            self._T = T_coarse
         self._T_coarse = T_coarse
         if self._inserted_m is None or np.linalg.norm(self._T[:3, 3] - self._inserted_m) >= INSERT_M:
             self._map.insert(cloud, self._T)
