@@ -11,6 +11,8 @@ _HEAD = (
     "query", "tilt", "height", "place rank", "start", "candidate", "from truth", "inliers at truth", "error", "heading", "status",
     "confidence", "lost by",
 )  # fmt: skip
+#: Columns that a row takes.
+WIDTH = 120
 
 
 def print_stages(name: str, found: list[QueryStages], console: Console) -> None:
@@ -26,7 +28,8 @@ def print_stages(name: str, found: list[QueryStages], console: Console) -> None:
         table.add_column(head, justify="left" if k >= len(_HEAD) - 3 else "right", overflow="fold")
     for each in found:
         table.add_row(*_row(each))
-    console.print(table)
+    # In a file or a pipe no line need be cut: words broken at 80 columns cannot be read.
+    Console(file=console.file, width=None if console.is_terminal else max(console.width, WIDTH)).print(table)
     for stage, count in lost_by_stage(found).items():
         if count:
             label = "right" if stage == "-" else f"lost by {stage}"
