@@ -1,4 +1,7 @@
-"""KITTI's odometry layout: ``sequences/NN/{velodyne,image_2,image_3,calib.txt,times.txt}`` and ``poses/NN.txt``."""
+"""KITTI's odometry layout: ``sequences/NN/{velodyne,image_2,image_3,calib.txt,times.txt}`` and ``poses/NN.txt``.
+
+Where there is no colour pair, the grey one is taken (``image_0``, ``image_1``).
+"""
 
 from pathlib import Path
 
@@ -11,6 +14,9 @@ from model_training.importing.spinning import KITTI_VERTICAL_DEG
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 from service.geometry.rigid import inverse, transform_from
+
+#: Left and right camera: the colour pair before the grey one.
+_PAIRS = (("2", "3"), ("0", "1"))
 
 
 def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float = KITTI_VERTICAL_DEG) -> KittiSequence:
@@ -29,9 +35,10 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float 
         raise DatasetError(
             f"{source}: a folder sequences/NN with velodyne/*.bin in it is wanted; here is no scan", field="source"
         )
-    left, right = (numbered(source / camera, (".png", ".jpg")) for camera in ("image_2", "image_3"))
-    stored = numbered(source / "depth_2", (".png",))
-    calibration, T_lidar_cam0 = _calibration(source / "calib.txt")
+    eyes = next((pair for pair in _PAIRS if (source / f"image_{pair[0]}").is_dir()), _PAIRS[0])
+    left, right = (numbered(source / f"image_{eye}", (".png", ".jpg")) for eye in eyes)
+    stored = numbered(source / f"depth_{eyes[0]}", (".png",))
+    calibration, T_lidar_cam0 = _calibration(source / "calib.txt", *eyes)
     numbers = sorted(scans.keys() | left.keys())
     stamps = _times(source / "times.txt", numbers[-1])
     frames = tuple(KittiFrame(f"{n:06d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers)  # fmt: skip
@@ -39,9 +46,10 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float 
     return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses, vertical_deg=vertical_deg)
 
 
-def _calibration(path: Path) -> tuple[KittiCalibration, np.ndarray]:
-    found = read_matrices(path, {"P2": (3, 4), "P3": (3, 4), "Tr": (3, 4)}, optional=frozenset({"P3"}))
-    calibration = calibration_from(path, P2=found["P2"], P3=found.get("P3"), R0=np.eye(3), Tr=found["Tr"])
+def _calibration(path: Path, left: str, right: str) -> tuple[KittiCalibration, np.ndarray]:
+    P2, P3 = f"P{left}", f"P{right}"
+    found = read_matrices(path, {P2: (3, 4), P3: (3, 4), "Tr": (3, 4)}, optional=frozenset({P3}))
+    calibration = calibration_from(path, P2=found[P2], P3=found.get(P3), R0=np.eye(3), Tr=found["Tr"])
     return calibration, inverse(transform_from(found["Tr"][:, :3], found["Tr"][:, 3]))
 
 

@@ -1,6 +1,7 @@
 """KITTI's raw layout: ``DATE/DATE_drive_NNNN_sync/{velodyne_points,image_02,image_03,oxts}`` and the day's calibration.
 
-A drive's files are numbered alike; what was left out of an extract may be missing. Depth that lies beside is that of KITTI's
+A drive's files are numbered alike; what was left out of an extract may be missing. Where there is no colour pair, the grey one is
+taken (``image_00``, ``image_01``). Depth that lies beside is that of KITTI's
 depth benchmark, ``proj_depth/groundtruth/image_02``.
 """
 
@@ -22,6 +23,8 @@ from service.errors import DatasetError
 from service.geometry.rigid import Transform, transform_from
 
 _PICTURES = (".png", ".jpg")
+#: Left and right camera: the colour pair before the grey one.
+_PAIRS = (("02", "03"), ("00", "01"))
 
 
 def open_kitti_raw(source: Path, *, depth: KittiDepth, vertical_deg: float = KITTI_VERTICAL_DEG) -> KittiSequence:
@@ -38,10 +41,11 @@ def open_kitti_raw(source: Path, *, depth: KittiDepth, vertical_deg: float = KIT
         DatasetError: there is no drive, no scan, or no calibration.
     """
     drive = _drive(source)
-    calibration = _calibration(drive)
+    eyes = next((pair for pair in _PAIRS if (drive / f"image_{pair[0]}" / "data").is_dir()), _PAIRS[0])
+    calibration = _calibration(drive, *eyes)
     scans = numbered(drive / "velodyne_points" / "data", (".bin",))
-    left, right = (numbered(drive / camera / "data", _PICTURES) for camera in ("image_02", "image_03"))
-    stored = numbered(drive / "proj_depth" / "groundtruth" / "image_02", (".png",))
+    left, right = (numbered(drive / f"image_{eye}" / "data", _PICTURES) for eye in eyes)
+    stored = numbered(drive / "proj_depth" / "groundtruth" / f"image_{eyes[0]}", (".png",))
     if not scans:
         raise DatasetError(f"{drive}/velodyne_points/data has no scan; add the scans", field="velodyne_points")
     numbers = sorted(scans.keys() | left.keys())
@@ -77,13 +81,12 @@ def _drive(source: Path) -> Path:
     return drives[0]
 
 
-def _calibration(drive: Path) -> KittiCalibration:
+def _calibration(drive: Path, left: str, right: str) -> KittiCalibration:
     cameras = _calibration_file(drive, "calib_cam_to_cam.txt")
     Tr = _rigid(_calibration_file(drive, "calib_velo_to_cam.txt"))
-    found = read_matrices(
-        cameras, {"R_rect_00": (3, 3), "P_rect_02": (3, 4), "P_rect_03": (3, 4)}, optional=frozenset({"P_rect_03"})
-    )
-    return calibration_from(cameras, P2=found["P_rect_02"], P3=found.get("P_rect_03"), R0=found["R_rect_00"], Tr=Tr[:3])
+    P2, P3 = f"P_rect_{left}", f"P_rect_{right}"
+    found = read_matrices(cameras, {"R_rect_00": (3, 3), P2: (3, 4), P3: (3, 4)}, optional=frozenset({P3}))
+    return calibration_from(cameras, P2=found[P2], P3=found.get(P3), R0=found["R_rect_00"], Tr=Tr[:3])
 
 
 def _calibration_file(drive: Path, name: str) -> Path:

@@ -121,6 +121,32 @@ def test_scans_and_pictures_come_with_the_mounting_of_the_calibration(drive):
     assert picture.file.name.startswith("0000")
 
 
+def only_grey(drive):
+    """The same pictures of one channel, by cameras 0 and 1, of which camera 0 has no offset."""
+    raw = "sync" in drive.name
+    for colour, grey in (("2", "0"), ("3", "1")):
+        folder = drive / (f"image_0{colour}" if raw else f"image_{colour}")
+        for path in folder.rglob("*.png"):
+            cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        folder.rename(drive / (f"image_0{grey}" if raw else f"image_{grey}"))
+    calibration = drive.parent / "calib_cam_to_cam.txt" if raw else drive / "calib.txt"
+    names = ("P_rect_00", "P_rect_01") if raw else ("P0", "P1")
+    calibration.write_text(
+        calibration.read_text() + line(names[0], projection(0.0)) + line(names[1], projection(-BASELINE_M))
+    )
+
+
+def test_where_there_is_no_colour_pair_the_grey_one_is_taken(drive):
+    colour = events_of(drive, RecordedPicture, "sgbm")[0]
+    only_grey(drive)
+    grey = events_of(drive, RecordedPicture, "sgbm")[0]
+    depth = grey.depth[:, 140:]
+    assert abs(np.median(depth[depth > 0]) - 5.0) < 0.02
+    assert grey.baseline_m == pytest.approx(BASELINE_M)
+    moved = grey.T_vehicle_camera[:3, 3] - colour.T_vehicle_camera[:3, 3]
+    assert np.linalg.norm(moved) == pytest.approx(0.06)  # camera 2 stands that far aside of camera 0
+
+
 def test_matched_depth_is_that_of_the_wall(drive):
     depth = events_of(drive, RecordedPicture, "sgbm")[0].depth[:, 140:]
     assert abs(np.median(depth[depth > 0]) - 5.0) < 0.02
