@@ -14,7 +14,6 @@ from model_training.calibration.plans import PAIR_RIGS
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.disparity_errors import DisparityErrors, disparity_errors
 from model_training.simulation.plan import QueryPlan, SimulationPlan
-from model_training.simulation.sensor_parameters import StereoParameters
 from model_training.simulation.simulate import simulate
 from model_training.training.recipe import WATCH_SEEDS
 
@@ -30,7 +29,7 @@ def simulated_errors(work: Path) -> DisparityErrors:
     for k in range(DRIVES):
         query = QueryPlan(
             name="own", traversal=0, count=FRAMES, depths=("sgbm",), aside_m=0.3, heading_deg=3.0,
-            stereo_parameters=StereoParameters(focal_baseline_px_m=rig.focal_baseline_px_m),
+            stereo_parameters=rig.stereo,
         )  # fmt: skip
         plan = SimulationPlan(
             name=f"matcher-{k}", seed=WATCH_SEEDS[FIRST_SEED + k], size_m=(120.0, 120.0), lidar=rig.lidar,

@@ -60,7 +60,7 @@ class PairRig:
         name: of its kinds of queries.
         camera: of the left picture.
         camera_height_m: above the ground.
-        focal_baseline_px_m: focal length times baseline, pixels times metres.
+        stereo: focal length times baseline, and how badly it is rectified.
         depths: matchers.
         lidar: of the survey.
         lidar_height_m: above the ground.
@@ -71,7 +71,7 @@ class PairRig:
     name: str
     camera: CameraPlan
     camera_height_m: float
-    focal_baseline_px_m: float
+    stereo: StereoParameters
     depths: tuple[str, ...]
     lidar: str
     lidar_height_m: float
@@ -82,12 +82,14 @@ class PairRig:
 PAIR_RIGS = (
     # A car as KITTI's: Geiger et al., Vision meets Robotics, IJRR 2013. Poses of GNSS and inertial sensors err by a decimetre.
     PairRig(
-        "car", CameraPlan(width=1242, height=376, horizontal_deg=81.4), 1.65, 384.0, ("sgbm",), "hdl_64", 1.73, 2.5,
-        SurveyParameters(position_m=0.08, angle_deg=0.1, speed_m_s=8.0, followed=0.3),
+        "car", CameraPlan(width=1242, height=376, horizontal_deg=81.4), 1.65, StereoParameters(focal_baseline_px_m=384.0), ("sgbm",),
+        "hdl_64", 1.73, 2.5, SurveyParameters(position_m=0.08, angle_deg=0.1, speed_m_s=8.0, followed=0.3),
     ),
-    # A small robot: stereo of 0.2 m baseline matched by blocks or along scan lines, in a survey by a LiDAR of 32 beams.
+    # A small robot: stereo of 0.2 m baseline matched by blocks or along scan lines, in a survey by a LiDAR of 32 beams. It is rectified as
+    # well as the car's: the same angles are half as many of its pixels.
     PairRig(
-        "robot", CameraPlan(width=640, height=400, horizontal_deg=80.0), 0.9, 76.0, ("bm", "sgbm3way"), "hdl_32", 1.6, 1.5,
+        "robot", CameraPlan(width=640, height=400, horizontal_deg=80.0), 0.9,
+        StereoParameters(focal_baseline_px_m=76.0, offset_px=0.29, vertical_px=0.21, roll_px=0.21), ("bm", "sgbm3way"), "hdl_32", 1.6, 1.5,
         SurveyParameters(position_m=0.04, angle_deg=0.1, speed_m_s=1.5),
     ),
 )  # fmt: skip
@@ -103,12 +105,11 @@ def pair_plan(rig: PairRig, index: int, *, drives: int = 6, queries: int = 25, s
         queries: of each drive.
         sequences: of ``SEQUENCE`` frames, in the last city.
     """
-    stereo = StereoParameters(focal_baseline_px_m=rig.focal_baseline_px_m)
 
     def drive(traversal: int, name: str, count: int, sequence: int | None = None) -> QueryPlan:
         step_m = None if sequence is None else 2.0
         return QueryPlan(
-            name=name, traversal=traversal, count=count, depths=rig.depths, stereo_parameters=stereo, aside_m=1.5,
+            name=name, traversal=traversal, count=count, depths=rig.depths, stereo_parameters=rig.stereo, aside_m=1.5,
             heading_deg=10.0, followed=rig.survey.followed, sequence=sequence, step_m=step_m,
         )  # fmt: skip
 

@@ -34,9 +34,9 @@ class Reason:
     remedy: str
 
 
-#: What evidence out of range speaks of, the likeliest cause first. ``log_share`` says only which of several places it is.
+#: What evidence out of range speaks of, the likeliest cause first. What confidence does not weigh is no reason either.
 GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    ("intrinsics", ("similarity", "facings"), "compare fx, fy, cx, cy and the picture's size with the camera's own calibration"),
+    ("intrinsics", ("facings",), "compare fx, fy, cx, cy and the picture's size with the camera's own calibration"),
     ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
     (
         "field of view or depth range", ("measured", "far"),

@@ -47,6 +47,6 @@ def test_a_rig_is_rectified_anew_for_each_drive_and_its_last_city_has_sequences(
         drives = [query.traversal for query in plan.queries]
         assert len(set(drives)) == len(drives)
         assert 0 not in drives  # the survey's own
-        assert plan.focal_baseline_px_m() == rig.focal_baseline_px_m
+        assert plan.focal_baseline_px_m() == rig.stereo.focal_baseline_px_m
     assert [plan.queries[-1].sequence for plan in plans] == [None, SEQUENCE]
     assert len({plan.name for plan in plans}) == PAIR_CITIES

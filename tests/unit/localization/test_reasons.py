@@ -38,9 +38,11 @@ def test_evidence_in_the_range_that_calibration_saw_gives_none(calibration, size
 
 
 def test_the_likeliest_reason_comes_first_and_one_remedy_is_told_once(calibration):
-    evidence = evidence_of(margin=-5, front=4, through=8, points=-3.5, measured=-4, scale=6, similarity=-10, inliers=-2)
+    evidence = evidence_of(
+        margin=-5, front=4, through=8, points=-3.5, measured=-4, scale=6, facings=-10, similarity=-9, inliers=-2
+    )
     assert told(reasons_of(calibration, evidence)) == [
-        ("intrinsics", (("similarity", -10.0),)),
+        ("intrinsics", (("facings", -10.0),)),
         ("depth unit", (("scale", 6.0),)),
         ("field of view or depth range", (("measured", -4.0),)),
         ("baseline", (("points", -3.5),)),
