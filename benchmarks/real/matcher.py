@@ -38,9 +38,7 @@ def simulated_errors(work: Path) -> DisparityErrors:
         )  # fmt: skip
         simulate(plan, work / plan.name)
         found.append(disparity_errors(Dataset(work / plan.name), "own_sgbm"))
-    return DisparityErrors(
-        *(np.concatenate([getattr(each, name) for each in found]) for name in ("error_px", "textured"))
-    )
+    return DisparityErrors.joined(found)
 
 
 def matcher_rows(report: Report, data: Path, work: Path, recording: str = "kitti_0005") -> None:

@@ -69,6 +69,8 @@ class DisparityErrors:
         at = self.line * width + self.column
         values = dict(zip(at[matched].tolist(), error[matched].tolist(), strict=True))
         spread = float(np.mean(error[matched] ** 2))
+        if spread == 0:
+            return 0.0
         before_px, before = 0.0, 1.0
         for lag in LAGS_PX:
             products = [value * values[place + lag] for place, value in values.items() if place + lag in values]
