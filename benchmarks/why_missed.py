@@ -63,6 +63,10 @@ _OVER_BARE = (
     "out, since a stuck request would stop all others. Next: fewer reads of a body, each of which wakes the loop while the worker "
     "computes"
 )
+_OLD_0013 = (
+    "of the code before poses were mended, confidence was fitted anew and places were verified. This drive may be measured once a day, and "
+    "had its run before. By the same changes drive 0005 went from 0.00 to 1.00 accepted and within 1 m"
+)
 _PEERS = (
     "the best peer is MLServer. With eight clients its processor time is 35.3 ms for a full request and 10.0 ms for retrieval. Ours is "
     "38.2 and 11.6 ms. The others take 39.5 to 40.4 and 11.7 to 13.2 ms. MLServer's handler runs in the event loop's own thread, as its "
@@ -145,6 +149,18 @@ WHY_MISSED: dict[str, Reason] = {
         "of sequences between two landmarks. Six of 137 more are no longer ambiguous. Not looked into yet; next: sequences by these "
         "cameras on the calibration's street of repeating blocks",
     ),
+    "real.matcher.error_ratio.untextured.percentile_90": Reason(
+        0.7421621,
+        "0005 has more outliers from 10 to 20 m (0.105, simulated 0.052). Its road is overexposed in places, and a van and cyclists move; "
+        "the simulated drives have no vehicle ahead. Which of these it is has not been looked into. Against the recording's own poses, "
+        "where fewer points of two scans agree, the ratio was 1.09",
+    ),
+    "real.kitti_0013.recall_at_1_5m": Reason(0.5416667, _OLD_0013),
+    "real.kitti_0013.recall_at_1_10m": Reason(0.6666667, _OLD_0013),
+    "real.kitti_0013.answered_within_1_m": Reason(0.0, _OLD_0013),
+    "real.kitti_0013.median_m": Reason(None, _OLD_0013),
+    "real.kitti_0013.inliers_at_truth": Reason(0.1766411, _OLD_0013),
+    "real.sequence5.kitti_0013.answered_within_1_m": Reason(0.0, _OLD_0013),
     "real.kitti_stereo.registration.median_m": Reason(
         0.08065068,
         "0.074 m before. Since then a stereo rig's noise is half a pixel at least, and the left tenth of the pictures is matched too. "

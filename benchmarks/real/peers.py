@@ -32,7 +32,26 @@ NEAR_PLACE_M = 5.0
 Locate = Callable[[QueryFrame, int], Transform | None]
 
 
-def peer_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer, query_set: str) -> None:
+def pooled_rows(report: Report, drives: list[tuple[float, float, int]]) -> None:
+    """Of all drives: the best other method of each, and ours, within 1 m, weighted by queries.
+
+    Args:
+        report: where to.
+        drives: what ``peer_rows`` returned of each.
+    """
+    if not drives:
+        return
+    best, ours, queries = np.array(drives).T
+    best_share, our_share = (float((shares * queries).sum() / queries.sum()) for shares in (best, ours))
+    report.row("real.peers.best_within_1_m", best_share, "share", n=int(queries.sum()))
+    report.row(
+        "real.peers.ours_within_1_m", our_share, "share", bar=float(np.nextafter(best_share, 1)), n=int(queries.sum())
+    )
+
+
+def peer_rows(
+    report: Report, name: str, dataset: Dataset, localizer: Localizer, query_set: str
+) -> tuple[float, float, int]:
     """Every method on one drive.
 
     Args:
@@ -41,6 +60,9 @@ def peer_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer,
         dataset: the drive's.
         localizer: of its map.
         query_set: with truth.
+
+    Returns:
+        Shares within 1 m of the best other method and of ours, forced; how many queries.
     """
     frames = list(dataset.queries(query_set))
     true_xy = np.array([frame.T_map_camera[:2, 3] for frame in frames if frame.T_map_camera is not None])
@@ -95,8 +117,7 @@ def peer_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer,
     report.share(f"real.peers.{name}.ours.answered_within_1_m", ours.localized & (errors <= RIGHT_M))
     report.share(f"real.peers.{name}.ours.within_5_m", errors <= NEAR_PLACE_M)
     report.row(f"real.peers.{name}.best_within_1_m", best[1], "share", why=f"of {best[0]}")
-    ahead = float((errors <= RIGHT_M).mean()) - best[1]
-    report.row(f"real.peers.{name}.ours_ahead_of_best", ahead, "share", bar=1e-9)
+    return best[1], float((errors <= RIGHT_M).mean()), len(frames)
 
 
 def _by_raw_range(

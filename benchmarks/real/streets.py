@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.real.peers import peer_rows
+from benchmarks.real.peers import peer_rows, pooled_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import position_errors
@@ -49,13 +49,15 @@ class Street:
 def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] = DRIVES) -> None:
     """Each drive on its own map; then each one's queries on the other's map, where they are strangers."""
     streets = [street for name in drives if (street := _street(report, data, work, name)) is not None]
+    others = []
     for street in streets:
         found = predict(street.localizer, street.dataset, QUERIES)
         answer_rows(report, f"real.{street.name}", found)
         _stage_rows(report, street)
-        peer_rows(report, street.name, street.dataset, street.localizer, QUERIES)
+        others.append(peer_rows(report, street.name, street.dataset, street.localizer, QUERIES))
         if street.name == "kitti_0013":
             _sequence_rows(report, street)
+    pooled_rows(report, others)
     accepted = [
         predict(own.localizer, other.dataset, QUERIES).localized
         for own in streets

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.real.peers import pooled_rows
 from benchmarks.real.streets import answer_rows, status_rows
 from benchmarks.report import Report
 
@@ -36,3 +37,14 @@ def test_recall_has_both_distances(tmp_path, answers_of):
     rows = rows_of(report)
     assert rows["real.d.recall_at_1_5m"]["value"] == pytest.approx(1 / 3)
     assert rows["real.d.recall_at_1_10m"]["value"] == pytest.approx(2 / 3)
+
+
+def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):
+    """Ten queries at 0.5 and thirty at 0.1 are 0.2 in all."""
+    report = Report("x", "x", folder=tmp_path)
+    pooled_rows(report, [(0.5, 0.2, 10), (0.1, 0.2, 30)])
+    rows = rows_of(report)
+    assert rows["real.peers.best_within_1_m"]["value"] == pytest.approx(0.2)
+    assert rows["real.peers.ours_within_1_m"]["holds"] is False
+    pooled_rows(report, [(0.5, 0.9, 10)])
+    assert rows_of(report)["real.peers.ours_within_1_m"]["holds"] is True
