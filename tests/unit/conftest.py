@@ -171,11 +171,13 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A dozen scans of a LiDAR that looks down (2 to -24.8 degrees) and five picture pairs of another drive."""
     from model_training.datasets.dataset import Dataset
     from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
+    from model_training.simulation.sensor_parameters import LidarParameters
     from model_training.simulation.simulate import simulate
 
     out = tmp_path_factory.mktemp("datasets") / "small"
     plan = SimulationPlan(
         name="small", seed=3, size_m=(60.0, 60.0), spacing_m=5.0, streets=("1",), lidar="hdl_64",
+        lidar_parameters=LidarParameters(bottom_deg=-24.8),  # evenly spaced beams
         camera=CameraPlan(width=96, height=72), queries=(QueryPlan(name="drive1", traversal=1, count=5),),
     )  # fmt: skip
     simulate(plan, out, workers=1)
