@@ -9,14 +9,20 @@ from rich.console import Console
 from model_training.cli.progress import bars
 from model_training.training.loop import Progress, TrainingConfig, device_of, train
 from model_training.training.packs import make_packs
-from model_training.training.recipe import paper_plans, stock_plans
+from model_training.training.recipe import RECIPES
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
 
 def command(
     run: Annotated[Path, typer.Option(help="folder of the run: configuration, checkpoint, TensorBoard log")],
-    recipe: Annotated[str, typer.Option(help="stock: many cities; paper: the paper's city itself")] = "stock",
+    recipe: Annotated[
+        str,
+        typer.Option(
+            help="stock: many cities; matched: some of them, and cities whose depth comes from matched stereo pairs; paper: the paper's "
+            "city itself"
+        ),
+    ] = "stock",
     cities: Annotated[int, typer.Option(help="cities of the stock recipe", min=1, max=1000)] = 26,
     packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
     steps: Annotated[int, typer.Option(help="optimiser steps", min=1)] = 4000,
@@ -30,7 +36,9 @@ def command(
     precision: Annotated[
         str, typer.Option(help="float32, or bfloat16: twice as fast on processors that have it, and on GPUs")
     ] = "float32",
-    start_from: Annotated[Path | None, typer.Option(help="run whose weights to start from")] = None,
+    start_from: Annotated[
+        Path | None, typer.Option(help="run whose weights to start from, or an exported encoder (.onnx)")
+    ] = None,
     negatives: Annotated[
         str,
         typer.Option(
@@ -47,8 +55,12 @@ def command(
     Example, the stock encoder:
       streetfix train --run runs/stock && streetfix export runs/stock --out encoder.onnx
     """
-    if recipe not in ("stock", "paper"):
-        raise DatasetError(f"recipe: {recipe!r} is neither 'stock' nor 'paper'", field="recipe")
+    if recipe not in RECIPES:
+        raise DatasetError(f"recipe: {recipe!r} is none of {', '.join(RECIPES)}", field="recipe")
+    if start_from is not None and not start_from.exists():
+        raise DatasetError(
+            f"start_from: {start_from} is not there; name a run's folder or an encoder (.onnx)", field="start_from"
+        )
     if optimiser not in ("adamw", "sgdm"):
         raise DatasetError(f"optimiser: {optimiser!r} is neither 'adamw' nor 'sgdm'", field="optimiser")
     if precision not in ("float32", "bfloat16"):
@@ -70,7 +82,7 @@ def command(
         | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network no longer drift fast
         | ({"memory_after": None} if negatives == "batch" else {})
     )
-    plans = paper_plans() if recipe == "paper" else stock_plans(cities)
+    plans = RECIPES[recipe](cities)
     grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
     with bars() as report:
         folders = make_packs(plans, packs, grid, workers=workers, report=report)

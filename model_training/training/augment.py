@@ -47,17 +47,17 @@ class Augmenter:
     def __init__(
         self, settings: Augmentation, grid: ViewGrid, generator: torch.Generator, device: torch.device
     ) -> None:
-        self.settings, self.grid, self._generator, self._device = settings, grid, generator, device
+        self.settings, self.grid, self._generator, self.device = settings, grid, generator, device
         self.elevation = torch.tensor(grid.elevations_rad, dtype=torch.float32, device=device)[:, None]
         self.azimuth = torch.tensor(grid.azimuths_rad.copy(), dtype=torch.float32, device=device)[None, :]
         # z of the optical axis for each metre of range, of a level camera
         self.z_of_range = torch.cos(self.elevation) * torch.cos(self.azimuth)
 
     def _uniform(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self._generator, device=self._device)
+        return torch.rand(*shape, generator=self._generator, device=self.device)
 
     def _normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self._generator, device=self._device)
+        return torch.randn(*shape, generator=self._generator, device=self.device)
 
     def _chance(self, count: int, share: float) -> Tensor:
         return self._uniform(count, 1, 1) < share
@@ -69,7 +69,7 @@ class Augmenter:
 
     def cut_rows(self, rows_seen: Tensor, count: int) -> Tensor:
         """Rows (B, rows, 1) that the survey covers: the sensor's, and sometimes fewer at the top."""
-        row = torch.arange(self.grid.rows, device=self._device)[None, :, None]
+        row = torch.arange(self.grid.rows, device=self.device)[None, :, None]
         top = (self._uniform(count, 1, 1) * 9 + 8).floor() * self._chance(count, self.settings.unseen_top_rows)
         return rows_seen.reshape(1, -1, 1) & (row >= top)
 
@@ -85,18 +85,32 @@ class Augmenter:
         bright = brightness(intensity * wrong, measured=keep, seen=keep & known)
         return self._planes(torch.where(keep, noisy, 0.0), height_m, rows_seen.expand_as(ranges), None, bright)
 
-    def query(self, ranges: Tensor, rgb: Tensor, height_m: Tensor, rows_seen: Tensor) -> Tensor:
-        """Planes (B, 6, rows, columns) of clean query views (B, rows, columns) with colour (B, 3, rows, columns) 0..255."""
+    def query(
+        self, ranges: Tensor, rgb: Tensor, height_m: Tensor, rows_seen: Tensor, *, seen: Tensor | None = None
+    ) -> Tensor:
+        """Planes (B, 6, rows, columns) of query views (B, rows, columns) with colour (B, 3, rows, columns) 0..255.
+
+        Args:
+            ranges: metres; clean, but where ``seen`` is given.
+            rgb: sRGB.
+            height_m: of the cameras above the ground (B).
+            rows_seen: rows that the survey covers.
+            seen: cells that the camera looks at (B, rows, columns), of depth that has its errors already: none are drawn.
+        """
         s, count = self.settings, len(ranges)
         blocked = ranges
         blocked = self._block(blocked, height_m, self._chance(count, s.blocked), 0.12, s.widest_block)
         blocked = self._block(blocked, height_m, self._chance(count, s.small_blocks), 0.03, 0.2)
-        z, measured = self._stereo(blocked * self.z_of_range, blocked > 0)
+        z, measured = blocked * self.z_of_range, blocked > 0
+        if seen is None:
+            z, measured = self._stereo(z, measured)
         observed = rows_seen.expand_as(ranges) & self._field_of_view(count)
+        if seen is not None:
+            observed = observed & seen
         reach = torch.where(
             self._chance(count, s.short_range),
             s.shortest_range_m + (self.grid.max_range_m - s.shortest_range_m) * self._uniform(count, 1, 1),
-            torch.full((count, 1, 1), self.grid.max_range_m, device=self._device),
+            torch.full((count, 1, 1), self.grid.max_range_m, device=self.device),
         )
         distance = z / self.z_of_range
         keep = (
@@ -148,7 +162,7 @@ class Augmenter:
         count, behind = len(rows), ranges[rows]
         width = (narrowest + (widest - narrowest) * self._uniform(count, 1, 1)) * self.grid.columns
         left = self._uniform(count, 1, 1) * (self.grid.columns + 0.6 * width) - 0.6 * width
-        column = torch.arange(self.grid.columns, device=self._device)[None, None, :]
+        column = torch.arange(self.grid.columns, device=self.device)[None, None, :]
         distance = 2.5 + 6.0 * self._uniform(count, 1, 1)
         facing = (self._uniform(count, 1, 1) - 0.5) * 1.6
         slant = torch.cos(self.azimuth - facing).clamp(min=0.25)
@@ -162,8 +176,8 @@ class Augmenter:
     def _field_of_view(self, count: int) -> Tensor:
         """Cells (B, rows, columns) that the camera looks at: narrower cameras, cut borders."""
         s = self.settings
-        row = torch.arange(self.grid.rows, device=self._device)[None, :, None]
-        column = torch.arange(self.grid.columns, device=self._device)[None, None, :]
+        row = torch.arange(self.grid.rows, device=self.device)[None, :, None]
+        column = torch.arange(self.grid.columns, device=self.device)[None, None, :]
         top = self._chance(count, s.narrow_rows) * self._uniform(count, 1, 1) * 10
         bottom = self._chance(count, s.narrow_rows) * self._uniform(count, 1, 1) * 10
         narrow = self._chance(count, s.narrow_columns)
@@ -181,13 +195,13 @@ class Augmenter:
         r, g, b = ((rgb[known] * balance)[:, k] for k in range(3))
         planes = torch.stack([(2 * b - r - g) / 6**0.5, (g - r) / 2**0.5], dim=1)
         planes = (planes + 3.0 * self._normal(*planes.shape)) * torch.exp(0.4 * self._normal(count, 1, 1, 1))
-        return torch.zeros(len(rgb), *planes.shape[1:], device=self._device).index_copy(0, known, planes)
+        return torch.zeros(len(rgb), *planes.shape[1:], device=self.device).index_copy(0, known, planes)
 
     def _planes(
         self, ranges: Tensor, height_m: Tensor, observed: Tensor, colour: Tensor | None, bright: Tensor
     ) -> Tensor:
         heights = torch.where(ranges > 0, ranges * torch.sin(self.elevation) + height_m.reshape(-1, 1, 1), 0.0)
-        planes = torch.zeros(len(ranges), len(PLANES), self.grid.rows, self.grid.columns, device=self._device)
+        planes = torch.zeros(len(ranges), len(PLANES), self.grid.rows, self.grid.columns, device=self.device)
         if colour is not None:
             planes[:, 1:3] = torch.where(observed[:, None], colour, 0.0)
         for plane, values in ((0, ranges), (3, heights), (4, observed), (5, bright)):

@@ -20,7 +20,8 @@ PAIR_REACH_M = 2.5
 class Batch:
     """Clean views of pairs: tensors (B, rows, columns), colour (B, 3, rows, columns), heights and positions (m).
 
-    ``survey_intensity`` is 0..1.
+    ``survey_intensity`` is 0..1; ``query_seen`` (B, rows, columns) are cells that the camera looks at, where depth comes from matching
+    and has its errors already, else None.
     """
 
     survey_ranges: Tensor
@@ -33,6 +34,7 @@ class Batch:
     survey_xy: Tensor
     query_xy: Tensor
     pairs: NDArray[np.int64]
+    query_seen: Tensor | None = None
 
     @property
     def images(self) -> int:
@@ -93,4 +95,5 @@ class City:
             tensor(views(pack.panoramas)), (tensor(views(pack.intensities)) / 255) ** 2, tensor(places[:, 3]),
             tensor(pack.ranges[chosen]), tensor(pack.rgb[chosen].transpose(0, 3, 1, 2)), tensor(queries[:, 3]),
             torch.from_numpy(np.array(pack.rows_seen)), tensor(places[:, :2]), tensor(queries[:, :2]), chosen,
+            None if pack.seen is None else torch.from_numpy(np.ascontiguousarray(pack.seen[chosen])),
         )  # fmt: skip

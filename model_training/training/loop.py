@@ -17,15 +17,18 @@ from torch.utils.tensorboard import SummaryWriter
 
 from model_training.datasets.files import read_bytes, reading
 from model_training.training.augment import Augmentation, Augmenter
-from model_training.training.batches import Batch, open_cities
+from model_training.training.batches import Batch, City, open_cities
 from model_training.training.encoder_net import EncoderNet, EncoderShape
+from model_training.training.from_onnx import net_of
 from model_training.training.losses import Side, hardest_triplet, paired_info_nce
 from model_training.training.memory import DescriptorMemory
 from model_training.training.precision import Precision, forward_in
 from service.errors import DatasetError
 from service.imaging.view_grid import PLANES, ViewGrid
+from service.localization.encoder import Encoder
 
 PAIRS_AT_ONCE = 16  # augmented together on a processor
+STATISTICS_BATCHES = 6  # whose views set the statistics of an encoder that was exported without them
 
 _LOSSES = {"info_nce": paired_info_nce, "triplet": hardest_triplet}
 
@@ -93,10 +96,11 @@ def train(
 ) -> EncoderNet:  # fmt: skip
     """Train an encoder on packs; the run's folder holds ``config.json``, ``checkpoint.pt`` and TensorBoard's log.
 
-    The first Ctrl-C saves a checkpoint and ends; the same call goes on from there.
+    The first Ctrl-C saves a checkpoint and ends; the same call goes on from there. ``start_from`` is a run's folder or an exported encoder.
 
     Raises:
         DatasetError: the run's folder belongs to another configuration.
+        EncoderError: ``start_from`` is a file, but no encoder of the configuration's shape.
         KeyboardInterrupt: after the checkpoint was saved.
     """
     grid, place = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns), device_of(device)
@@ -106,15 +110,20 @@ def train(
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     generator = torch.Generator(device=place).manual_seed(config.seed)
-    net = EncoderNet(config.encoder).to(place)
-    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
-    log_scale = torch.nn.Parameter(torch.tensor(float(np.log(1 / 0.07)), device=place))
-    optimiser = _optimiser([*net.parameters(), log_scale], config)
+    augment = Augmenter(config.augmentation, grid, generator, place)
     checkpoint = run / "checkpoint.pt"
-    first = 0
     cities = open_cities(packs, grid, turn_deg=config.turn_deg, pairs=config.pairs)
+    log_scale = torch.nn.Parameter(torch.tensor(float(np.log(1 / 0.07)), device=place))
+    net = EncoderNet(config.encoder)
+    if start_from is not None and not start_from.is_dir() and not (resume and checkpoint.exists()):
+        net = net_of(start_from, config.encoder, *_views_of_all(cities, config, augment, rng))
+        log_scale.data.fill_(float(np.log(config.largest_scale)))
+    net = net.to(place)
+    net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
+    optimiser = _optimiser([*net.parameters(), log_scale], config)
+    first = 0
     memories = [DescriptorMemory(len(city.pack.queries), config.encoder.descriptor, place) for city in cities]
-    if start_from is not None:
+    if start_from is not None and start_from.is_dir():
         before = read_checkpoint(start_from, place)
         net.load_state_dict(before["net"])
         log_scale.data.copy_(before["log_scale"])
@@ -128,7 +137,6 @@ def train(
         first = int(state["step"])
         for memory, kept in zip(memories, state["memories"], strict=True):
             memory.restore(kept)
-    augment = Augmenter(config.augmentation, grid, generator, place)
 
     def save(step: int) -> None:
         part = checkpoint.with_suffix(".part")
@@ -194,6 +202,18 @@ def train(
     return trained
 
 
+def _views_of_all(
+    cities: list[City], config: TrainingConfig, augment: Augmenter, rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Augmented planes and sides of ``STATISTICS_BATCHES`` batches, the cities in turn."""
+    planes, sides = [], []
+    for k in range(STATISTICS_BATCHES):
+        batch = cities[k % len(cities)].draw(config.pairs, rng)
+        planes.append(views_of(batch, augment, augment.device, blind=config.blind).cpu())
+        sides.append(torch.arange(len(planes[-1])) < len(batch.query_xy))
+    return torch.cat(planes), torch.cat(sides).float()
+
+
 def views_of(batch: Batch, augment: Augmenter, place: torch.device, *, blind: tuple[str, ...] = ()) -> torch.Tensor:
     """A batch as the network sees it: augmented planes, queries before survey views; queries without the planes in ``blind``.
 
@@ -209,8 +229,10 @@ def views_of(batch: Batch, augment: Augmenter, place: torch.device, *, blind: tu
             batch.survey_ranges[part].to(place), batch.survey_intensity[part].to(place),
             batch.survey_height_m[part].to(place), rows_seen,
         )  # fmt: skip
+        seen = None if batch.query_seen is None else batch.query_seen[part].to(place)
         planes[part] = augment.query(
-            batch.query_ranges[part].to(place), batch.query_rgb[part].to(place), batch.query_height_m[part].to(place), rows_seen
+            batch.query_ranges[part].to(place), batch.query_rgb[part].to(place), batch.query_height_m[part].to(place), rows_seen,
+            seen=seen,
         )  # fmt: skip
     planes[:count, [PLANES.index(name) for name in blind]] = 0.0
     return planes
@@ -287,7 +309,12 @@ def trained_on(run: Path) -> tuple[str, ...]:
 def _keep_packs(run: Path, packs: list[Path], start_from: Path | None) -> None:
     """Write down what the run learns from, and what the run before it did; refuse to go on with other cities."""
     path = run / "packs.json"
-    earlier = [] if start_from is None else read_packs(start_from)
+    if start_from is None:
+        earlier = []
+    elif start_from.is_dir():
+        earlier = read_packs(start_from)
+    else:
+        earlier = [f"encoder-{name}" for name in Encoder.open(start_from).trained_on]
     names = earlier + [folder.name for folder in packs]
     if path.exists() and read_packs(run) != names:
         raise DatasetError(f"{path} names other cities; take another --run folder, or remove this one", field="run")

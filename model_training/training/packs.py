@@ -22,11 +22,15 @@ from model_training.simulation.meshes import joined
 from model_training.simulation.scene import Scene
 from model_training.simulation.shading import Light, shade, to_srgb
 from model_training.simulation.traversal import lidar_pose, stations, upright_on
-from service.geometry.rigid import heading_of_body, rotation_x, rotation_y, rotation_z
+from model_training.training.matched_views import MatchedRig, RigOfADrive
+from service.geometry.rigid import heading_of_body, rotation_x, rotation_y, rotation_z, transform_from
 from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
 FORMAT = 2
+DRIVE_VIEWS = 60  # of matched pairs: then another rig, or the same rectified anew, under another sun
+#: Rays ahead that tell whether something stands right before the camera.
+_COARSE = ViewGrid(rows=8, columns=16).rays_level().reshape(-1, 3)
 OWN_DRIVES = 1000  # traversals of the training set: no dataset's drive has the same vehicles and people
 
 
@@ -40,11 +44,13 @@ class PackPlan:
     queries_a_place: int = 3
     lidar: str = "paper_32"
     size_m: tuple[float, float] = (300.0, 400.0)
+    rigs: tuple[MatchedRig, ...] = ()  # stereo rigs of the queries, in turn; none: clean depth
 
     @property
     def stem(self) -> str:
         """File name of the pack, without its ending."""
-        return f"pack{FORMAT}-{self.name}-{self.seed}-{self.places}x{self.queries_a_place}-{self.lidar}"
+        matched = "-matched" if self.rigs else ""
+        return f"pack{FORMAT}-{self.name}-{self.seed}-{self.places}x{self.queries_a_place}-{self.lidar}{matched}"
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,8 @@ class Pack:
     ``panoramas`` (P, rows, around) metres; ``intensities`` of the same shape, 255 times the root of 0..1;
     ``places`` (P, 4): x, y, heading of the panorama's x axis, LiDAR height (m, rad);
     ``rows_seen`` (rows); ``ranges`` (Q, rows, columns) metres; ``rgb`` (Q, rows, columns, 3); ``queries`` (Q, 4): x, y,
-    heading, camera height.
+    heading, camera height; ``seen`` (Q, rows, columns) cells that the camera looks at, where depth comes from matching and has
+    its errors already, else None.
     """
 
     panoramas: NDArray[np.float16]
@@ -64,6 +71,7 @@ class Pack:
     ranges: NDArray[np.float16]
     rgb: NDArray[np.uint8]
     queries: NDArray[np.float64]
+    seen: NDArray[np.bool_] | None = None
 
     @staticmethod
     def open(folder: Path) -> "Pack":
@@ -76,6 +84,7 @@ class Pack:
         return Pack(**{
             name: read_arrays(path, partial(np.load, path, mmap_mode="r", allow_pickle=False), remedy=remedy)
             for name, path in ((name, folder / f"{name}.npy") for name in Pack.__annotations__)
+            if name != "seen" or path.exists()
         })  # fmt: skip
 
 
@@ -131,11 +140,10 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
         R_map_level = T[:3, :3] @ level.R_level_sensor.T
         places[k] = (x, y, heading_of_body(np.vstack([np.c_[R_map_level, [0, 0, 0]], [0, 0, 0, 1]])), level.height_m)
     del survey
-    ranges, rgb, queries = _queries(city, plan, places, grid, rng)
     arrays: dict[str, NDArray[np.generic]] = {
         "panoramas": panoramas, "intensities": intensities, "places": places, "rows_seen": rows_seen_by(panoramas),
-        "ranges": ranges, "rgb": rgb, "queries": queries,
     }  # fmt: skip
+    arrays |= (_matched_queries if plan.rigs else _queries)(city, plan, places, grid, rng)
     part = folder.with_name(folder.name + ".part")
     part.mkdir(parents=True, exist_ok=True)
     for name, array in arrays.items():
@@ -143,9 +151,40 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
     part.rename(folder)
 
 
+def _matched_queries(
+    city: City, plan: PackPlan, places: NDArray[np.float64], grid: ViewGrid, rng: np.random.Generator
+) -> dict[str, NDArray[np.generic]]:
+    """Range and colour as stereo rigs give them; every rig and every ``DRIVE_VIEWS`` views are rectified anew."""
+    total = len(places) * plan.queries_a_place
+    ranges, queries = np.zeros((total, grid.rows, grid.columns), np.float16), np.zeros((total, 4))
+    rgb, seen = np.zeros((*ranges.shape, 3), np.uint8), np.zeros(ranges.shape, np.bool_)
+    order = rng.permutation(np.repeat(np.arange(len(places)), plan.queries_a_place))
+    scene, traversal = Scene(joined([city.static])), -1
+    for row, place in enumerate(order):
+        if row % DRIVE_VIEWS == 0:
+            rig = plan.rigs[row // DRIVE_VIEWS % len(plan.rigs)]
+            if row * plan.queries_a_place // total != traversal:
+                traversal = row * plan.queries_a_place // total
+                scene = Scene(joined([city.static, city.occupants(OWN_DRIVES + traversal)]))
+            drive = RigOfADrive(rig, scene, city, rng)
+        for _ in range(6):
+            x, y, heading = _near(places[place], rng)
+            roll, pitch = np.deg2rad(rng.normal(0, 0.6, 2))
+            R = upright_on(city, x, y, heading) @ rotation_y(pitch) @ rotation_x(roll)
+            T = transform_from(R, np.array([x, y, city.height(x, y) + rng.uniform(*rig.height_m)]))
+            met = scene.distances(T[:3, 3], (_COARSE @ R.T).astype(np.float32))
+            met = met[met > 0]
+            if len(met) and np.percentile(met, 40) > 1.5:
+                break
+        view = drive.view(T, grid)
+        ranges[row], rgb[row], seen[row] = view.ranges, view.rgb, view.seen
+        queries[row] = (x, y, view.heading_rad, view.height_m)
+    return {"ranges": ranges, "rgb": rgb, "queries": queries, "seen": seen}
+
+
 def _queries(
     city: City, plan: PackPlan, places: NDArray[np.float64], grid: ViewGrid, rng: np.random.Generator
-) -> tuple[NDArray[np.float16], NDArray[np.uint8], NDArray[np.float64]]:
+) -> dict[str, NDArray[np.generic]]:
     """Clean range and colour of query views, each ray of a cell its centre's, shaken a little."""
     drives = max(1, plan.queries_a_place)
     total = len(places) * plan.queries_a_place
@@ -177,7 +216,7 @@ def _queries(
             rgb[row] = np.clip(to_srgb(linear, gain), 0, 255).reshape(*shape, 3)
             queries[row] = (x, y, heading, height)
             row += 1
-    return ranges, rgb, queries
+    return {"ranges": ranges, "rgb": rgb, "queries": queries}
 
 
 def _near(place: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, float]:

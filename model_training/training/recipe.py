@@ -4,6 +4,12 @@ Seeds by use, so that nothing is tuned on what is reported (a test holds them ap
 training 2000-2999, calibrating confidence 3000-3999, evaluation 9000-9999; the paper's city is evaluation too.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+
+from model_training.simulation.plan import CameraPlan
+from model_training.simulation.stereo_pair import STEREOS
+from model_training.training.matched_views import MatchedRig
 from model_training.training.packs import PackPlan
 
 TRAINING_SEEDS = range(1000, 2000)
@@ -31,6 +37,46 @@ def stock_plans(cities: int) -> list[PackPlan]:
     return [PackPlan(seed=TRAINING_SEEDS[k], lidar=_LIDARS[k % len(_LIDARS)]) for k in range(cities)]
 
 
+#: Rigs whose pairs are rendered and matched. A car's as KITTI's at half the pixels, half the errors of rectification with it; a small
+#: robot's by two matchers; and a hand-held one.
+MATCHED_RIGS = (
+    MatchedRig(
+        CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(), (1.5, 1.8),
+        replace(STEREOS["sgbm"], focal_baseline_px_m=192.0, offset_px=0.28, vertical_px=0.2, roll_px=0.2),
+    ),
+    MatchedRig(
+        CameraPlan(width=480, height=270, horizontal_deg=90.0).pinhole(), (1.0, 1.6),
+        replace(STEREOS["sgbm"], focal_baseline_px_m=60.0, offset_px=0.2, vertical_px=0.15, roll_px=0.15),
+    ),
+    MatchedRig(
+        CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(), (1.5, 1.8),
+        replace(STEREOS["sgbm3way"], focal_baseline_px_m=192.0, offset_px=0.28, vertical_px=0.2, roll_px=0.2),
+    ),
+    MatchedRig(
+        CameraPlan(width=480, height=300, horizontal_deg=80.0).pinhole(), (0.7, 1.2),
+        replace(STEREOS["bm"], focal_baseline_px_m=76.0, offset_px=0.22, vertical_px=0.16, roll_px=0.16),
+    ),
+)  # fmt: skip
+#: The first seed of ``matched_plans``: after those of the stock recipe.
+_MATCHED_FROM = 40
+_MATCHED_LIDARS = ("hdl_64", "hdl_32", "hdl_64", "os1_64", "hdl_64", "vlp_16")
+
+
+#: Clean cities beside them in the matched recipe, so that what the encoder knows is not unlearnt.
+_CLEAN_BESIDE, _MATCHED = 6, 6
+
+
+def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
+    """Cities whose queries have depth of matched stereo pairs."""
+    return [
+        PackPlan(
+            seed=TRAINING_SEEDS[_MATCHED_FROM + k], places=1000, queries_a_place=1,
+            lidar=_MATCHED_LIDARS[k % len(_MATCHED_LIDARS)], rigs=MATCHED_RIGS,
+        )
+        for k in range(cities)
+    ]  # fmt: skip
+
+
 def watch_plans() -> list[PackPlan]:
     """One city that training is watched on."""
     return [PackPlan(seed=WATCH_SEEDS[0], places=900, queries_a_place=1)]
@@ -39,3 +85,11 @@ def watch_plans() -> list[PackPlan]:
 def paper_plans() -> list[PackPlan]:
     """The paper's city itself, for the encoder that is trained on it (its own drives and vehicles)."""
     return [PackPlan(seed=0, name="paper", places=2000)]
+
+
+#: Recipes by name, of the number of cities that the stock one is asked for.
+RECIPES: dict[str, Callable[[int], list[PackPlan]]] = {
+    "stock": stock_plans,
+    "matched": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans()],
+    "paper": lambda _: paper_plans(),
+}

@@ -206,7 +206,7 @@ def test_doubt_is_a_problem_where_the_format_has_no_word_for_it(
     from service.localization import localizer
     from service.localization.decide import Decision
 
-    monkeypatch.setattr(localizer, "decide", lambda *_: Decision("AMBIGUOUS", 0.4))
+    monkeypatch.setattr(localizer, "decide", lambda *_, **__: Decision("AMBIGUOUS", 0.4))
     monkeypatch.setattr(MapBundle, "calibration", calibration_of(), raising=False)
     refused = post(client, parts_of(), Accept="application/geopose+json")
     assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")

@@ -179,3 +179,23 @@ def test_the_least_of_nine_is_what_a_pooling_gives():
     values = torch.rand(3, 32, 128, generator=torch.Generator().manual_seed(4))
     pooled = -torch.nn.functional.max_pool2d(-values[:, None], 3, 1, 1)[:, 0]
     torch.testing.assert_close(least_of_nine(values), pooled, rtol=0, atol=0)
+
+
+def test_depth_of_matched_pairs_gets_no_drawn_errors():
+    noisy = {"disparity_noise_px": (0.5, 0.5), "scale_error": 0.05, "invented_depth": 1.0}
+    ranges, rgb, height, rows = clean()
+    seen = torch.ones_like(ranges, dtype=torch.bool)
+    planes = augmenter(**noisy).query(ranges, rgb, height, rows, seen=seen)
+    torch.testing.assert_close(plane(planes, "range_m"), ranges, rtol=1e-6, atol=0)
+    drawn = plane(augmenter(**noisy).query(ranges, rgb, height, rows), "range_m")
+    assert ((drawn - ranges).abs() > 0.1).any()
+
+
+def test_what_the_camera_does_not_see_is_not_observed():
+    ranges, rgb, height, rows = clean()
+    seen = torch.ones_like(ranges, dtype=torch.bool)
+    seen[:, :, :40] = False
+    planes = augmenter().query(ranges, rgb, height, rows, seen=seen)
+    for name in ("range_m", "observed", "brightness"):
+        assert not plane(planes, name)[:, :, :40].any(), name
+    assert plane(planes, "observed")[:, :, 40:].all()

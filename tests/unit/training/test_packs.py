@@ -1,21 +1,32 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs the extra `training`")
 
-from model_training.training import packs as module  # after the skip
-from model_training.training.packs import Pack, PackPlan, make_pack, make_packs, rows_seen_by
+from model_training.simulation.city import City  # after the skip
+from model_training.simulation.meshes import joined
+from model_training.simulation.plan import CameraPlan
+from model_training.simulation.scene import Scene
+from model_training.simulation.stereo_pair import STEREOS
+from model_training.simulation.traversal import upright_on
+from model_training.training import packs as module
+from model_training.training.matched_views import MatchedRig
+from model_training.training.packs import OWN_DRIVES, Pack, PackPlan, make_pack, make_packs, rows_seen_by
 from model_training.training.recipe import (
     CALIBRATION_SEEDS,
     EVALUATION_SEEDS,
+    RECIPES,
     TRAINING_SEEDS,
     WATCH_SEEDS,
+    matched_plans,
     paper_plans,
     stock_plans,
     watch_plans,
 )
+from service.imaging.view_grid import ViewGrid
 
 PLAN = PackPlan(seed=1002, places=6, queries_a_place=2, lidar="hdl_64", size_m=(60.0, 60.0))
 
@@ -60,7 +71,7 @@ def test_heights_are_those_of_sensors(pack):
 def test_one_seed_gives_one_pack(pack, grid, tmp_path):
     make_pack(PLAN, tmp_path / "again", grid)
     again = Pack.open(tmp_path / "again")
-    for name in Pack.__annotations__:
+    for name in set(Pack.__annotations__) - {"seen"}:
         np.testing.assert_array_equal(getattr(pack, name), getattr(again, name))
 
 
@@ -113,6 +124,56 @@ def test_the_stock_encoder_meets_no_city_that_a_bar_is_measured_on():
 
 def test_training_is_watched_on_cities_of_its_own():
     assert {plan.seed for plan in watch_plans()} <= set(WATCH_SEEDS)
+
+
+def test_cities_of_matched_pairs_are_none_of_the_stock_recipes():
+    matched = {plan.seed for plan in matched_plans(20)}
+    assert len(matched) == 20
+    assert matched <= set(TRAINING_SEEDS)
+    assert not matched & {plan.seed for plan in stock_plans(40)}
+    assert all(plan.rigs for plan in RECIPES["matched"](1)[-6:])
+
+
+RIG = MatchedRig(
+    CameraPlan(width=160, height=96, horizontal_deg=70.0).pinhole(), (1.4, 1.6),
+    replace(STEREOS["sgbm"], focal_baseline_px_m=60.0, offset_px=0.1, vertical_px=0.05, roll_px=0.05),
+)  # fmt: skip
+MATCHED = PackPlan(seed=1001, places=8, queries_a_place=1, size_m=(120.0, 120.0), rigs=(RIG,))
+
+
+@pytest.fixture(scope="module")
+def matched(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("matched") / MATCHED.stem
+    make_pack(MATCHED, folder, ViewGrid())
+    return Pack.open(folder)
+
+
+def test_matched_views_are_seen_by_a_camera_and_have_depth_within_it(matched):
+    assert matched.seen is not None
+    share = matched.seen.mean(axis=(1, 2))
+    # 70 of the grid's 90 degrees of azimuth, and elevations beyond the picture's +-22.8 do not occur
+    assert np.all((share > 0.6) & (share < 0.85))
+    assert not (matched.ranges[~matched.seen] > 0).any()
+    assert (matched.ranges[matched.seen] > 0).mean() > 0.4
+
+
+def test_matched_depth_errs_as_matching_does(matched):
+    """The pose is written down, so the true depth can be rendered: matching is near it, and not equal."""
+    city = City(seed=MATCHED.seed, name=MATCHED.name, size_m=MATCHED.size_m)
+    scene = Scene(joined([city.static, city.occupants(OWN_DRIVES)]))
+    rays = ViewGrid().rays_level().reshape(-1, 3)
+    errors = []
+    for found, (x, y, heading, height) in zip(matched.ranges, matched.queries, strict=True):
+        R = upright_on(city, x, y, heading)
+        true = scene.distances(np.array([x, y, city.height(x, y) + height]), (rays @ R.T).astype(np.float32))
+        both = (found.reshape(-1) > 0) & (true > 0) & (true < 15)
+        errors.append(np.abs(found.reshape(-1)[both] / true[both] - 1))
+    error = np.median(np.concatenate(errors))
+    assert 0.002 < error < 0.08
+
+
+def test_a_pack_without_matching_has_no_mask(pack):
+    assert pack.seen is None
 
 
 def test_the_papers_city_is_only_in_its_own_recipe():

@@ -1,0 +1,122 @@
+"""The network of an exported encoder, to train on: an encoder in a map bundle or in the package has no checkpoint.
+
+Export folds batch normalisation into the convolutions, and eight bits round their weights. Here each convolution takes the folded
+weights, and the statistics of its normalisation are set from views so that the layer says the same as the exported one, in training
+mode as in evaluation mode.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import numpy_helper
+from torch import Tensor, nn
+
+from model_training.training.encoder_net import EncoderNet, EncoderShape
+from service.errors import EncoderError
+from service.localization.encoder import Encoder
+
+Floats = NDArray[np.float32]
+
+
+def net_of(encoder: Path, shape: EncoderShape, planes: Tensor, side: Tensor) -> EncoderNet:
+    """Read an encoder that ``export`` or ``quantise`` wrote.
+
+    Args:
+        encoder: ONNX file.
+        shape: that it must have.
+        planes: views (B, 6, rows, columns) that the statistics of batch normalisation are taken over; several hundred of both sides.
+        side: 0 for survey views, 1 for queries (B).
+
+    Raises:
+        EncoderError: the file is no encoder of this architecture and shape.
+    """
+    opened, layers = Encoder.open(encoder), _layers(encoder)
+    found = _shape(opened, layers, encoder)
+    if found != shape:
+        raise _foreign(encoder, f"it has the shape {found}, not {shape}")
+    net = EncoderNet(shape)
+    convolutions = [module for module in net.modules() if isinstance(module, nn.Conv2d | nn.Linear)]
+    blocks = [module for module in net.modules() if isinstance(module, nn.Sequential)]
+    biases: dict[nn.Module, Tensor] = {}
+    for module, (weight, bias) in zip(convolutions, layers, strict=True):
+        if module.weight.shape != weight.shape:
+            raise _foreign(
+                encoder, f"a layer of {tuple(weight.shape)} stands where {tuple(module.weight.shape)} is expected"
+            )
+        module.weight.data.copy_(torch.from_numpy(weight))
+        if module.bias is not None:
+            module.bias.data.copy_(torch.from_numpy(bias))
+        else:
+            biases[module] = torch.from_numpy(bias)
+    hooks = [_norm(block).register_forward_pre_hook(_matching(biases[block[0]])) for block in blocks]
+    net.eval()
+    with torch.no_grad():  # front to back: a layer's statistics are set before the next one's input is computed
+        net(planes, side)
+    for hook in hooks:
+        hook.remove()
+    return net
+
+
+def _matching(bias: Tensor):  # type: ignore[no-untyped-def]  # torch's hook type is private
+    """A hook that sets a normalisation so that it adds ``bias`` to its input and changes nothing else."""
+
+    def hook(norm: nn.BatchNorm2d, inputs: tuple[Tensor]) -> None:
+        mean, variance = inputs[0].mean(dim=(0, 2, 3)), inputs[0].var(dim=(0, 2, 3))
+        for known, value in (
+            (norm.running_mean, mean),
+            (norm.running_var, variance),
+            (norm.weight, torch.sqrt(variance + norm.eps)),
+            (norm.bias, bias + mean),
+        ):
+            if known is None:
+                raise TypeError("the normalisation keeps no statistics")
+            known.data.copy_(value)
+
+    return hook
+
+
+def _norm(block: nn.Sequential) -> nn.BatchNorm2d:
+    norm = block[1]
+    if not isinstance(norm, nn.BatchNorm2d):
+        raise TypeError(f"{norm} is no batch normalisation")
+    return norm
+
+
+def _layers(encoder: Path) -> list[tuple[Floats, Floats]]:
+    """Weight and bias of every layer with weights, in their order, as float32."""
+    graph = onnx.load(encoder).graph
+    known = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and node.input[0] in known:
+            values, scale, zero = (known[name] for name in node.input)
+            along = (-1,) + (1,) * (values.ndim - 1) if scale.ndim else ()
+            known[node.output[0]] = (
+                (values.astype(np.float32) - zero.astype(np.float32).reshape(along)) * scale.reshape(along)
+            ).astype(np.float32)  # fmt: skip
+    found = []
+    for node in graph.node:
+        if node.op_type in ("Conv", "Gemm"):
+            if any(name not in known for name in node.input[1:3]) or len(node.input) != 3:
+                raise _foreign(encoder, f"{node.name} has no constant weights and bias")
+            weight, bias = (known[name].astype(np.float32) for name in node.input[1:3])
+            found.append((weight, bias))
+    return found
+
+
+def _shape(encoder: Encoder, layers: list[tuple[Floats, Floats]], path: Path) -> EncoderShape:
+    if len(layers) != 12:
+        raise _foreign(path, f"it has {len(layers)} layers with weights, not 12")
+    outputs = [len(bias) for _, bias in layers]
+    return EncoderShape(
+        rows=encoder.rows, columns=encoder.columns, widths=(outputs[0], outputs[1], outputs[6], outputs[9]),
+        narrow=outputs[10], descriptor=outputs[11],
+    )  # fmt: skip
+
+
+def _foreign(path: Path, why: str) -> EncoderError:
+    return EncoderError(
+        f"{path} is no encoder that can be trained on: {why}; take one that `streetfix export` wrote", field="encoder"
+    )
