@@ -20,24 +20,30 @@ class Drive:
     """A recorded drive.
 
     Attributes:
-        name: of an odometry sequence two digits, of a raw drive its date and number.
+        name: of an odometry sequence two digits, of a raw drive and of KITTI-360's its date and number.
         kind: importer that reads it.
         folder: what the importer takes.
         packed: it must be unpacked first (``unpack.py`` beside it).
     """
 
     name: str
-    kind: Literal["kitti-odometry", "kitti-raw"]
+    kind: Literal["kitti-odometry", "kitti-raw", "kitti-360"]
     folder: Path
     packed: bool = False
 
 
 def drives_below(root: Path) -> list[Drive]:
-    """Odometry sequences (``sequences/NN`` with poses) and raw drives (``*_sync``), by name; a drive that is there twice, once."""
+    """Odometry sequences (``sequences/NN``), raw drives (``*_sync``) and KITTI-360's, by name; a drive that is there twice, once."""
     found = dict[str, Drive]()
     for folder in sorted(root.rglob("sequences/[0-9][0-9]")):
         if (folder / "velodyne").is_dir() and (folder / "image_3").is_dir():
             found.setdefault(folder.name, Drive(folder.name, "kitti-odometry", folder))
+    for folder in sorted(root.rglob("data_3d_raw/*_sync")):
+        beside = folder.parent.parent
+        pictures = beside / "data_2d_raw" / folder.name / "image_01" / "data_rect"
+        if pictures.is_dir() and (beside / "data_poses" / folder.name / "poses.txt").is_file():
+            name = folder.name.removesuffix("_sync")
+            found.setdefault(name, Drive(name, "kitti-360", folder))
     for folder in sorted(root.rglob("*_sync")):
         scans = folder / "velodyne_points" / "data"
         if not scans.is_dir() or not (folder / "image_03").is_dir() or not (folder / "oxts").is_dir():
@@ -62,4 +68,8 @@ def missing(drives: Sequence[Drive]) -> list[str]:
     ]
     wanted = dict.fromkeys(name for mapped, asked, _ in OTHER_DAY for name in (mapped, asked))
     lines += [f"raw drive {name} (velodyne_points, image_02, image_03, oxts)" for name in wanted if name not in names]
-    return [*lines, "KITTI-360: there is no importer for its layout yet"]
+    if not any(drive.kind == "kitti-360" for drive in drives):
+        lines.append(
+            "any drive of KITTI-360 (data_3d_raw, data_2d_raw with image_00 and image_01, data_poses, calibration)"
+        )
+    return lines

@@ -105,6 +105,12 @@ def _kitti_odometry(source: Path, settings: OpenSettings) -> Recording:
     return open_kitti_odometry(source, depth=_kitti_depth(settings.depth), vertical_deg=settings.kitti_vertical_deg)
 
 
+def _kitti_360(source: Path, settings: OpenSettings) -> Recording:
+    from model_training.importing.kitti_360 import open_kitti_360
+
+    return open_kitti_360(source, depth="none" if settings.depth == "lidar" else "sgbm")
+
+
 def _clouds(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.clouds import open_clouds
 
@@ -149,6 +155,7 @@ _KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
 KINDS: dict[str, Kind] = {
     "kitti-raw": Kind(_kitti_raw, _KITTI, frozenset({"vertical_correction"})),
     "kitti-odometry": Kind(_kitti_odometry, _KITTI, frozenset({"vertical_correction"})),
+    "kitti-360": Kind(_kitti_360, ("sgbm", "lidar")),
     "rosbag": Kind(_rosbag, ("recorded", "lidar"), frozenset({"topics", "extrinsics", "camera", "rectified"})),
     "carla": Kind(_carla, ("recorded", "lidar")),
     "clouds": Kind(_clouds, ("recorded",)),

@@ -5,19 +5,18 @@ taken (``image_00``, ``image_01``). Depth that lies beside is that of KITTI's
 depth benchmark, ``proj_depth/groundtruth/image_02``.
 """
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.datasets.files import read_bytes
 from model_training.datasets.layouts import SCANS_AT_REST
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
+from model_training.importing.kitti_times import stamps_of, turn_of
 from model_training.importing.oxts import read_oxts
-from model_training.importing.spinning import KITTI_VERTICAL_DEG, period_of
+from model_training.importing.spinning import KITTI_VERTICAL_DEG
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 from service.geometry.rigid import Transform, transform_from
@@ -50,23 +49,16 @@ def open_kitti_raw(source: Path, *, depth: KittiDepth, vertical_deg: float = KIT
         raise DatasetError(f"{drive}/velodyne_points/data has no scan; add the scans", field="velodyne_points")
     numbers = sorted(scans.keys() | left.keys())
     times = drive / "velodyne_points" / "timestamps.txt"
-    stamps = _stamps(times, numbers) or {n: n / RATE_HZ for n in numbers}
+    stamps = stamps_of(times, numbers) or {n: n / RATE_HZ for n in numbers}
     at_rest = (drive / SCANS_AT_REST).is_file()
     frames = tuple(
         KittiFrame(f"{n:010d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers
     )
     poses, georeference = _poses(drive)
     return KittiSequence(
-        "kitti-raw", drive, frames, calibration, depth, poses, georeference, turn_s=None if at_rest else _turn_s(times),
+        "kitti-raw", drive, frames, calibration, depth, poses, georeference, turn_s=None if at_rest else turn_of(times),
         vertical_deg=0.0 if at_rest else vertical_deg,
     )  # fmt: skip
-
-
-def _turn_s(times: Path) -> float:
-    """Time of one turn, by the stamps of all scans of the drive, those that an extract leaves out among them."""
-    count = len(times.read_bytes().splitlines()) if times.is_file() else 0
-    stamps = _stamps(times, list(range(count))) or {}
-    return period_of(np.array([stamps[n] for n in sorted(stamps)]), otherwise_s=1 / RATE_HZ)
 
 
 def _drive(source: Path) -> Path:
@@ -116,30 +108,8 @@ def _poses(drive: Path) -> tuple[Trajectory | None, dict[str, Any] | None]:
     files = numbered(drive / "oxts" / "data", (".txt",))
     if not files:
         return None, None
-    stamps = _stamps(drive / "oxts" / "timestamps.txt", sorted(files)) or {n: n / RATE_HZ for n in files}
+    stamps = stamps_of(drive / "oxts" / "timestamps.txt", sorted(files)) or {n: n / RATE_HZ for n in files}
     T_lidar_imu = _rigid(_calibration_file(drive, "calib_imu_to_velo.txt"))
     T_map_imu, georeference = read_oxts([files[n] for n in sorted(files)])
     at: NDArray[np.float64] = np.array([stamps[n] for n in sorted(files)])
     return Trajectory(at, T_map_imu, str(drive / "oxts")).moved_by(T_lidar_imu), georeference
-
-
-def _stamps(path: Path, numbers: list[int]) -> dict[int, float] | None:
-    """Seconds by a frame's number, or None where no times were recorded."""
-    if not path.is_file():
-        return None
-    lines = read_bytes(path).decode("ascii", errors="replace").splitlines()
-    if numbers and numbers[-1] >= len(lines):
-        raise DatasetError(
-            f"{path} has {len(lines)} lines, and there is a frame {numbers[-1]:010d}; take the file from the recording again",
-            field=path.name,
-        )
-    stamps = {}
-    for number in numbers:
-        text = lines[number].strip()
-        try:
-            whole, _, nanoseconds = text.partition(".")
-            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            stamps[number] = moment.timestamp() + float(f"0.{nanoseconds or 0}")
-        except ValueError as error:
-            raise DatasetError(f"{path}, line {number + 1}: no time: {text[:40]!r}", field=path.name) from error
-    return stamps

@@ -49,6 +49,14 @@ def test_drives_are_found_wherever_they_lie(tmp_path):
     assert [(each.name, each.kind, each.packed) for each in found] == [
         ("05", "kitti-odometry", False), ("2011_09_30_drive_0027", "kitti-raw", False),
     ]  # fmt: skip
+    drive(tmp_path, "360/data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data")
+    drive(tmp_path, "360/data_2d_raw/2013_05_28_drive_0000_sync/image_01/data_rect")
+    assert drives_below(tmp_path) == found  # no poses, nothing to measure
+    drive(tmp_path, "360/data_poses/2013_05_28_drive_0000_sync")
+    (tmp_path / "360/data_poses/2013_05_28_drive_0000_sync/poses.txt").touch()
+    assert [each.name for each in drives_below(tmp_path) if each.kind == "kitti-360"] == ["2013_05_28_drive_0000"]
+    assert not any("KITTI-360" in line for line in missing(drives_below(tmp_path)))
+    assert any("KITTI-360" in line for line in missing(found))
     words = missing(found)
     assert [name for name in PUBLISHED if any(f"sequence {name} " in line for line in words)] == [
         name for name in PUBLISHED if name != "05"

@@ -10,7 +10,7 @@ from service.geometry.camera import PinholeCamera
 
 
 def test_an_unknown_format_is_refused_with_those_there_are(tmp_path):
-    with pytest.raises(DatasetError, match="'ros3' is not known; there is: carla, clouds, kitti-odometry"):
+    with pytest.raises(DatasetError, match="'ros3' is not known; there is: carla, clouds, kitti-360, kitti-odometry"):
         open_recording("ros3", tmp_path, OpenSettings())
 
 

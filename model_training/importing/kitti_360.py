@@ -1,0 +1,98 @@
+"""KITTI-360's layout: ``data_2d_raw``, ``data_3d_raw`` and ``data_poses`` side by side, a folder a drive in each, and ``calibration``.
+
+Liao et al., KITTI-360, TPAMI 2022. Pictures are those of the rectified perspective pair, ``image_00`` and ``image_01``. Poses are given for
+the moments at which the vehicle moved; scans are not compensated for its motion.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from model_training.datasets.files import read_bytes
+from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
+from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
+from model_training.importing.kitti_times import stamps_of, turn_of
+from model_training.importing.trajectory import Trajectory
+from service.errors import DatasetError
+from service.geometry.rigid import Transform, inverse, transform_from
+
+_PICTURES = (".png", ".jpg")
+_PARTS = ("data_3d_raw", "data_2d_raw", "data_poses")
+
+
+def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
+    """Open a drive. A scan's stamp is the moment when the laser faces ahead, and its points' times follow from their azimuths.
+
+    Args:
+        source: the drive's folder in one of ``data_3d_raw``, ``data_2d_raw`` and ``data_poses``.
+        depth: what a picture's depth comes from; depth stored beside the pictures does not occur in this layout.
+
+    Raises:
+        DatasetError: there is no scan or no calibration, or a file of them is broken.
+    """
+    root, name = source.resolve().parent.parent, source.resolve().name
+    scans_of = root / "data_3d_raw" / name / "velodyne_points"
+    pictures = root / "data_2d_raw" / name
+    scans = numbered(scans_of / "data", (".bin",))
+    if not scans:
+        raise DatasetError(
+            f"{source}: a drive's folder in {', '.join(_PARTS)} is wanted, and {scans_of}/data has no scan",
+            field="source",
+        )
+    left, right = (numbered(pictures / f"image_{eye}" / "data_rect", _PICTURES) for eye in ("00", "01"))
+    calibration, T_lidar_cam0 = _calibration(root / "calibration")
+    numbers = sorted(scans.keys() | left.keys())
+    times = scans_of / "timestamps.txt"
+    stamps = stamps_of(times, numbers) or {n: n / RATE_HZ for n in numbers}
+    frames = tuple(KittiFrame(f"{n:010d}", stamps[n], scans.get(n), left.get(n), right.get(n), None) for n in numbers)
+    poses = _poses(root / "data_poses" / name / "poses.txt", stamps, _mounting(root / "calibration", T_lidar_cam0))
+    return KittiSequence("kitti-360", source, frames, calibration, depth, poses, turn_s=turn_of(times))
+
+
+def _calibration(folder: Path) -> tuple[KittiCalibration, Transform]:
+    """Of the left perspective camera, and T_lidar_camera before rectification."""
+    path = folder / "perspective.txt"
+    found = read_matrices(
+        path, {"P_rect_00": (3, 4), "P_rect_01": (3, 4), "R_rect_00": (3, 3)}, optional=frozenset({"P_rect_01"})
+    )
+    T_lidar_cam0 = _rigid(folder / "calib_cam_to_velo.txt")
+    Tr = inverse(T_lidar_cam0)[:3]
+    calibration = calibration_from(path, P2=found["P_rect_00"], P3=found.get("P_rect_01"), R0=found["R_rect_00"], Tr=Tr)
+    return calibration, T_lidar_cam0
+
+
+def _mounting(folder: Path, T_lidar_cam0: Transform) -> Transform:
+    """T_pose_lidar: poses are those of the inertial system."""
+    rows = read_matrices(folder / "calib_cam_to_pose.txt", {"image_00": (3, 4)})["image_00"]
+    return transform_from(rows[:, :3], rows[:, 3]) @ inverse(T_lidar_cam0)
+
+
+def _rigid(path: Path) -> Transform:
+    """A file with the twelve numbers of one transform."""
+    try:
+        rows = np.array(read_bytes(path).decode("ascii").split(), np.float64).reshape(3, 4)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise DatasetError(
+            f"{path}: not the 12 numbers of a transform; take the file from the recording again", field=path.name
+        ) from error
+    return transform_from(rows[:, :3], rows[:, 3])
+
+
+def _poses(path: Path, stamps: dict[int, float], T_pose_lidar: Transform) -> Trajectory | None:
+    """T_map_lidar at those moments that have a frame here."""
+    if not path.is_file():
+        return None
+    poses, times = [], []
+    for number, line in enumerate(read_bytes(path).decode("ascii", errors="replace").splitlines(), 1):
+        try:
+            frame, *values = line.split()
+            rows = np.array(values, np.float64).reshape(3, 4)
+            stamp = stamps.get(int(frame))
+        except ValueError as error:
+            raise DatasetError(
+                f"{path}, line {number}: not a frame's number and the 12 numbers of its pose", field=path.name
+            ) from error
+        if stamp is not None:
+            poses.append(transform_from(rows[:, :3], rows[:, 3]) @ T_pose_lidar)
+            times.append(stamp)
+    return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4), str(path))

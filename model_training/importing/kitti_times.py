@@ -1,0 +1,44 @@
+"""Times of a recording in KITTI's raw layouts: a line a frame, those that an extract leaves out among them."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from model_training.datasets.files import read_bytes
+from model_training.importing.kitti_sequence import RATE_HZ
+from model_training.importing.spinning import period_of
+from service.errors import DatasetError
+
+
+def turn_of(times: Path) -> float:
+    """Time of one turn of the LiDAR (s), by the stamps of all scans of the drive, those that an extract leaves out among them."""
+    count = len(times.read_bytes().splitlines()) if times.is_file() else 0
+    stamps = stamps_of(times, list(range(count))) or {}
+    return period_of(np.array([stamps[n] for n in sorted(stamps)]), otherwise_s=1 / RATE_HZ)
+
+
+def stamps_of(path: Path, numbers: list[int]) -> dict[int, float] | None:
+    """Seconds by a frame's number, or None where no times were recorded.
+
+    Raises:
+        DatasetError: a line is no time, or there are fewer lines than frames.
+    """
+    if not path.is_file():
+        return None
+    lines = read_bytes(path).decode("ascii", errors="replace").splitlines()
+    if numbers and numbers[-1] >= len(lines):
+        raise DatasetError(
+            f"{path} has {len(lines)} lines, and there is a frame {numbers[-1]:010d}; take the file from the recording again",
+            field=path.name,
+        )
+    stamps = {}
+    for number in numbers:
+        text = lines[number].strip()
+        try:
+            whole, _, nanoseconds = text.partition(".")
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+            stamps[number] = moment.timestamp() + float(f"0.{nanoseconds or 0}")
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {number + 1}: no time: {text[:40]!r}", field=path.name) from error
+    return stamps
