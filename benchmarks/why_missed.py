@@ -45,115 +45,110 @@ def explain(rows: Iterable[dict[str, Any]], reasons: Mapping[str, Reason] | None
 
 
 _LOOK_ALIKES = (
-    "look-alike streets: the right place is among the ten nearest in most of the missed queries; tried: a wider trunk, look-alike "
-    "batches, narrower turns, density ranking, smoothing, the raw image beside, brightness (+3 on stereo), a second round (+2), "
-    "no stale negatives and a better level of the picture (+1.5 precise, +3 stereo)"
+    "Streets that look alike. The right place is among the ten nearest in most of the missed queries. Tried without gain: a wider "
+    "trunk, narrower turns, density ranking, smoothing, the raw image beside. These helped: batches of look-alikes, brightness (3 "
+    "points by stereo), a second round (2), no stale negatives with a better level of the picture (1.5 precise, 3 stereo)"
 )
 _BORDERS = (
-    "of 80 streets told wrongly 32 have their answer within 5 m, across a street's border (2 within 1 m); the rest are look-alikes; "
-    "tried: another temperature of the vote (nothing), the heaviest cluster's street instead of the vote (+0.5 points in four other "
-    "cities, nothing here)"
+    "Of 80 streets told wrongly, 32 have their answer within 5 m, across a street's border (2 within 1 m). The rest are streets "
+    "that look alike. Another temperature of the vote changed nothing. The heaviest cluster's street instead of the vote gained "
+    "half a point in four other cities, and nothing here"
 )
 _OVER_BARE = (
     "medians of runs differ by up to 10 %: full REST 0.97 to 1.13, retrieval REST 1.14 to 1.27, gRPC 1.15 to 1.29. A full request "
-    "takes 29 ms. Of that the event loop takes 1.0 ms, splitting the body 0.12 to 0.2 ms, writing the answer 0.12 to 0.28 ms, and the"
-    " framework's own dispatch 0.1 ms. These changes gained nothing: httptools and uvloop, fewer copies, no proxy headers. Nor did "
-    "bodies in one piece that the system holds until they are whole. Nor did other intervals of thread switches and of garbage "
+    "takes 29 ms. Of that the event loop takes 1.0 ms, splitting the body 0.12 to 0.2 ms, writing the answer 0.12 to 0.28 ms, and "
+    "the framework's own dispatch 0.1 ms. These changes gained nothing: httptools and uvloop, fewer copies, no proxy headers. Nor "
+    "did bodies in one piece that the system holds until they are whole. Nor did other intervals of thread switches and of garbage "
     "collection, or one arena of malloc. Parsing the headers of parts once gained 0.1 ms. Answering in the loop's thread is ruled "
     "out, since a stuck request would stop all others. Next: fewer reads of a body, each of which wakes the loop while the worker "
     "computes"
 )
 _OLD_0013 = (
-    "of the code before poses were mended, confidence was fitted anew and places were verified. This drive may be measured once a day, and "
-    "had its run before. By the same changes drive 0005 went from 0.00 to 1.00 accepted and within 1 m"
+    "of the code before poses were mended, confidence was fitted anew and places were verified. This drive may be measured once a "
+    "day, and had its run before. By the same changes drive 0005 went from 0.00 to 1.00 accepted and within 1 m"
 )
 _PEERS = (
-    "the best peer is MLServer. With eight clients its processor time is 35.3 ms for a full request and 10.0 ms for retrieval. Ours is "
-    "38.2 and 11.6 ms. The others take 39.5 to 40.4 and 11.7 to 13.2 ms. MLServer's handler runs in the event loop's own thread, as its "
-    "documentation advises without workers, so it changes no thread. Ours hands work to another thread. So health and refusals are "
-    "answered meanwhile, and a stuck request stops no other. That the change of threads is the difference is a guess, not measured"
+    "the best peer is MLServer. With eight clients its processor time is 35.3 ms for a full request and 10.0 ms for retrieval. Ours "
+    "is 38.2 and 11.6 ms. The others take 39.5 to 40.4 and 11.7 to 13.2 ms. MLServer's handler runs in the event loop's own thread, "
+    "as its documentation advises without workers, so it changes no thread. Ours hands work to another thread. So health and "
+    "refusals are answered meanwhile, and a stuck request stops no other. That the change of threads is the difference is a guess, "
+    "not measured"
 )
 WHY_MISSED: dict[str, Reason] = {
     "raw.unseen.precise.recall_at_1_5m": Reason(
         0.56587,
-        "asked as our own method asks, levelled and at three turns; seen straight on, as the prototype asked (0.29), it finds as many as "
-        "raw.unseen.precise.straight says; tried: cities of 600 x 400 m (raw.large: 0.46, ours 0.987; four hard conditions would miss "
-        "their bars there), in which the bar is not reached either",
+        "Queries are levelled and asked at three turns, as our own are. Asked straight ahead, as the prototype asked (0.29), the "
+        "raw image finds what raw.unseen.precise.straight says. Cities of 600 x 400 m do not reach the bar either (raw.large 0.46, "
+        "ours 0.987), and four hard conditions would miss their bars there",
     ),
     "retrieval.paper_city.precise.street_accuracy": Reason(0.97444, _BORDERS),
     "retrieval.paper_city.precise.recall_at_10_5m": Reason(
         0.99553,
-        "14 of 3,130 have no view of their place among the ten nearest places, 7 of them in one canyon of 40 m with smooth walls on "
-        "both sides",
+        "14 of 3,130 have no view of their place among the ten nearest places. 7 of them stand in one canyon of 40 m with smooth "
+        "walls on both sides",
     ),
     "retrieval.paper_city.stereo.street_accuracy": Reason(0.941853, _LOOK_ALIKES),
     "retrieval.paper_city.stereo.recall_at_1_5m": Reason(0.93994, _LOOK_ALIKES),
     "full.unseen.precise.within_0_5_m": Reason(
         0.9883333,
-        "counts are of the run before, whose value was 0.989. "
-        "19 of 3,000 are more than 1 m off when forced, 14 of them in one of the three cities, 17 with their place among the ten nearest "
-        "but only 5 with a right pose among the four candidates that are kept, 8 by 1 to 2 m; 13 more are 0.5 to 1 m off, and one right "
-        "one is refused; tried last: rays, brightness as a judge, looking around (of exact pictures 2 % moved: not used), less weight for "
-        "what may have moved; next: brightness where candidates are still chosen by few points",
+        "Counts are of the run before, whose value was 0.989. 19 of 3,000 are more than 1 m off when forced. 14 of them lie in one "
+        "of the three cities. 17 have their place among the ten nearest, but only 5 a right pose among the four candidates that are "
+        "kept. 13 more are 0.5 to 1 m off, and one right one is refused. Tried last: rays, brightness as a judge, less weight for "
+        "what may have moved. Next: brightness where candidates are still chosen by few points",
     ),
     "full.unseen.stereo.within_1_m": Reason(
         0.97,
-        "counts are of the run before, whose value was 0.9717. "
-        "73 of 3,000 are more than 1 m off when forced, 59 of them with their place among the ten nearest but only 25 with a right pose "
-        "among the four candidates that are kept, 26 by 1 to 2 m; 12 right ones are refused; looking around brought answers within 0.5 m "
-        "(0.945 to 0.952), and of those beyond 1 m two; tried: a second round, other places looked around too, other weights of "
-        "brightness (nothing, decision log); next: brightness where candidates are still chosen by few points",
+        "Counts are of the run before, whose value was 0.9717. 73 of 3,000 are more than 1 m off when forced. 59 have their place "
+        "among the ten nearest, but only 25 a right pose among the four candidates that are kept. 12 right ones are refused. Tried: "
+        "a second round, other places looked around too, other weights of brightness (decision log). Next: brightness where "
+        "candidates are still chosen by few points",
     ),
     "full.paper_city.precise.street_accuracy": Reason(
         0.9897764,
-        "counts are of the run before, whose value was 0.9901. "
-        "31 of 3,130 count as wrong: 24 refused ones, 4 of them right, and 7 accepted, 5 of these within 1 m but across a street's "
-        "border; of the 26 that are more than 1 m off when forced (20 of them in another place) the right place is among the ten nearest "
-        "in 17 and the right pose among the four candidates in 8",
+        "Counts are of the run before, whose value was 0.9901. 31 of 3,130 count as wrong. 24 are refused, 4 of them right. 7 are "
+        "accepted, 5 of these within 1 m but across a street's border. Of 26 that are more than 1 m off when forced, 17 have the "
+        "right place among the ten nearest, and 8 the right pose among the four candidates",
     ),
     "full.paper_city.precise.mean_distance_error_m": Reason(
         0.173013,
-        "counts are of the run before, whose value was 0.161. "
-        "three accepted answers are more than 5 m off; without them the mean is 0.055 m",
+        "Counts are of the run before, whose value was 0.161. Three accepted answers are more than 5 m off. "
+        "Without them the mean is 0.055 m",
     ),
     "full.paper_city.precise.forced_mean_distance_error_m": Reason(
         0.7827492,
-        "counts are of the run before, whose value was 0.7458. "
-        "20 answers are 108 m off in the mean: that is 0.69 m of it",
+        "Counts are of the run before, whose value was 0.7458. 20 answers are 108 m off in the mean: that is 0.69 m of it",
     ),
     "full.paper_city.stereo.street_accuracy": Reason(
         0.9664537,
-        "counts are of the run before, whose value was 0.9661. "
-        "74 of 3,130 answers are in another place when forced; 82 are refused, 21 of them right",
+        "Counts are of the run before, whose value was 0.9661. 74 of 3,130 answers are in another place when forced. 82 are "
+        "refused, 21 of them right",
     ),
     "doubt.covariance_95_coverage": Reason(
         0.8553265,
-        "counts are of the run before, whose value was 0.8525. "
-        "tails: 2 to 4 % of the answers are off by more than three deviations along the street, across it or in heading (0.3 % should "
-        "be), and of the others too many lie within one (0.70 to 0.78 for 0.68), so no factor for all mends it: full pose by stereo, 9.1 "
-        "% lie above the bounds and 5.6 % below; tried: patches that disagree (helped), figures of the query, the spread of nearby "
-        "candidates, factors by axis fitted anew on three calibration cities, how far rays moved the pose, a scale told by the evidence "
-        "of the answer (nothing), all 18 parameters fitted anew to answers as they are now (0.834 instead of 0.840 at worst in the "
-        "calibration cities); next: halves of the picture registered apart",
+        "Counts are of the run before, whose value was 0.8525. 2 to 4 % of the answers are off by more than three deviations along "
+        "the street, across it or in heading (0.3 % should be). Of the others too many lie within one deviation (0.70 to 0.78, for "
+        "0.68), so one factor for all does not mend it. Patches that disagree helped. These did not: figures of the query, the "
+        "spread of nearby candidates, factors by axis fitted on three calibration cities, how far rays moved the pose, a scale told "
+        "by the evidence of the answer. Next: halves of the picture registered apart",
     ),
     "doubt.sigma_coverage_gap": Reason(
         0.1252474,
-        "counts are of the run before, whose value was 0.09299. "
-        "along the street by stereo tails (see doubt.covariance_95_coverage): 0.776 lie within one deviation where 0.683 should; heights, "
-        "with a precise camera: how far a map's own are off differs from city to city (0.015 to 0.022 m in the calibration cities), and "
-        "one floor stands for all; next: a map's own errors told by its build",
+        "Counts are of the run before, whose value was 0.09299. Along the street by stereo 0.776 lie within one deviation where "
+        "0.683 should: tails, see doubt.covariance_95_coverage. With a precise camera it is heights. How far a map's own heights "
+        "are off differs from city to city (0.015 to 0.022 m in calibration), and one floor stands for all. Next: a map's own "
+        "errors told by its build",
     ),
     "sequence.no_landmark.ambiguous": Reason(
         0.9124088,
-        "0.956 with the calibration before, which held. The calibration now also knows cameras that see less of the view grid. It is surer "
-        "of sequences between two landmarks. Six of 137 more are no longer ambiguous. Not looked into yet; next: sequences by these "
-        "cameras on the calibration's street of repeating blocks",
+        "0.956 with the calibration before, which held. The calibration now also knows cameras that see less of the view grid. It "
+        "is surer of sequences between two landmarks. Six of 137 more are no longer ambiguous. Not looked into yet; next: sequences "
+        "by these cameras on the calibration's street of repeating blocks",
     ),
     "real.matcher.error_ratio.untextured.percentile_90": Reason(
         0.7421621,
-        "0005 has more outliers from 10 to 20 m (0.105, simulated 0.052). Its road is overexposed in places, and a van and cyclists move; "
-        "the simulated drives have no vehicle ahead. Which of these it is has not been looked into. Against the recording's own poses, "
-        "where fewer points of two scans agree, the ratio was 1.09",
+        "0005 has more outliers from 10 to 20 m (0.105, simulated 0.052). Its road is overexposed in places, and a van and cyclists "
+        "move; the simulated drives have no vehicle ahead. Which of these it is has not been looked into. Against the recording's "
+        "own poses, where fewer points of two scans agree, the ratio was 1.09",
     ),
     "real.kitti_0013.recall_at_1_5m": Reason(0.5416667, _OLD_0013),
     "real.kitti_0013.recall_at_1_10m": Reason(0.6666667, _OLD_0013),
@@ -163,28 +158,27 @@ WHY_MISSED: dict[str, Reason] = {
     "real.sequence5.kitti_0013.answered_within_1_m": Reason(0.0, _OLD_0013),
     "real.kitti_stereo.registration.median_m": Reason(
         0.08065068,
-        "0.074 m before. Since then a stereo rig's noise is half a pixel at least, and the left tenth of the pictures is matched too. "
-        "Which of the two costs 7 mm is not measured: these seven frames may not choose",
+        "0.074 m before. Since then a stereo rig's noise is half a pixel at least, and the left tenth of the pictures is matched "
+        "too. Which of the two costs 7 mm is not measured: these seven frames may not choose",
     ),
     "kitti_drive.odometry_vs_reference_m": Reason(
         0.106507,
-        "0.36 m of it are the reference's first 0.4 s: GICP of those two scans gives 0.96 to 0.97 m for a step of 0.61 m there, from "
-        "three starts, with the points of the sides, those behind, or all; what is left without the first frame is in the row beside; "
-        "tried: KISS-ICP alone (0.40 unaligned, two voxel sizes), aligned on distributions, points above 1 to 4.5 m alone",
+        "0.36 m of it are the reference's first 0.4 s. GICP of those two scans gives 0.96 to 0.97 m for a step of 0.61 m there, "
+        "from three starts, with the points of the sides, those behind, or all. The row beside leaves the first frame out. Tried: "
+        "KISS-ICP alone (0.40 m), aligned on distributions, points above 1 to 4.5 m alone",
     ),
     "roundtrip.kitti.pose_difference_m": Reason(
         0.0672261,
-        "the largest of 40: KITTI's depth has steps of 3.9 mm, and what registration chooses at an edge can flip on that; of an earlier "
-        "run, whose largest was 0.047 m, the median was 0.9 mm, 5 differed by more than 1 cm, and the answers were no worse (0.019 and "
-        "0.050 m off at the largest difference)",
+        "The largest of 40. KITTI's depth has steps of 3.9 mm, and what registration chooses at an edge can flip on that. In an "
+        "earlier run, whose largest was 0.047 m, the median was 0.9 mm and 5 differed by more than 1 cm. The answers were no worse",
     ),
     "cpu_over_bare.full.rest": Reason(1.0606557, _OVER_BARE),
     "cpu_over_bare.retrieval.rest": Reason(1.2228344, _OVER_BARE),
     "cpu_over_bare.retrieval.grpc": Reason(1.1925513, _OVER_BARE),
     "retrieval.cpu_ms": Reason(
         11.1234705,
-        "the bare pipeline alone took 9.1 ms in this run (7.2 in the run before, on another machine). So 0.4 ms would be left for all of "
-        "the service. What it adds is explained at cpu_over_bare.retrieval.rest",
+        "the bare pipeline alone took 9.1 ms in this run (7.2 in the run before, on another machine). So 0.4 ms would be left for "
+        "all of the service. What it adds is explained at cpu_over_bare.retrieval.rest",
     ),
     "retrieval.cpu_ms_fast_depth": Reason(
         10.44979,
@@ -192,8 +186,8 @@ WHY_MISSED: dict[str, Reason] = {
     ),
     "retrieval.p99_over_p50": Reason(
         4.847275,
-        "at 70 % of what saturates one worker, random arrivals alone give 4.3 with a constant service time (queue M/D/1, simulated); a "
-        "ratio of 3 would need less than 60 % or a second worker; before, the median was twice as long, which hid it",
+        "At 70 % of what saturates one worker, random arrivals alone give 4.3 with a constant service time (queue M/D/1, "
+        "simulated). A ratio of 3 would need less than 60 % or a second worker. Before, the median was twice as long, which hid it",
     ),
     "peers.throughput_over_best.retrieval": Reason(0.9103448, _PEERS),
     "peers.throughput_over_best.full": Reason(0.9624060, _PEERS),

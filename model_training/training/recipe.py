@@ -59,11 +59,11 @@ MATCHED_RIGS = (
 )  # fmt: skip
 #: The first seed of ``matched_plans``: after those of the stock recipe.
 _MATCHED_FROM = 40
-_MATCHED_LIDARS = ("hdl_64", "hdl_32", "hdl_64", "os1_64", "hdl_64", "vlp_16")
+_MATCHED_LIDARS = ("hdl_64", "hdl_32", "hdl_64", "os1_64", "hdl_64")
 
 
 #: Clean cities beside them in the matched recipe, so that what the encoder knows is not unlearnt.
-_CLEAN_BESIDE, _MATCHED = 6, 6
+_CLEAN_BESIDE, _MATCHED = 6, 5
 
 
 def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:

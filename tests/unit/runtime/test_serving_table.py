@@ -221,14 +221,14 @@ def test_a_single_process_follows_the_same_rules() -> None:
 
 
 def test_all_answers_agree_while_workers_are_killed_and_versions_come_are_chosen_and_go(tmp_path: Path) -> None:
-    """A hundred random steps with three processes, and a kill every 70 ms."""
+    """Forty random steps with three processes, and a kill every 70 ms."""
     seed = str(random.randrange(2**32))  # noqa: S311  # no secret
     done = subprocess.run(
-        [sys.executable, str(Path(__file__).with_name("agreeing_workers.py")), str(tmp_path), "100", seed],
+        [sys.executable, str(Path(__file__).with_name("agreeing_workers.py")), str(tmp_path), "40", seed],
         env={"PYTHONPATH": str(ROOT), "PATH": ""}, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, ""), f"seed {seed}: {done.stdout[:2000]}"
     answers, _, switches, *_ = done.stdout.split()
-    assert int(answers) > 1000
-    assert int(switches) > 10
+    assert int(answers) > 400
+    assert int(switches) > 4
     assert "'kill'" in done.stdout
