@@ -1,7 +1,7 @@
 """``streetfix simulate``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, cast
 
 import typer
 from rich.console import Console
@@ -35,7 +35,10 @@ An interrupted run goes on where it stopped. Same seed, same bytes, for any numb
 def command(
     out: Annotated[Path, typer.Option(help="folder to write the dataset to")],
     city: Annotated[
-        str, typer.Option(help="paper: the paper's nine streets; city: another city for each seed")
+        str,
+        typer.Option(
+            help="paper: the paper's nine streets; city: another city for each seed; mixed: one of more kinds of streets"
+        ),
     ] = "city",
     seed: Annotated[int, typer.Option(help="decides everything that is random", min=0)] = 0,
     name: Annotated[str, typer.Option(help="name of the dataset [default: that of the folder]")] = "",
@@ -141,13 +144,13 @@ def command(
             "set: without queries nothing takes pictures or measures depth; ask for some, or set numbers of lidar only",
             field="set",
         )
-    if city not in ("paper", "city"):
-        raise DatasetError(f"city: {city!r} is neither 'paper' nor 'city'", field="city")
+    if city not in ("paper", "city", "mixed"):
+        raise DatasetError(f"city: {city!r} is none of paper, city and mixed", field="city")
     if city == "paper" and size is not None:
         raise DatasetError("size: the paper's city has its own; leave it out, or take --city city", field="size")
     width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
-        name=name or out.name, city="paper" if city == "paper" else "city", seed=seed,
+        name=name or out.name, city=cast(Literal["paper", "city", "mixed"], city), seed=seed,
         size_m=_pair(size or "300x400", "size", least=30, most=10_000),
         streets=tuple(s for s in streets.split(",") if s), lidar=lidar, spacing_m=spacing, survey_condition=survey_condition,
         survey_error=survey_error, camera=CameraPlan.model_validate({"width": width, "height": height, "horizontal_deg": hfov}),

@@ -1,6 +1,5 @@
 """A city by seed: streets, terrain, buildings, gardens, trees; and who stands there on a given drive."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,47 +7,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from model_training.simulation.buildings import FacadeStyle, Footprint, add_building
+from model_training.simulation.districts import DISTRICTS, DOWNTOWN, MIXED_SHARES, RESIDENTIAL, WOODED, District
 from model_training.simulation.meshes import Material, Mesh, MeshBuilder
 from model_training.simulation.street_life import add_bush, add_furniture, add_person, add_tree, add_vehicle
 from model_training.simulation.streets import Street, paper_streets, random_streets, streets_geojson
 from model_training.simulation.terrain import GroundPicture, Terrain
 
 Vector = NDArray[np.float64]
-
-DOWNTOWN, RESIDENTIAL, WOODED = 0, 1, 2
-
-
-@dataclass(frozen=True)
-class District:
-    """How a part of the city is built, metres and shares; (low, high) are uniform ranges."""
-
-    width: tuple[float, float]
-    depth: tuple[float, float]
-    height: tuple[float, float]
-    setback: tuple[float, float]
-    gap: tuple[float, float]
-    joined: float  # share of houses that touch their neighbour
-    tree_step: float
-    tree_share: float
-    parked: float
-    people: float  # a hundred metres of pavement
-    roofs: tuple[str, ...]
-
-
-DISTRICTS = (
-    District((9, 26), (9, 16), (9, 26), (0, 2.0), (1, 8), 0.75, 16.0, 0.5, 0.6, 2.5, ("flat", "flat", "flat", "hip")),
-    District(
-        (7, 15), (7, 12), (3.2, 8), (2, 8), (2, 12), 0.15, 15.0, 0.5, 0.35, 0.8, ("gable", "gable", "hip", "flat")
-    ),
-    District((6, 13), (6, 10), (3, 6.5), (4, 14), (12, 35), 0.0, 7.0, 0.8, 0.12, 0.3, ("gable", "gable", "hip")),
-)
+#: Rows of a car park beyond the pavement, and the width of a slot, metres.
+CAR_ROWS_M, CAR_SLOT_M = (4.0, 15.0, 20.5), 2.8
 
 
 class City:
     """Everything that does not move, and the slots where things may stand.
 
     Args:
-        name: ``paper`` for the paper's city, else only a name.
+        name: ``paper`` for the paper's city, ``mixed`` for one of all kinds of districts, else only a name of one of the first three kinds.
         seed: the same seed gives the same city.
         size_m: extent in x and y of a random city.
     """
@@ -86,7 +60,7 @@ class City:
         return float(self.terrain.height(np.array([x, y])))
 
     def district_of(self, point: Vector) -> int:
-        """DOWNTOWN, RESIDENTIAL or WOODED."""
+        """Number of the nearest district in ``DISTRICTS``."""
         nearest = int(np.argmin(((self._district_seeds - point) ** 2).sum(axis=1)))
         return int(self._district_kinds[nearest])
 
@@ -133,7 +107,9 @@ class City:
             return seeds, np.array([DOWNTOWN, DOWNTOWN, RESIDENTIAL, RESIDENTIAL, RESIDENTIAL, WOODED])
         count = max(4, round(self.half_size_m[0] * self.half_size_m[1] / 5500.0))
         seeds = rng.uniform([-self.half_size_m[0], -self.half_size_m[1]], self.half_size_m, (count, 2))
-        return seeds, rng.choice([0, 0, 1, 1, 1, 2], count)
+        if self.name == "mixed":
+            return seeds, rng.choice(len(DISTRICTS), count, p=MIXED_SHARES)
+        return seeds, rng.choice([DOWNTOWN, DOWNTOWN, RESIDENTIAL, RESIDENTIAL, RESIDENTIAL, WOODED], count)
 
     def _free(self, corners: Vector, clearance_m: float) -> bool:
         around = np.concatenate([corners, (corners + np.roll(corners, 1, axis=0)) / 2, corners.mean(axis=0)[None]])
@@ -194,7 +170,8 @@ class City:
             normal = np.array([-direction[1], direction[0]]) * side
             yaw = float(np.arctan2(direction[1], direction[0])) + (0.0 if side > 0 else np.pi)
             yaw += 0.0 if district.joined > 0.5 else rng.normal(0, 0.06)
-            for _ in range(3):
+            built = district.built >= 1.0 or rng.random() < district.built
+            for _ in range(3 if built else 0):
                 centre = point + normal * (edge + setback + depth / 2)
                 corners = _corners(centre, width, depth, yaw)
                 if width > 4 and self._free(corners, 1.2):
@@ -209,9 +186,22 @@ class City:
                     self._annex(builder, plan, rng)
                     break
                 width, depth = 0.7 * width, 0.75 * depth
+            if not built:
+                self._car_park(point + normal * edge, direction, normal, width, district)
             if setback > 1.5 and rng.random() < 0.7:
-                self._boundary(builder, point, direction, normal, edge, width + 0.8 * gap, rng)
+                self._boundary(builder, point, direction, normal, edge, width + 0.8 * gap, district, rng)
             u += width + gap
+
+    def _car_park(self, edge: Vector, direction: Vector, normal: Vector, width: float, district: District) -> None:
+        """Slots at right angles to the street, two rows to each aisle."""
+        yaw = float(np.arctan2(normal[1], normal[0]))
+        for aside in CAR_ROWS_M:
+            for along in np.arange(-width / 2, width / 2, CAR_SLOT_M):
+                place = edge + normal * aside + direction * along
+                corners = _corners(place, 5.0, 2.4, yaw)
+                if self.clearance(place[None]) > 4.0 and self._free(corners, 3.0):
+                    self._occupied.append(corners)
+                    self._parking.append((place[0], place[1], yaw, district.parked))
 
     def _annex(self, builder: MeshBuilder, plan: Footprint, rng: np.random.Generator) -> None:
         if rng.random() > 0.35:
@@ -226,10 +216,11 @@ class City:
             builder.box(base, (width, depth, height + 1.0), plan.yaw, rng.uniform(0.3, 0.75, 3), Material.MATTE)
 
     def _boundary(
-        self, builder: MeshBuilder, point: Vector, direction: Vector, normal: Vector, edge: float, length: float, rng: np.random.Generator
+        self, builder: MeshBuilder, point: Vector, direction: Vector, normal: Vector, edge: float, length: float,
+        district: District, rng: np.random.Generator,
     ) -> None:  # fmt: skip
         """A fence, a hedge or a wall with a gate, following the slope piece by piece."""
-        kind = rng.choice(["fence", "hedge", "wall"])
+        kind = rng.choice(list(district.boundaries))
         height = {"fence": rng.uniform(0.8, 1.6), "hedge": rng.uniform(0.8, 1.9), "wall": rng.uniform(0.5, 1.8)}[
             str(kind)
         ]
@@ -293,7 +284,7 @@ class City:
         half = np.array(self.half_size_m)
         count = int(half[0] * half[1] * 4 / 45.0)
         for point in rng.uniform(-half - 25, half + 25, (count, 2)):
-            share = (0.03, 0.18, 0.8)[self.district_of(point)]
+            share = DISTRICTS[self.district_of(point)].wild
             away = self.clearance(point[None])
             if 3 < away < 45 and rng.random() < share and self._free(_corners(point, 2.5, 2.5, 0.0), 3.0):
                 base = np.array([*point, self.height(*point)])

@@ -127,7 +127,7 @@ class SimulationPlan(_Model):
     """A city, its survey and its query traversals."""
 
     name: str
-    city: Literal["paper", "city", "repeating"] = "city"
+    city: Literal["paper", "city", "mixed", "repeating"] = "city"
     seed: int = Field(0, ge=0)
     size_m: tuple[CitySide, CitySide] = (300.0, 400.0)
     streets: tuple[str, ...] = ()  # only these are driven; empty: all

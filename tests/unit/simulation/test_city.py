@@ -4,7 +4,8 @@ import shapely
 from scipy.spatial import cKDTree
 
 from model_training.simulation import city as module
-from model_training.simulation.city import City
+from model_training.simulation.city import CAR_ROWS_M, City
+from model_training.simulation.districts import DISTRICTS, DOWNTOWN, MIXED_SHARES, RESIDENTIAL, WOODED
 from model_training.simulation.streets import TABLE_I, paper_streets, random_streets, streets_geojson
 from model_training.simulation.terrain import Terrain
 
@@ -150,3 +151,50 @@ def test_the_share_of_parked_cars_that_change_is_an_option(stood, changed, stay)
 
 def test_the_same_traversal_has_the_same_occupants(city):
     np.testing.assert_array_equal(city.occupants(3).triangles, city.occupants(3).triangles)
+
+
+class CarParks(City):
+    """A city of nothing else."""
+
+    def _districts(self, rng):
+        seeds, kinds = super()._districts(rng)
+        return seeds, np.full_like(kinds, next(k for k, each in enumerate(DISTRICTS) if each.name == "car park"))
+
+
+@pytest.fixture(scope="module")
+def car_parks():
+    return CarParks(seed=2061, name="mixed", size_m=(120.0, 120.0))
+
+
+def test_a_mixed_city_has_districts_of_all_kinds_by_their_shares():
+    assert sum(MIXED_SHARES) == pytest.approx(1.0)
+    assert len(MIXED_SHARES) == len(DISTRICTS) == len({each.name for each in DISTRICTS})
+    stub = City.__new__(City)
+    stub.name, stub.half_size_m = "mixed", (4000.0, 4000.0)
+    _, kinds = stub._districts(np.random.default_rng(0))
+    assert len(kinds) > 2000
+    np.testing.assert_allclose(np.bincount(kinds, minlength=len(DISTRICTS)) / len(kinds), MIXED_SHARES, atol=0.03)
+
+
+def test_other_cities_have_the_first_three_kinds_alone():
+    stub = City.__new__(City)
+    stub.name, stub.half_size_m = "city", (4000.0, 4000.0)
+    _, kinds = stub._districts(np.random.default_rng(0))
+    assert set(kinds) == {DOWNTOWN, RESIDENTIAL, WOODED}
+
+
+def test_cars_of_a_car_park_stand_in_rows_beyond_the_pavement(car_parks):
+    """Elsewhere cars park on the carriageway, whose clearance is negative."""
+    clearance = np.array([car_parks.clearance(np.array([[x, y]])) for x, y, *_ in car_parks._parking])
+    beyond = clearance > 4.0
+    assert beyond.sum() > 20
+    assert (clearance[~beyond] < 0.1).all()
+    # pavements are 1.5 to 2.8 m wide
+    for row in CAR_ROWS_M:
+        assert ((clearance > row + 1.0) & (clearance < row + 4.0)).any(), row
+
+
+def test_no_two_cars_of_a_car_park_stand_in_each_other(car_parks):
+    spots = np.array([(x, y) for x, y, *_ in car_parks._parking if car_parks.clearance(np.array([[x, y]])) > 4.0])
+    distance, _ = cKDTree(spots).query(spots, k=2)
+    assert distance[:, 1].min() > 2.0
