@@ -66,7 +66,12 @@ def command(
             "repeat for several of one sort [default: precise]"
         ),
     ] = None,
-    rgb: Annotated[str, typer.Option(help="automatic, small or fixed")] = "automatic",
+    rgb: Annotated[
+        str,
+        typer.Option(
+            help="automatic, small, fixed, or machine: a machine-vision camera, whose lights clip and whose shadows are dark"
+        ),
+    ] = "automatic",
     sun_elevation: Annotated[
         float | None,
         typer.Option(help="of the sun above the horizon, degrees [default: by the condition]", min=1, max=90),

@@ -1,6 +1,7 @@
 """From light to the bytes of a picture: metering, gain, noise, rain and snow in the air."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from model_training.simulation.shading import to_srgb
 
 METERING = (0.8, 1.25)  # factors by which metering errs
 _MEAN_LIGHT = 0.26  # what metering brings the darkest channel's mean to (linear)
+_PROPORTIONAL = 1.6  # display value (0 to 1) of light 1 times the gain, of a response in proportion
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +21,8 @@ class RgbModel:
 
     Gain turns light into display values, exposure time and amplifier in one: what is metered by each picture, or fixed. Noise is a
     display value (0 to 255), one sigma: a floor, and a share that grows with the gain up to 40, where denoising sets in.
+    ``response`` is how values follow light: ``tone_mapped`` has a soft shoulder and gamma 2.2, so lights and shadows keep their detail;
+    ``proportional`` has neither and clips, as cameras for measuring do. Of KITTI's drive 0005 a tenth of the lower half is clipped.
     """
 
     name: str
@@ -27,6 +31,7 @@ class RgbModel:
     fixed_gain: float = 0.0  # of an exposure that is not metered; 0: metered
     noise: float = 1.2
     noise_per_gain: float = 0.35
+    response: Literal["tone_mapped", "proportional"] = "tone_mapped"
 
 
 RGBS = {
@@ -35,6 +40,7 @@ RGBS = {
         RgbModel("automatic"),
         RgbModel("small", most_gain=30.0, noise=3.0, noise_per_gain=1.0),  # a phone's or webcam's sensor
         RgbModel("fixed", fixed_gain=0.8),  # set once for a clear day: night is nearly black
+        RgbModel("machine", response="proportional"),  # a machine-vision camera, as KITTI's
     )
 }
 
@@ -47,7 +53,7 @@ def exposed(
     metering = rng.uniform(*METERING) if metering is None else metering
     metered = min(_MEAN_LIGHT * 2.0**model.exposure_ev / mean, model.most_gain) * metering
     gain = model.fixed_gain * 2.0**model.exposure_ev or metered
-    picture = to_srgb(linear, gain)
+    picture = to_srgb(linear, gain) if model.response == "tone_mapped" else _in_proportion(linear, gain)
     sigma = model.noise + model.noise_per_gain * min(gain, 40.0)
     picture += rng.standard_normal(linear.shape[:2], dtype=np.float32)[..., None] * np.float32(sigma)
     picture += cv2.resize(rng.standard_normal((linear.shape[0] // 2, linear.shape[1] // 2, 3), dtype=np.float32),
@@ -55,6 +61,11 @@ def exposed(
     if condition.streaks > 0:
         _particles(picture, condition, rng)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+
+def _in_proportion(linear: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
+    """Display values 0..255 that are proportional to light, clipped."""
+    return np.minimum(linear * np.float32(255.0 * _PROPORTIONAL * gain), np.float32(255.0))
 
 
 def _particles(picture: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> None:

@@ -189,3 +189,27 @@ def test_the_sun_stands_where_it_is_told_to():
 def test_telling_the_sun_draws_no_other_clouds():
     told = Light.of(CLEAR, np.random.default_rng(0), elevation_deg=30.0, azimuth_deg=90.0)
     assert told.clouds == Light.of(CLEAR, np.random.default_rng(0)).clouds
+
+
+def test_a_machine_vision_camera_answers_in_proportion_and_clips():
+    """Display value 0.26 * 1.6 for what metering brings to 0.26; noise of about one value."""
+    quiet = RgbParameters(noise=0.0, noise_per_gain=0.0).on("machine")
+    light = grey(0.1)
+    light[:, ::2] = 0.2
+    picture = exposed(light, quiet, CLEAR, np.random.default_rng(1), metering=1.0)
+    dim, bright = picture[:, 1::2].mean(), picture[:, ::2].mean()
+    assert bright == pytest.approx(2 * dim, abs=1.0)
+    light[:4, :4] = 5.0
+    clipped = exposed(light, quiet, CLEAR, np.random.default_rng(1), metering=1.0)
+    assert (clipped[:3, :3] == 255).all()
+
+
+def test_a_machine_vision_camera_has_more_contrast_than_one_that_maps_tones():
+    light = grey(0.05)
+    light[:, 16:] = 0.8
+    mapped, in_proportion = (
+        exposed(light, RGBS[name], CLEAR, np.random.default_rng(1), metering=1.0) for name in ("automatic", "machine")
+    )
+    ratio_mapped, ratio = (float(each[:, 17:].mean() / each[:, :15].mean()) for each in (mapped, in_proportion))
+    assert ratio == pytest.approx(16.0, rel=0.1)  # as of the light
+    assert ratio_mapped < 6.0

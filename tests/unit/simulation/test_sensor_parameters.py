@@ -18,7 +18,7 @@ from model_training.simulation.survey_drive import SurveyModel
 from service.errors import DatasetError
 
 #: What only a preset says: its name, a table of beams, a matcher.
-NOT_NUMBERS = {"name", "beams_deg", "matching"}
+NOT_NUMBERS = {"name", "beams_deg", "matching", "response"}
 FORMATS = Path(__file__).parents[3] / "docs" / "formats.md"
 
 
