@@ -14,10 +14,13 @@ from model_training.calibration.plans import PAIR_RIGS
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.disparity_errors import DisparityErrors, disparity_errors
 from model_training.simulation.plan import QueryPlan, SimulationPlan
+from model_training.simulation.sensor_parameters import RgbParameters
 from model_training.simulation.simulate import simulate
 from model_training.training.recipe import WATCH_SEEDS
 
 DRIVES, FRAMES, FIRST_SEED = 6, 6, 20
+#: A machine-vision camera that is exposed for the shade, so that sunlit roads clip, as 0005's are.
+EXPOSURE = RgbParameters(exposure_ev=1.0)
 RATIO = (0.8, 1.25)
 RANGES_M = ((5, 10), (10, 20), (20, 40))
 
@@ -29,7 +32,7 @@ def simulated_errors(work: Path) -> DisparityErrors:
     for k in range(DRIVES):
         query = QueryPlan(
             name="own", traversal=0, count=FRAMES, depths=("sgbm",), aside_m=0.3, heading_deg=3.0,
-            stereo_parameters=rig.stereo,
+            stereo_parameters=rig.stereo, condition="hard_light", rgb="machine", rgb_parameters=EXPOSURE,
         )  # fmt: skip
         plan = SimulationPlan(
             name=f"matcher-{k}", seed=WATCH_SEEDS[FIRST_SEED + k], size_m=(120.0, 120.0), lidar=rig.lidar,

@@ -80,7 +80,9 @@ def command(
         float | None,
         typer.Option(help="of the sun, from east counter-clockwise, degrees [default: by chance]", min=-360, max=360),
     ] = None,
-    condition: Annotated[str, typer.Option(help="of all queries: clear, rain, snow, fog, night or low_sun")] = "clear",
+    condition: Annotated[
+        str, typer.Option(help="of all queries: clear, hard_light, rain, snow, fog, night or low_sun")
+    ] = "clear",
     survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
     survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
     parked_changed: Annotated[

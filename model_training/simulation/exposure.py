@@ -65,7 +65,8 @@ def exposed(
 
 def _in_proportion(linear: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
     """Display values 0..255 that are proportional to light, clipped."""
-    return np.minimum(linear * np.float32(255.0 * _PROPORTIONAL * gain), np.float32(255.0))
+    values: NDArray[np.float32] = np.minimum(linear * np.float32(255.0 * _PROPORTIONAL * gain), np.float32(255.0))
+    return values
 
 
 def _particles(picture: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> None:

@@ -213,3 +213,11 @@ def test_a_machine_vision_camera_has_more_contrast_than_one_that_maps_tones():
     ratio_mapped, ratio = (float(each[:, 17:].mean() / each[:, :15].mean()) for each in (mapped, in_proportion))
     assert ratio == pytest.approx(16.0, rel=0.1)  # as of the light
     assert ratio_mapped < 6.0
+
+
+def test_shade_is_darker_in_hard_light():
+    """A wall that faces away from the sun has the sky's light alone, of which there is 0.45 of a clear day's."""
+    rng = [np.random.default_rng(3) for _ in range(2)]
+    clear, hard = (Light.of(CONDITIONS[name], each) for name, each in zip(("clear", "hard_light"), rng, strict=True))
+    np.testing.assert_allclose(hard.sky, 0.45 * clear.sky, rtol=1e-5)
+    np.testing.assert_allclose(hard.sun, clear.sun, rtol=1e-6)

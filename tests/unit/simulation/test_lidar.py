@@ -120,7 +120,7 @@ def test_drops_and_flakes_answer_near_the_sensor(wall, name):
     assert np.median(ranges) < 8.0
 
 
-@pytest.mark.parametrize("name", ["clear", "night", "low_sun"])
+@pytest.mark.parametrize("name", ["clear", "hard_light", "night", "low_sun"])
 def test_light_does_not_trouble_the_lidar(wall, name):
     assert np.abs(scan_of(wall, MODEL, CONDITIONS[name])[:, 0] - wall.x_m).max() < 0.2
 
