@@ -144,12 +144,6 @@ WHY_MISSED: dict[str, Reason] = {
         "is surer of sequences between two landmarks. Six of 137 more are no longer ambiguous. Not looked into yet; next: sequences "
         "by these cameras on the calibration's street of repeating blocks",
     ),
-    "real.matcher.error_ratio.untextured.percentile_90": Reason(
-        0.7421621,
-        "0005 has more outliers from 10 to 20 m (0.105, simulated 0.052). Its road is overexposed in places, and a van and cyclists "
-        "move; the simulated drives have no vehicle ahead. Which of these it is has not been looked into. Against the recording's "
-        "own poses, where fewer points of two scans agree, the ratio was 1.09",
-    ),
     "real.kitti_0013.recall_at_1_5m": Reason(0.5416667, _OLD_0013),
     "real.kitti_0013.recall_at_1_10m": Reason(0.6666667, _OLD_0013),
     "real.kitti_0013.answered_within_1_m": Reason(0.0, _OLD_0013),
