@@ -5,7 +5,7 @@ holes. An encoder that has only met drawn errors finds 0.78 to 0.93 of the place
 (decision log, 2026-11-25).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from model_training.simulation.camera import take, unit_rays
 from model_training.simulation.city import City
 from model_training.simulation.conditions import CONDITIONS
-from model_training.simulation.exposure import METERING, RGBS
+from model_training.simulation.exposure import METERING, RGBS, RgbModel
 from model_training.simulation.scene import Scene
 from model_training.simulation.shading import Light
 from model_training.simulation.stereo_pair import StereoModel, StereoRig
@@ -35,11 +35,17 @@ class MatchedRig:
         camera: of the left picture.
         height_m: of the camera above the ground, least and greatest.
         model: matcher, focal length times baseline, and how badly the rig is rectified.
+        rgb: how both cameras turn light into values.
+        condition: of the light.
+        exposure_ev: stops that the pictures of a drive are brighter than metered, least and greatest.
     """
 
     camera: PinholeCamera
     height_m: tuple[float, float]
     model: StereoModel
+    rgb: RgbModel = RGBS["automatic"]
+    condition: str = "clear"
+    exposure_ev: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +81,9 @@ class RigOfADrive:
         self._rig, self._scene, self._city, self._rng = rig, scene, city, rng
         self._stereo = StereoRig.drawn(rig.model, rig.camera, rng)
         self._rays, self._z_of_ray = unit_rays(rig.camera)
-        self._light = Light.of(CONDITIONS["clear"], rng)
+        self._condition = CONDITIONS[rig.condition]
+        self._light = Light.of(self._condition, rng)
+        self._rgb = replace(rig.rgb, exposure_ev=rng.uniform(*rig.exposure_ev))
         cv2.setNumThreads(1)  # a process a city: more threads would only wait for each other
 
     def view(self, T_map_body: Transform, grid: ViewGrid) -> MatchedView:
@@ -90,7 +98,7 @@ class RigOfADrive:
         metering = float(self._rng.uniform(*METERING))  # both cameras of a rig are exposed alike
         left, right = (
             take(
-                self._scene, self._city.ground, self._rig.camera, T, self._light, CONDITIONS["clear"], RGBS["automatic"], self._rng,
+                self._scene, self._city.ground, self._rig.camera, T, self._light, self._condition, self._rgb, self._rng,
                 rays_camera=self._rays, z_of_ray=self._z_of_ray, metering=metering,
             ).rgb
             for T in (T_map_camera, T_map_camera @ self._stereo.T_left_right)

@@ -7,6 +7,7 @@ training 2000-2999, calibrating confidence 3000-3999, evaluation 9000-9999; the 
 from collections.abc import Callable
 from dataclasses import replace
 
+from model_training.simulation.exposure import RGBS
 from model_training.simulation.plan import CameraPlan
 from model_training.simulation.stereo_pair import STEREOS
 from model_training.training.matched_views import MatchedRig
@@ -37,12 +38,14 @@ def stock_plans(cities: int) -> list[PackPlan]:
     return [PackPlan(seed=TRAINING_SEEDS[k], lidar=_LIDARS[k % len(_LIDARS)]) for k in range(cities)]
 
 
-#: Rigs whose pairs are rendered and matched. A car's as KITTI's at half the pixels, half the errors of rectification with it; a small
-#: robot's by two matchers; and a hand-held one.
+#: A machine-vision camera, its light, and stops of exposure: more for the shade, so that sunlit roads clip.
+_MACHINE = (RGBS["machine"], "hard_light", (-0.3, 1.0))
+#: Rigs whose pairs are rendered and matched. A car's as KITTI's at half the pixels, half the errors of rectification with it, by two
+#: matchers; a small robot's; and a hand-held one.
 MATCHED_RIGS = (
     MatchedRig(
         CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(), (1.5, 1.8),
-        replace(STEREOS["sgbm"], focal_baseline_px_m=192.0, offset_px=0.28, vertical_px=0.2, roll_px=0.2),
+        replace(STEREOS["sgbm"], focal_baseline_px_m=192.0, offset_px=0.28, vertical_px=0.2, roll_px=0.2), *_MACHINE,
     ),
     MatchedRig(
         CameraPlan(width=480, height=270, horizontal_deg=90.0).pinhole(), (1.0, 1.6),
@@ -54,7 +57,7 @@ MATCHED_RIGS = (
     ),
     MatchedRig(
         CameraPlan(width=480, height=300, horizontal_deg=80.0).pinhole(), (0.7, 1.2),
-        replace(STEREOS["bm"], focal_baseline_px_m=76.0, offset_px=0.22, vertical_px=0.16, roll_px=0.16),
+        replace(STEREOS["bm"], focal_baseline_px_m=76.0, offset_px=0.22, vertical_px=0.16, roll_px=0.16), *_MACHINE,
     ),
 )  # fmt: skip
 #: The first seed of ``matched_plans``: after those of the stock recipe.
@@ -67,10 +70,10 @@ _CLEAN_BESIDE, _MATCHED = 6, 5
 
 
 def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
-    """Cities whose queries have depth of matched stereo pairs."""
+    """Cities of all kinds of districts whose queries have depth of matched stereo pairs."""
     return [
         PackPlan(
-            seed=TRAINING_SEEDS[_MATCHED_FROM + k], places=1000, queries_a_place=1,
+            seed=TRAINING_SEEDS[_MATCHED_FROM + k], name="mixed", places=1000, queries_a_place=1,
             lidar=_MATCHED_LIDARS[k % len(_MATCHED_LIDARS)], rigs=MATCHED_RIGS,
         )
         for k in range(cities)

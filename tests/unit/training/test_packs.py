@@ -179,6 +179,7 @@ def test_a_pack_without_matching_has_no_mask(pack):
 def test_the_papers_city_is_only_in_its_own_recipe():
     assert {plan.name for plan in paper_plans()} == {"paper"}
     assert {plan.name for plan in stock_plans(50) + watch_plans()} == {"city"}
+    assert {plan.name for plan in matched_plans(20)} == {"mixed"}
 
 
 def test_plans_that_differ_have_packs_of_their_own():
