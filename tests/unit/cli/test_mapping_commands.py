@@ -114,7 +114,7 @@ def test_simulate_refuses_a_number_that_no_sensor_can_take(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--city", "paris"), "'paris' is neither 'paper' nor 'city'"),
+        (("--city", "paris"), "'paris' is none of paper, city and mixed"),
         (("--size", "300"), "size: '300' is not two numbers"),
         (("--camera", "axb"), "camera: 'axb' is not two numbers"),
         (("--camera", "nanx480"), "camera: nan in 'nanx480' is not between 48 and 4096"),
