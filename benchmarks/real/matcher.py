@@ -20,7 +20,7 @@ from model_training.training.recipe import WATCH_SEEDS
 
 DRIVES, FRAMES, FIRST_SEED = 6, 6, 20
 #: A machine-vision camera that is exposed for the shade, so that sunlit roads clip, as 0005's are.
-EXPOSURE = RgbParameters(exposure_ev=1.0)
+EXPOSURE = RgbParameters(exposure_ev=0.6)
 RATIO = (0.8, 1.25)
 RANGES_M = ((5, 10), (10, 20), (20, 40))
 

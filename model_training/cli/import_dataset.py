@@ -32,7 +32,7 @@ def command(
         str,
         typer.Option(
             help="what a picture's depth is: recorded or stored beside it, sgbm of the stereo pair, lidar for the scan "
-            "nearest in time [default: recorded; kitti-object: sgbm]"
+            "nearest in time [default: recorded; kitti-object and kitti-360: sgbm]"
         ),
     ] = "",
     poses: Annotated[
@@ -82,13 +82,13 @@ def command(
     deskew: Annotated[
         bool,
         typer.Option(
-            help="take the vehicle's motion out of scans that tell their points' times; of kitti-raw the azimuth tells them"
+            help="take the vehicle's motion out of scans that tell their points' times; of kitti-raw and kitti-360 the azimuth tells them"
         ),
     ] = True,
     vertical_correction: Annotated[
         bool | None,
         typer.Option(
-            help="turn KITTI's points up by 0.205 degrees, which its HDL-64 errs by [default: of KITTI's layouts]"
+            help="turn KITTI's points up by 0.205 degrees, which its HDL-64 errs by [default: of kitti-raw and kitti-odometry]"
         ),
     ] = None,
 ) -> None:

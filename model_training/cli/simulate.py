@@ -37,7 +37,7 @@ def command(
     city: Annotated[
         str,
         typer.Option(
-            help="paper: the paper's nine streets; city: another city for each seed; mixed: one of more kinds of streets"
+            help="paper: the paper's nine streets; city: another city for each seed; mixed: like city, with eight kinds of districts"
         ),
     ] = "city",
     seed: Annotated[int, typer.Option(help="decides everything that is random", min=0)] = 0,

@@ -7,9 +7,9 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.training.loop import Progress, TrainingConfig, device_of, train
+from model_training.training.loop import Progress, TrainingConfig, device_of, require_start, train
 from model_training.training.packs import make_packs
-from model_training.training.recipe import RECIPES
+from model_training.training.recipe import RECIPES, STOCK_CITIES
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
@@ -23,7 +23,12 @@ def command(
             "city itself"
         ),
     ] = "stock",
-    cities: Annotated[int, typer.Option(help="cities of the stock recipe", min=1, max=1000)] = 26,
+    cities: Annotated[
+        int | None,
+        typer.Option(
+            help=f"of the stock recipe, the only one that takes it [default: {STOCK_CITIES}]", min=1, max=1000
+        ),
+    ] = None,
     packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
     steps: Annotated[int, typer.Option(help="optimiser steps", min=1)] = 4000,
     pairs: Annotated[int, typer.Option(help="pairs of views a step", min=2, max=2048)] = 128,
@@ -57,10 +62,8 @@ def command(
     """
     if recipe not in RECIPES:
         raise DatasetError(f"recipe: {recipe!r} is none of {', '.join(RECIPES)}", field="recipe")
-    if start_from is not None and not start_from.exists():
-        raise DatasetError(
-            f"start_from: {start_from} is not there; name a run's folder or an encoder (.onnx)", field="start_from"
-        )
+    if cities is not None and recipe != "stock":
+        raise DatasetError(f"cities: the recipe {recipe!r} has its own; leave it out", field="cities")
     if optimiser not in ("adamw", "sgdm"):
         raise DatasetError(f"optimiser: {optimiser!r} is neither 'adamw' nor 'sgdm'", field="optimiser")
     if precision not in ("float32", "bfloat16"):
@@ -82,7 +85,9 @@ def command(
         | ({} if start_from is None else {"memory_after": 30})  # descriptors of a trained network no longer drift fast
         | ({"memory_after": None} if negatives == "batch" else {})
     )
-    plans = RECIPES[recipe](cities)
+    if start_from is not None:
+        require_start(start_from, config.encoder)
+    plans = RECIPES[recipe](cities or STOCK_CITIES)
     grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
     with bars() as report:
         folders = make_packs(plans, packs, grid, workers=workers, report=report)

@@ -108,6 +108,7 @@ def _kitti_odometry(source: Path, settings: OpenSettings) -> Recording:
 def _kitti_360(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.kitti_360 import open_kitti_360
 
+    # Nothing is recorded beside its pictures, so the usual depth is that of the stereo pair.
     return open_kitti_360(source, depth="none" if settings.depth == "lidar" else "sgbm")
 
 
@@ -155,7 +156,7 @@ _KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
 KINDS: dict[str, Kind] = {
     "kitti-raw": Kind(_kitti_raw, _KITTI, frozenset({"vertical_correction"})),
     "kitti-odometry": Kind(_kitti_odometry, _KITTI, frozenset({"vertical_correction"})),
-    "kitti-360": Kind(_kitti_360, ("sgbm", "lidar")),
+    "kitti-360": Kind(_kitti_360, ("recorded", "sgbm", "lidar")),
     "rosbag": Kind(_rosbag, ("recorded", "lidar"), frozenset({"topics", "extrinsics", "camera", "rectified"})),
     "carla": Kind(_carla, ("recorded", "lidar")),
     "clouds": Kind(_clouds, ("recorded",)),

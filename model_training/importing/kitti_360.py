@@ -7,6 +7,7 @@ the moments at which the vehicle moved; scans are not compensated for its motion
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model_training.datasets.files import read_bytes
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
@@ -30,7 +31,8 @@ def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
     Raises:
         DatasetError: there is no scan or no calibration, or a file of them is broken.
     """
-    root, name = source.resolve().parent.parent, source.resolve().name
+    source = source.absolute()  # a link to the drive's folder is not followed: the other trees lie beside the link
+    root, name = source.parent.parent, source.name
     scans_of = root / "data_3d_raw" / name / "velodyne_points"
     pictures = root / "data_2d_raw" / name
     scans = numbered(scans_of / "data", (".bin",))
@@ -40,50 +42,63 @@ def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
             field="source",
         )
     left, right = (numbered(pictures / f"image_{eye}" / "data_rect", _PICTURES) for eye in ("00", "01"))
-    calibration, T_lidar_cam0 = _calibration(root / "calibration")
+    calibration = _calibration(root / "calibration")
     numbers = sorted(scans.keys() | left.keys())
     times = scans_of / "timestamps.txt"
     stamps = stamps_of(times, numbers) or {n: n / RATE_HZ for n in numbers}
     frames = tuple(KittiFrame(f"{n:010d}", stamps[n], scans.get(n), left.get(n), right.get(n), None) for n in numbers)
-    poses = _poses(root / "data_poses" / name / "poses.txt", stamps, _mounting(root / "calibration", T_lidar_cam0))
+    poses = _poses(root / "data_poses" / name / "poses.txt", stamps, root / "calibration")
     return KittiSequence("kitti-360", source, frames, calibration, depth, poses, turn_s=turn_of(times))
 
 
-def _calibration(folder: Path) -> tuple[KittiCalibration, Transform]:
-    """Of the left perspective camera, and T_lidar_camera before rectification."""
+def _calibration(folder: Path) -> KittiCalibration:
+    """Of the left perspective camera."""
     path = folder / "perspective.txt"
     found = read_matrices(
         path, {"P_rect_00": (3, 4), "P_rect_01": (3, 4), "R_rect_00": (3, 3)}, optional=frozenset({"P_rect_01"})
     )
-    T_lidar_cam0 = _rigid(folder / "calib_cam_to_velo.txt")
-    Tr = inverse(T_lidar_cam0)[:3]
-    calibration = calibration_from(path, P2=found["P_rect_00"], P3=found.get("P_rect_01"), R0=found["R_rect_00"], Tr=Tr)
-    return calibration, T_lidar_cam0
+    Tr = inverse(_T_lidar_cam0(folder))[:3]
+    return calibration_from(path, P2=found["P_rect_00"], P3=found.get("P_rect_01"), R0=found["R_rect_00"], Tr=Tr)
 
 
-def _mounting(folder: Path, T_lidar_cam0: Transform) -> Transform:
+def _mounting(folder: Path) -> Transform:
     """T_pose_lidar: poses are those of the inertial system."""
-    rows = read_matrices(folder / "calib_cam_to_pose.txt", {"image_00": (3, 4)})["image_00"]
-    return transform_from(rows[:, :3], rows[:, 3]) @ inverse(T_lidar_cam0)
+    path = folder / "calib_cam_to_pose.txt"
+    rows = read_matrices(path, {"image_00": (3, 4)})["image_00"]
+    return _rigid(rows, f"{path}: image_00", path.name) @ inverse(_T_lidar_cam0(folder))
 
 
-def _rigid(path: Path) -> Transform:
-    """A file with the twelve numbers of one transform."""
+def _T_lidar_cam0(folder: Path) -> Transform:
+    """Of the left camera before rectification."""
+    path = folder / "calib_cam_to_velo.txt"
     try:
         rows = np.array(read_bytes(path).decode("ascii").split(), np.float64).reshape(3, 4)
     except (ValueError, UnicodeDecodeError) as error:
         raise DatasetError(
             f"{path}: not the 12 numbers of a transform; take the file from the recording again", field=path.name
         ) from error
-    return transform_from(rows[:, :3], rows[:, 3])
+    return _rigid(rows, str(path), path.name)
 
 
-def _poses(path: Path, stamps: dict[int, float], T_pose_lidar: Transform) -> Trajectory | None:
+def _rigid(rows: NDArray[np.float64], where: str, field: str) -> Transform:
+    """Rows (3, 4) as a transform.
+
+    Raises:
+        DatasetError: they are not finite, or their first three columns are no rotation.
+    """
+    R = rows[:, :3]
+    if not np.isfinite(rows).all() or not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise DatasetError(f"{where}: no rotation and position; take the file from the recording again", field=field)
+    return transform_from(R, rows[:, 3])
+
+
+def _poses(path: Path, stamps: dict[int, float], calibration: Path) -> Trajectory | None:
     """T_map_lidar at those moments that have a frame here."""
     if not path.is_file():
         return None
+    T_pose_lidar = _mounting(calibration)
     poses, times = [], []
-    for number, line in enumerate(read_bytes(path).decode("ascii", errors="replace").splitlines(), 1):
+    for number, line in enumerate(read_bytes(path).decode("ascii", errors="replace").rstrip().splitlines(), 1):
         try:
             frame, *values = line.split()
             rows = np.array(values, np.float64).reshape(3, 4)
@@ -93,6 +108,6 @@ def _poses(path: Path, stamps: dict[int, float], T_pose_lidar: Transform) -> Tra
                 f"{path}, line {number}: not a frame's number and the 12 numbers of its pose", field=path.name
             ) from error
         if stamp is not None:
-            poses.append(transform_from(rows[:, :3], rows[:, 3]) @ T_pose_lidar)
+            poses.append(_rigid(rows, f"{path}, line {number}", path.name) @ T_pose_lidar)
             times.append(stamp)
     return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4), str(path))

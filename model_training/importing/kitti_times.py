@@ -13,7 +13,7 @@ from service.errors import DatasetError
 
 def turn_of(times: Path) -> float:
     """Time of one turn of the LiDAR (s), by the stamps of all scans of the drive, those that an extract leaves out among them."""
-    count = len(times.read_bytes().splitlines()) if times.is_file() else 0
+    count = len(times.read_bytes().rstrip().splitlines()) if times.is_file() else 0
     stamps = stamps_of(times, list(range(count))) or {}
     return period_of(np.array([stamps[n] for n in sorted(stamps)]), otherwise_s=1 / RATE_HZ)
 
@@ -26,7 +26,7 @@ def stamps_of(path: Path, numbers: list[int]) -> dict[int, float] | None:
     """
     if not path.is_file():
         return None
-    lines = read_bytes(path).decode("ascii", errors="replace").splitlines()
+    lines = read_bytes(path).decode("ascii", errors="replace").rstrip().splitlines()
     if numbers and numbers[-1] >= len(lines):
         raise DatasetError(
             f"{path} has {len(lines)} lines, and there is a frame {numbers[-1]:010d}; take the file from the recording again",

@@ -48,8 +48,8 @@ CONDITIONS = {
     c.name: c
     for c in (
         Condition("clear"),
-        # A clear day among tall houses and trees: what the sun does not reach sees little of the sky. ``ambient`` and a stop more
-        # exposure make clipped and dark shares of pictures, and errors of matching, as on KITTI's drive 0005 (decision log).
+        # A clear day among tall houses and trees: what the sun does not reach sees little of the sky. ``ambient`` is chosen so that
+        # stereo matching errs as on KITTI's drive 0005 (decision log).
         Condition("hard_light", ambient=0.45),
         Condition("rain", 1.076 * 25**0.67 * _PER_METRE, 0.024, 4.0, wet=0.8, sun_strength=0.0, ambient=0.8, streaks=0.5,
                   disparity_noise=1.4, holes=0.25),

@@ -9,16 +9,16 @@ class District:
 
     Attributes:
         name: of the kind.
-        width: of a house, along the street;
-        depth: across it;
-        height: and up.
+        width: of a house along the street.
+        depth: of a house across the street.
+        height: of a house.
         setback: from the pavement.
         gap: between houses that do not touch.
         joined: share of houses that touch their neighbour.
         tree_step: along the pavement.
         tree_share: of those places that have a tree.
         parked: share of parking slots that are taken.
-        people: a hundred metres of pavement.
+        people: people per 100 m of pavement.
         roofs: kinds, each as likely as the others.
         wild: share of places behind the houses that have a tree or a bush.
         boundaries: kinds of what stands between garden and pavement, each as likely as the others.

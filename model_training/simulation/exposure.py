@@ -64,9 +64,8 @@ def exposed(
 
 
 def _in_proportion(linear: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
-    """Display values 0..255 that are proportional to light, clipped."""
-    values: NDArray[np.float32] = np.minimum(linear * np.float32(255.0 * _PROPORTIONAL * gain), np.float32(255.0))
-    return values
+    """Display values that are proportional to light; they clip after the noise, so that what is clipped is flat."""
+    return linear * np.float32(255.0 * _PROPORTIONAL * gain)
 
 
 def _particles(picture: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> None:

@@ -33,10 +33,7 @@ def net_of(encoder: Path, shape: EncoderShape, planes: Tensor, side: Tensor) -> 
     Raises:
         EncoderError: the file is no encoder of this architecture and shape.
     """
-    opened, layers = Encoder.open(encoder), _layers(encoder)
-    found = _shape(opened, layers, encoder)
-    if found != shape:
-        raise _foreign(encoder, f"it has the shape {found}, not {shape}")
+    layers = require_shape(encoder, shape)
     net = EncoderNet(shape)
     convolutions = [module for module in net.modules() if isinstance(module, nn.Conv2d | nn.Linear)]
     blocks = [module for module in net.modules() if isinstance(module, nn.Sequential)]
@@ -58,6 +55,25 @@ def net_of(encoder: Path, shape: EncoderShape, planes: Tensor, side: Tensor) -> 
     for hook in hooks:
         hook.remove()
     return net
+
+
+def require_shape(encoder: Path, shape: EncoderShape) -> list[tuple[Floats, Floats]]:
+    """Weight and bias of every layer of an encoder.
+
+    Raises:
+        EncoderError: the file is no encoder of this architecture and shape.
+    """
+    try:
+        opened, layers = Encoder.open(encoder), _layers(encoder)
+    except EncoderError as error:
+        raise EncoderError(f"{encoder}: {error}", field="encoder") from error
+    found = _shape(opened, layers, encoder)
+    if found != shape:
+        raise EncoderError(
+            f"{encoder}: it has the shape {found}, and the training wants {shape}; start from an encoder of that shape",
+            field="encoder",
+        )
+    return layers
 
 
 def _matching(bias: Tensor):  # type: ignore[no-untyped-def]  # torch's hook type is private
@@ -91,11 +107,16 @@ def _layers(encoder: Path) -> list[tuple[Floats, Floats]]:
     known = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
     for node in graph.node:
         if node.op_type == "DequantizeLinear" and node.input[0] in known:
-            values, scale, zero = (known[name] for name in node.input)
+            if any(name not in known for name in node.input):
+                raise _foreign(encoder, f"{node.name} has no constant scale")
+            parts = [known[name] for name in node.input]
+            values, scale, zero = (*parts, np.zeros(1)) if len(parts) == 2 else parts
             along = (-1,) + (1,) * (values.ndim - 1) if scale.ndim else ()
             known[node.output[0]] = (
-                (values.astype(np.float32) - zero.astype(np.float32).reshape(along)) * scale.reshape(along)
+                (values.astype(np.float32) - zero.astype(np.float32).reshape(along if zero.size > 1 else ())) * scale.reshape(along)
             ).astype(np.float32)  # fmt: skip
+        elif node.op_type == "Identity" and node.input[0] in known:  # torch stores equal tensors once
+            known[node.output[0]] = known[node.input[0]]
     found = []
     for node in graph.node:
         if node.op_type in ("Conv", "Gemm"):

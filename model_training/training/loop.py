@@ -19,7 +19,7 @@ from model_training.datasets.files import read_bytes, reading
 from model_training.training.augment import Augmentation, Augmenter
 from model_training.training.batches import Batch, City, open_cities
 from model_training.training.encoder_net import EncoderNet, EncoderShape
-from model_training.training.from_onnx import net_of
+from model_training.training.from_onnx import net_of, require_shape
 from model_training.training.losses import Side, hardest_triplet, paired_info_nce
 from model_training.training.memory import DescriptorMemory
 from model_training.training.precision import Precision, forward_in
@@ -28,7 +28,8 @@ from service.imaging.view_grid import PLANES, ViewGrid
 from service.localization.encoder import Encoder
 
 PAIRS_AT_ONCE = 16  # augmented together on a processor
-STATISTICS_BATCHES = 6  # whose views set the statistics of an encoder that was exported without them
+#: Batches, spread over all cities, whose views set the statistics of an encoder that was exported without them; pairs of each at most.
+STATISTICS_BATCHES, STATISTICS_PAIRS = 12, 64
 
 _LOSSES = {"info_nce": paired_info_nce, "triplet": hardest_triplet}
 
@@ -104,6 +105,8 @@ def train(
         KeyboardInterrupt: after the checkpoint was saved.
     """
     grid, place = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns), device_of(device)
+    if start_from is not None:
+        require_start(start_from, config.encoder)
     run.mkdir(parents=True, exist_ok=True)
     _keep_config(run, config)
     _keep_packs(run, packs, start_from)
@@ -202,13 +205,40 @@ def train(
     return trained
 
 
+def require_start(start_from: Path, shape: EncoderShape) -> None:
+    """Refuse what no training can start from, before anything is simulated or written.
+
+    Raises:
+        DatasetError: it is not there, or a run's folder without a checkpoint, or of another shape.
+        EncoderError: it is a file, but no encoder of this shape.
+    """
+    if not start_from.exists():
+        raise DatasetError(
+            f"start_from: {start_from} is not there; name a run's folder or an encoder (.onnx)", field="start_from"
+        )
+    if not start_from.is_dir():
+        require_shape(start_from, shape)
+        return
+    if not (start_from / "checkpoint.pt").is_file():
+        raise DatasetError(
+            f"start_from: {start_from} holds no checkpoint.pt; name the folder of a run that was trained, or an encoder (.onnx)",
+            field="start_from",
+        )
+    found = read_config(start_from).encoder
+    if found != shape:
+        raise DatasetError(
+            f"start_from: {start_from} has the shape {found}, and this training wants {shape}; start from a run of that shape",
+            field="start_from",
+        )
+
+
 def _views_of_all(
     cities: list[City], config: TrainingConfig, augment: Augmenter, rng: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Augmented planes and sides of ``STATISTICS_BATCHES`` batches, the cities in turn."""
+    """Augmented planes and sides of ``STATISTICS_BATCHES`` batches, spread over all cities."""
     planes, sides = [], []
     for k in range(STATISTICS_BATCHES):
-        batch = cities[k % len(cities)].draw(config.pairs, rng)
+        batch = cities[k * len(cities) // STATISTICS_BATCHES].draw(min(config.pairs, STATISTICS_PAIRS), rng)
         planes.append(views_of(batch, augment, augment.device, blind=config.blind).cpu())
         sides.append(torch.arange(len(planes[-1])) < len(batch.query_xy))
     return torch.cat(planes), torch.cat(sides).float()

@@ -1,7 +1,7 @@
 """Query views of the training set whose depth comes from matching a rendered stereo pair.
 
 Drawn errors (``augment``) err in another way than matching does: surfaces that a matcher smooths, edges that it fattens, streaks and
-holes. An encoder that has only met drawn errors finds 0.78 to 0.93 of the places of simulated pairs, and 0.77 on KITTI's drive 0005
+holes. An encoder that has only met drawn errors finds 0.75 to 0.81 of the places of simulated pairs, and 0.77 on KITTI's drive 0005
 (decision log, 2026-11-25).
 """
 

@@ -4,6 +4,7 @@ A pack is what one city gives: small enough to keep many, and free of the errors
 shows a pair (``augment``). Panoramas go through the same levelling and resampling as those of a real survey.
 """
 
+import hashlib
 import multiprocessing
 import os
 from collections.abc import Callable
@@ -28,9 +29,10 @@ from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
 FORMAT = 2
-DRIVE_VIEWS = 60  # of matched pairs: then another rig, or the same rectified anew, under another sun
+DRIVE_VIEWS = 60  # after so many matched views the next rig is taken, with new errors of rectification and another sun
 #: Rays ahead that tell whether something stands right before the camera.
 _COARSE = ViewGrid(rows=8, columns=16).rays_level().reshape(-1, 3)
+MATCHED = "-matched"  # in the names of packs of matched pairs
 OWN_DRIVES = 1000  # traversals of the training set: no dataset's drive has the same vehicles and people
 
 
@@ -49,7 +51,7 @@ class PackPlan:
     @property
     def stem(self) -> str:
         """File name of the pack, without its ending."""
-        matched = "-matched" if self.rigs else ""
+        matched = f"{MATCHED}-{_digest(self.rigs)}" if self.rigs else ""
         return f"pack{FORMAT}-{self.name}-{self.seed}-{self.places}x{self.queries_a_place}-{self.lidar}{matched}"
 
 
@@ -81,11 +83,17 @@ class Pack:
             DatasetError: an array is missing or damaged.
         """
         remedy = f"remove {folder}, so that the next training makes the city anew"
+        matched = MATCHED in folder.name
         return Pack(**{
             name: read_arrays(path, partial(np.load, path, mmap_mode="r", allow_pickle=False), remedy=remedy)
             for name, path in ((name, folder / f"{name}.npy") for name in Pack.__annotations__)
-            if name != "seen" or path.exists()
+            if name != "seen" or matched
         })  # fmt: skip
+
+
+def _digest(rigs: tuple[MatchedRig, ...]) -> str:
+    """Eight digits that change with every number of the rigs."""
+    return hashlib.sha256(repr((DRIVE_VIEWS, rigs)).encode()).hexdigest()[:8]
 
 
 def rows_seen_by(panoramas: NDArray[np.float16], *, least: float = 0.02) -> NDArray[np.bool_]:

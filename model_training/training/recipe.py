@@ -33,6 +33,9 @@ _LIDARS = (
 )
 
 
+STOCK_CITIES = 26
+
+
 def stock_plans(cities: int) -> list[PackPlan]:
     """The training set of the stock encoder."""
     return [PackPlan(seed=TRAINING_SEEDS[k], lidar=_LIDARS[k % len(_LIDARS)]) for k in range(cities)]
@@ -90,7 +93,7 @@ def paper_plans() -> list[PackPlan]:
     return [PackPlan(seed=0, name="paper", places=2000)]
 
 
-#: Recipes by name, of the number of cities that the stock one is asked for.
+#: Recipes by name. Each is given the number of cities, which the stock one alone uses.
 RECIPES: dict[str, Callable[[int], list[PackPlan]]] = {
     "stock": stock_plans,
     "matched": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans()],

@@ -15,6 +15,7 @@ NAME = "2013_05_28_drive_0000_sync"
 #: Camera 0 before rectification, against the LiDAR; and against the inertial system, whose y points right and z down.
 T_LIDAR_CAM0 = transform_from(R_BODY_OPTICAL, np.array([0.8, 0.3, -0.1]))
 T_POSE_CAM0 = transform_from(np.diag([1.0, -1.0, -1.0]) @ R_BODY_OPTICAL, np.array([1.6, -0.1, -1.5]))
+RECTIFIED = rotation_z(np.deg2rad(1.0))  # from camera 0 to its rectified frame
 MOVED = (1, 2, 3)  # frames with a pose
 
 
@@ -49,13 +50,13 @@ def root(tmp_path):
     P1 = np.c_[K, K @ [-0.5, 0, 0]]
     (calibration / "perspective.txt").write_text(
         "calib_time: 2013\nS_rect_00: 220 60\n"
-        + line("R_rect_00", np.eye(3))
+        + line("R_rect_00", RECTIFIED)
         + line("P_rect_00", np.c_[K, np.zeros(3)])
         + line("P_rect_01", P1)
     )
     (calibration / "calib_cam_to_velo.txt").write_text(" ".join(map(str, T_LIDAR_CAM0[:3].reshape(-1))) + "\n")
     (calibration / "calib_cam_to_pose.txt").write_text(
-        line("image_00", T_POSE_CAM0[:3]) + line("image_01", T_POSE_CAM0[:3])
+        line("image_00", T_POSE_CAM0[:3]) + line("image_01", np.eye(4)[:3])
     )
     poses = tmp_path / "data_poses" / NAME
     poses.mkdir(parents=True)
@@ -80,7 +81,8 @@ def test_a_drive_is_found_from_its_folder_in_any_of_the_trees(root, part):
 
 def test_points_are_where_the_calibration_says_in_the_picture(root):
     picture, scan = events_of(root, RecordedPicture)[0], events_of(root, RecordedScan)[0]
-    np.testing.assert_allclose(picture.T_vehicle_camera, T_LIDAR_CAM0, atol=1e-9)
+    T_cam0_rectified = inverse(transform_from(RECTIFIED, np.zeros(3)))
+    np.testing.assert_allclose(picture.T_vehicle_camera, T_LIDAR_CAM0 @ T_cam0_rectified, atol=1e-9)
     assert (picture.camera.fx, picture.camera.cx, picture.camera.cy) == (200.0, 110.0, 30.0)
     assert picture.baseline_m == pytest.approx(0.5)
     # 20 px of disparity at 200 px and 0.5 m: 5 m
@@ -110,6 +112,9 @@ def test_a_drive_becomes_a_dataset_without_the_frames_that_have_no_pose(root, tm
     [
         ("calibration/calib_cam_to_velo.txt", "1 2 3", "12 numbers"),
         ("calibration/calib_cam_to_pose.txt", "image_03: 1 2", "image_00 is missing"),
+        ("calibration/calib_cam_to_pose.txt", "image_00: " + "1 " * 12, "no rotation"),
+        ("calibration/calib_cam_to_velo.txt", "1 " * 12, "no rotation"),
+        (f"data_poses/{NAME}/poses.txt", "1 " + "2 " * 12, "line 1: no rotation"),
         ("calibration/perspective.txt", "P_rect_00: 1", "P_rect_00"),
         (f"data_poses/{NAME}/poses.txt", "1 2 3\n", "line 1"),
         (f"data_poses/{NAME}/poses.txt", "x " + "0 " * 12, "line 1"),
@@ -133,3 +138,27 @@ def test_without_scans_or_poses(root):
 def test_depth_that_the_layout_lacks_is_refused(root):
     with pytest.raises(DatasetError, match="sgbm, lidar"):
         opened(root, depth="stored")
+
+
+def test_a_link_to_a_drive_on_another_disk_is_not_followed(root, tmp_path):
+    elsewhere = tmp_path / "disk" / NAME
+    elsewhere.parent.mkdir()
+    (root / "data_3d_raw" / NAME).rename(elsewhere)
+    (root / "data_3d_raw" / NAME).symlink_to(elsewhere)
+    assert opened(root).count() == 10
+
+
+def test_blank_last_lines_are_no_lines(root):
+    for path in (root / f"data_3d_raw/{NAME}/velodyne_points/timestamps.txt", root / f"data_poses/{NAME}/poses.txt"):
+        path.write_text(path.read_text() + "\n")
+    assert len(opened(root).trajectory().stamps_s) == len(MOVED)
+
+
+def test_the_usual_depth_is_that_of_the_pair(root):
+    assert np.median(events_of(root, RecordedPicture, depth="recorded")[0].depth) > 0
+
+
+def test_without_poses_their_mounting_is_not_needed(root):
+    (root / f"data_poses/{NAME}/poses.txt").unlink()
+    (root / "calibration/calib_cam_to_pose.txt").unlink()
+    assert opened(root).trajectory() is None

@@ -10,9 +10,9 @@ from model_training.training.draws import augmented_batches  # noqa: E402  # aft
 from model_training.training.encoder_net import EncoderNet, EncoderShape  # noqa: E402
 from model_training.training.export import export  # noqa: E402
 from model_training.training.from_onnx import net_of  # noqa: E402
-from model_training.training.loop import TrainingConfig, read_packs, train  # noqa: E402
+from model_training.training.loop import TrainingConfig, load_run, read_packs, train  # noqa: E402
 from model_training.training.quantise import Views, quantise  # noqa: E402
-from service.errors import EncoderError  # noqa: E402
+from service.errors import DatasetError, EncoderError  # noqa: E402
 from service.localization.encoder import Encoder  # noqa: E402
 
 # torch's tracing exporter is deprecated in favour of one that needs a newer runtime than the service has
@@ -82,17 +82,51 @@ def test_a_run_may_start_from_an_exported_encoder(shape, exported, pack_folder, 
     assert read_packs(tmp_path / "run") == ["encoder-city-1000", pack_folder.name]
 
 
-def test_a_stopped_run_goes_on_from_its_checkpoint_not_from_the_encoder(shape, exported, pack_folder, tmp_path):
+def test_a_finished_run_is_not_begun_anew_by_the_same_call(shape, exported, pack_folder, tmp_path):
     config = TrainingConfig(steps=2, pairs=24, learning_rate=1e-2, encoder=shape)
-    first = train([pack_folder], tmp_path / "run", config, device="cpu", start_from=exported)
-    again = train([pack_folder], tmp_path / "run", config, device="cpu", start_from=exported)
-    torch.testing.assert_close(first.full12.weight, again.full12.weight, rtol=0, atol=0)
+    steps = []
+    for _ in range(2):
+        net = train(
+            [pack_folder],
+            tmp_path / "run",
+            config,
+            device="cpu",
+            start_from=exported,
+            report=lambda p: steps.append(p.step),
+        )
+    assert steps == [1, 2]
+    torch.testing.assert_close(net.full12.weight, load_run(tmp_path / "run").full12.weight, rtol=0, atol=0)
 
 
 def test_an_encoder_of_another_shape_is_refused(exported, shape, views):
     other = EncoderShape.model_validate(shape.model_dump() | {"narrow": shape.narrow + 1})
-    with pytest.raises(EncoderError, match="shape"):
+    with pytest.raises(EncoderError, match=r"encoder\.onnx: it has the shape"):
         net_of(exported, other, *views[0])
+
+
+@pytest.mark.parametrize("kind", ["nothing", "empty folder", "broken file", "another shape", "run of another shape"])
+def test_what_no_training_can_start_from_is_refused_before_anything_is_written(
+    kind, exported, shape, pack_folder, tmp_path
+):
+    other = EncoderShape.model_validate(shape.model_dump() | {"narrow": shape.narrow + 1})
+    start, wanted = tmp_path / "start", shape
+    if kind == "empty folder":
+        start.mkdir()
+    elif kind == "broken file":
+        start.write_bytes(b"no model")
+    elif kind == "another shape":
+        start, wanted = exported, other
+    elif kind == "run of another shape":
+        train([pack_folder], start, TrainingConfig(steps=1, pairs=24, encoder=other), device="cpu")
+    with pytest.raises((DatasetError, EncoderError), match=start.name):
+        train(
+            [pack_folder],
+            tmp_path / "run",
+            TrainingConfig(steps=1, pairs=24, encoder=wanted),
+            device="cpu",
+            start_from=start,
+        )
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_encoder_of_other_layers_is_refused(exported, shape, views, tmp_path):

@@ -26,6 +26,7 @@ from model_training.training.recipe import (
     stock_plans,
     watch_plans,
 )
+from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
 PLAN = PackPlan(seed=1002, places=6, queries_a_place=2, lidar="hdl_64", size_m=(60.0, 60.0))
@@ -155,6 +156,27 @@ def test_matched_views_are_seen_by_a_camera_and_have_depth_within_it(matched):
     assert np.all((share > 0.6) & (share < 0.85))
     assert not (matched.ranges[~matched.seen] > 0).any()
     assert (matched.ranges[matched.seen] > 0).mean() > 0.4
+
+
+def test_one_seed_gives_one_matched_pack(matched, tmp_path):
+    make_pack(MATCHED, tmp_path / MATCHED.stem, ViewGrid())
+    again = Pack.open(tmp_path / MATCHED.stem)
+    for name in Pack.__annotations__:
+        np.testing.assert_array_equal(getattr(matched, name), getattr(again, name), err_msg=name)
+
+
+def test_a_matched_pack_that_lost_its_mask_is_refused(tmp_path, matched):
+    folder = tmp_path / MATCHED.stem
+    folder.mkdir()
+    for name in set(Pack.__annotations__) - {"seen"}:
+        np.save(folder / f"{name}.npy", getattr(matched, name))
+    with pytest.raises(DatasetError, match=r"seen\.npy"):
+        Pack.open(folder)
+
+
+def test_other_rigs_give_other_packs():
+    brighter = replace(RIG, exposure_ev=(0.5, 0.5))
+    assert replace(MATCHED, rigs=(brighter,)).stem != MATCHED.stem != replace(MATCHED, rigs=(RIG, RIG)).stem
 
 
 def test_matched_depth_errs_as_matching_does(matched):
