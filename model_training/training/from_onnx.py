@@ -64,9 +64,10 @@ def require_shape(encoder: Path, shape: EncoderShape) -> list[tuple[Floats, Floa
         EncoderError: the file is no encoder of this architecture and shape.
     """
     try:
-        opened, layers = Encoder.open(encoder), _layers(encoder)
-    except EncoderError as error:
+        opened = Encoder.open(encoder)
+    except EncoderError as error:  # its text need not name the file
         raise EncoderError(f"{encoder}: {error}", field="encoder") from error
+    layers = _layers(encoder)
     found = _shape(opened, layers, encoder)
     if found != shape:
         raise EncoderError(
