@@ -45,12 +45,15 @@ demo: .venv/.mapping ## simulate streets, build their map, serve it, ask it over
 demo-real: .venv/.mapping ## the same with real stereo frames: make demo-real DATA=../shared/data/kitti_stereo
 	$(BIN)/streetfix demo --real $(DATA) $(ARGS)
 
-test: .venv/.torch ## all tests
-	$(BIN)/python -m pytest $(ARGS)
+# A file's tests stay in one process, whose fixtures they share.
+TEST_PROCESSES = --numprocesses auto --maxprocesses 4 --dist loadfile
+
+test: .venv/.torch ## all tests, in a process for each core
+	$(BIN)/python -m pytest $(TEST_PROCESSES) $(ARGS)
 
 # Without torch and the simulator: what can be tested where the latter's ray caster has no wheel (Linux on ARM).
 test-service: .venv/.dev ## the tests of the service alone
-	$(BIN)/python -m pytest tests/unit/test_*.py \
+	$(BIN)/python -m pytest $(TEST_PROCESSES) tests/unit/test_*.py \
 		$(addprefix tests/unit/,bridge client contract geometry grpc http imaging localization maps registration runtime) $(ARGS)
 
 check: .venv/.torch ## lint, types, layers, and the contracts as the code says them
