@@ -93,7 +93,7 @@ def _rigid(rows: NDArray[np.float64], where: str, field: str) -> Transform:
 
 
 def _poses(path: Path, stamps: dict[int, float], calibration: Path) -> Trajectory | None:
-    """T_map_lidar at those moments that have a frame here."""
+    """T_map_lidar at those moments that have a frame here; None if there is no such moment."""
     if not path.is_file():
         return None
     T_pose_lidar = _mounting(calibration)
@@ -110,4 +110,6 @@ def _poses(path: Path, stamps: dict[int, float], calibration: Path) -> Trajector
         if stamp is not None:
             poses.append(_rigid(rows, f"{path}, line {number}", path.name) @ T_pose_lidar)
             times.append(stamp)
+    if not poses:
+        return None
     return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4), str(path))

@@ -12,9 +12,12 @@ from service.errors import DatasetError
 
 
 def turn_of(times: Path) -> float:
-    """Time of one turn of the LiDAR (s), by the stamps of all scans of the drive, those that an extract leaves out among them."""
-    count = len(times.read_bytes().rstrip().splitlines()) if times.is_file() else 0
-    stamps = stamps_of(times, list(range(count))) or {}
+    """Time of one turn of the LiDAR (s), by the stamps of all scans of the recording.
+
+    An extract has fewer scans than lines. A scan that was not recorded may have a blank line.
+    """
+    lines = times.read_bytes().rstrip().splitlines() if times.is_file() else []
+    stamps = stamps_of(times, [number for number, line in enumerate(lines) if line.strip()]) or {}
     return period_of(np.array([stamps[n] for n in sorted(stamps)]), otherwise_s=1 / RATE_HZ)
 
 

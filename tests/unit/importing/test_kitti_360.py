@@ -162,3 +162,27 @@ def test_without_poses_their_mounting_is_not_needed(root):
     (root / f"data_poses/{NAME}/poses.txt").unlink()
     (root / "calibration/calib_cam_to_pose.txt").unlink()
     assert opened(root).trajectory() is None
+
+
+@pytest.mark.parametrize("text", ["", "\n", "99 1 0 0 0 0 1 0 0 0 0 1 0\n"])
+def test_a_pose_file_without_a_pose_of_this_drive_is_none(root, text):
+    (root / f"data_poses/{NAME}/poses.txt").write_text(text)
+    assert opened(root).trajectory() is None
+
+
+def test_a_scan_that_was_not_recorded_may_have_a_blank_line(root):
+    scans = root / f"data_3d_raw/{NAME}/velodyne_points"
+    lines = (scans / "timestamps.txt").read_text().splitlines()
+    (scans / "data/0000000002.bin").unlink()
+    for eye in ("00", "01"):
+        (root / f"data_2d_raw/{NAME}/image_{eye}/data_rect/0000000002.png").unlink()
+    (scans / "timestamps.txt").write_text("\n".join([*lines[:2], "", *lines[3:]]) + "\n")
+    assert opened(root).count() == 8
+
+
+def test_a_scan_without_a_time_is_named(root):
+    path = root / f"data_3d_raw/{NAME}/velodyne_points/timestamps.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:2], "", *lines[3:]]) + "\n")
+    with pytest.raises(DatasetError, match=r"timestamps.txt, line 3: no time"):
+        opened(root)
