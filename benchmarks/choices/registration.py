@@ -18,6 +18,8 @@ from service.localization.localizer import Localizer
 from service.registration.kernel import QueryPoints
 from service.registration.points import PointSettings
 
+#: The function of ``refine`` that makes points; its result is changed here.
+POINTS = "points_from"
 Sureness = Callable[[QueryPoints], QueryPoints]
 
 
@@ -41,7 +43,7 @@ WEIGHTS: dict[str, tuple[Sureness, PointSettings]] = {
 
 def registration_rows(report: Report, runs: Runs, dataset: Dataset) -> None:
     """Distance errors without registration, with it, and with its weights switched off; every query forced to answer."""
-    bundle, points_of = runs.bundle(dataset), refine.points_of
+    bundle, points_from = runs.bundle(dataset), getattr(refine, POINTS)
     plain = Localizer.open(bundle)
     for name in dataset.query_sets(with_truth=True):
         with bars() as show:
@@ -50,9 +52,9 @@ def registration_rows(report: Report, runs: Runs, dataset: Dataset) -> None:
             weighed = Localizer(bundle, plain.encoder, refining=replace(plain.refining, points=settings))
 
             def points(*given: Any, _as: Sureness = sureness, **named: Any) -> QueryPoints:
-                return _as(points_of(*given, **named))
+                return _as(points_from(*given, **named))
 
-            with bars() as show, patch.object(refine, "points_of", points):
+            with bars() as show, patch.object(refine, POINTS, points):
                 found[how] = predict(weighed, dataset, name, report=show)
         for how, answers in found.items():
             row = f"choices.registration.{how}.{name.rpartition('_')[2]}"

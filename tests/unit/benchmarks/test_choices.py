@@ -4,10 +4,12 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `training`")
 
 from benchmarks.choices.__main__ import _nearest_to_fixed, _vote
+from benchmarks.choices.registration import POINTS
 from benchmarks.choices.trainings import VARIATIONS
 from benchmarks.choices.watch import Seen, watch_plan
 from model_training.training.loop import TrainingConfig
 from model_training.training.recipe import WATCH_SEEDS
+from service.localization import refine
 
 
 def test_a_place_is_as_like_a_query_as_its_best_view_at_the_best_turn():
@@ -48,3 +50,7 @@ def test_variations_differ_from_the_reference_in_one_thing_and_are_configuration
 
 def test_choices_are_measured_in_a_watch_city():
     assert watch_plan().seed in WATCH_SEEDS
+
+
+def test_what_registration_is_measured_without_is_a_function_that_it_calls():
+    assert POINTS in refine._points.__code__.co_names
