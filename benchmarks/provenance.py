@@ -81,6 +81,7 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "choices": {"": (*_CORE, *_DATA, "model_training/training")},
     "console": {"": ("service/console", "service/http"), "docs.": (*_ALL, "README.md", "docs")},
+    "house": {"": (*_ALL, "pyproject.toml", "README.md", "docs")},
     "kitti": {"": (*_CORE, *_DATA, "model_training/importing")},
     "paper": {"": (*_CORE, *_DATA, "model_training/baselines", "model_training/training")},
     "real_data": {"": (*_CORE, *_DATA, "model_training/importing", "model_training/odometry", "model_training/exporting"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib
 
+from benchmarks import decisions
 from benchmarks.figures import write_figures
 from benchmarks.report import REPORTS, ROOT, write_report
 
@@ -24,12 +25,13 @@ row's commit; any change of these files counts, a comment too. *Age unknown* mea
 
 
 def main() -> None:
-    """Bring figures in documents up to date; write ``reports/README.md`` and ``reports/NAME.png``."""
+    """Bring figures in documents up to date; write ``reports/README.md``, ``reports/NAME.png`` and the index of the decisions."""
     lines = [HEAD]
     for path in sorted(REPORTS.glob("*.json")):
         write_report(path, json.loads(path.read_text()))
         lines += _section(path.stem, json.loads(path.read_text()))
     (REPORTS / "README.md").write_text("\n".join(lines))
+    decisions.write_index()
     for page in write_figures():
         print(f"figures written anew: {page.relative_to(ROOT)}")
 

@@ -1,4 +1,4 @@
-"""Why a bar is missed, as people found out; each reason names the value that it explains. docs/decisions.md has what was tried."""
+"""Why a bar is missed, as people found out; each reason names the value that it explains. docs/decisions has what was tried."""
 
 import math
 from collections.abc import Iterable, Mapping

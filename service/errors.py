@@ -308,6 +308,19 @@ class NotFiniteError(ArithmeticError):
         self.path = path
 
 
+def how_to_install(extra: str | None) -> str:
+    """The remedy for a missing extra. Streetfix is not on PyPI, so pip needs a clone.
+
+    Args:
+        extra: of ``pyproject.toml``; None for the package without extras.
+    """
+    return (
+        f'in a clone of Streetfix run pip install ".[{extra}]"'
+        if extra
+        else "in a clone of Streetfix run pip install ."
+    )
+
+
 class ExtraMissingError(StreetfixError):
     """A command needs packages of an extra that is not installed."""
 

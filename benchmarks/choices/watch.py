@@ -16,7 +16,7 @@ from service.geometry.rigid import heading_of_body
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import PLANES, ViewGrid, survey_planes
 from service.localization.encoder import Encoder
-from service.localization.localizer import turns_on
+from service.localization.retrieval import turns_on
 from service.maps.streets import Streets
 
 REACH_M = 5.0

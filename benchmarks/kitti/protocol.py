@@ -9,7 +9,7 @@ from service.errors import NoDepthError
 from service.geometry.earth import Georeference
 from service.imaging.query_view import query_views
 from service.localization.encoder import Encoder
-from service.localization.localizer import turns_on
+from service.localization.retrieval import turns_on
 from service.maps.reader import MapBundle
 
 RIGHT_M = 10.0

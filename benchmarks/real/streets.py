@@ -33,7 +33,7 @@ from service.maps.reader import MapBundle
 DRIVES = ("kitti_0005", "kitti_0013")
 QUERIES = "recorded"
 SEQUENCE = 5
-#: Bars of issue 36 (docs/decisions.md).
+#: Bars of issue 36 (docs/decisions).
 _ANSWERED, _WRONG, _MEDIAN_M, _RECALL_5M, _RECALL_10M, _INLIERS = 0.95, 0.02, 0.12, 0.95, 0.98, 0.5
 
 

@@ -17,7 +17,7 @@ from model_training.mapping.build import BuildSettings, view_ranges
 from service.errors import NoDepthError
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import ViewGrid
-from service.localization.localizer import turns_on
+from service.localization.retrieval import turns_on
 from service.maps.reader import MapBundle
 
 Ranges = NDArray[np.float32]

@@ -16,8 +16,9 @@ from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import Rotation, Transform, heading_of_camera, transform_from, wrap_angle
 from service.localization.answer import Answer
 from service.localization.frames import Frame
-from service.localization.localizer import RANKED, Localizer
+from service.localization.localizer import Localizer
 from service.localization.refine import settings_for_rig
+from service.localization.retrieval import RANKED
 from service.localization.search import distinct_places
 from service.localization.starts import starts_from
 from service.registration.kernel import STATE, QueryPoints

@@ -15,7 +15,7 @@ def draw(found: list[Summary], path: Path) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ExtraMissingError("--plot needs matplotlib: pip install matplotlib, or streetfix[dev]") from error
+        raise ExtraMissingError("--plot needs matplotlib: pip install matplotlib") from error
     runs = sorted(found, key=lambda each: each.offered_per_s)
     figure = Figure(figsize=(7, 5), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))

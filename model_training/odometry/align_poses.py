@@ -15,7 +15,7 @@ from model_training.importing.take import scans_of
 from model_training.importing.trajectory import Trajectory
 from model_training.odometry.pose_graph import held_near
 from model_training.odometry.scan_to_map import FineMap
-from service.errors import ExtraMissingError
+from service.errors import ExtraMissingError, how_to_install
 from service.geometry.rigid import inverse
 
 Report = Callable[[str, int, int], None]
@@ -65,7 +65,7 @@ def aligned_with_scans(
         import small_gicp  # noqa: F401
     except ModuleNotFoundError as error:
         raise ExtraMissingError(
-            f'aligning poses needs {error.name}: pip install "streetfix[odometry]", or import with --no-align',
+            f"aligning poses needs {error.name}: {how_to_install('odometry')}, or import with --no-align",
             field="align",
         ) from error
     mounted = recording.lidar.T_vehicle_sensor

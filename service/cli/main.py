@@ -12,7 +12,7 @@ import typer
 from pydantic import ValidationError
 
 from service.cli import bridge, health, keys, localize, serve
-from service.errors import ExtraMissingError, StreetfixError
+from service.errors import ExtraMissingError, StreetfixError, how_to_install
 
 GROUP = "streetfix.commands"
 #: One line for ``--help``, which must not import what it lists, and the extra that brings a command's packages.
@@ -159,10 +159,9 @@ def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any] | typer.Ty
     A missing package is told as a missing extra, whether now or when it runs.
     """
     if not _is_installed(point):
-        remedy = f"streetfix[{extra}]" if extra else "streetfix"
         raise ExtraMissingError(
             f"the command {point.name!r} is not part of this installation, which is the service alone (as in its container image): "
-            f'where maps are built, pip install "{remedy}"',
+            f"where maps are built, {how_to_install(extra)}",
             field=point.name,
         )
     try:
@@ -194,7 +193,7 @@ def _package(error: ModuleNotFoundError) -> str:
 
 def _extra_missing(command: str, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
     extra = _EXTRA_OF_PACKAGE.get(_package(error), extra)
-    remedy = f'pip install "streetfix[{extra}]"' if extra else "install the packages it needs"
+    remedy = how_to_install(extra) if extra else "install the packages it needs"
     if _package(error) in _NOT_EVERYWHERE:
         remedy = f"it is to be had {_NOT_EVERYWHERE[_package(error)]} alone ({remedy})"
     return ExtraMissingError(f"the command {command!r} needs the package {error.name!r}: {remedy}", field=command)

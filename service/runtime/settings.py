@@ -94,7 +94,7 @@ class Settings(BaseSettings):
         "warning", description="info: a line for each request"
     )
     traces_endpoint: str | None = Field(
-        None, description="OpenTelemetry collector, as http://127.0.0.1:4318/v1/traces; needs streetfix[otel]"
+        None, description="OpenTelemetry collector, as http://127.0.0.1:4318/v1/traces; needs the extra otel"
     )
     traces_share: float = Field(
         0.05, ge=0, le=1, description="share of the requests without a trace of their own that get one"

@@ -6,7 +6,7 @@ Nothing of OpenTelemetry is imported unless an endpoint is set.
 import time
 from typing import TYPE_CHECKING
 
-from service.errors import ExtraMissingError
+from service.errors import ExtraMissingError, how_to_install
 from service.localization.answer import Timings
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class Tracing:
             from opentelemetry.sdk.trace.sampling import ParentBased, TraceIdRatioBased
         except ImportError as error:
             raise ExtraMissingError(
-                "traces_endpoint needs OpenTelemetry: pip install 'streetfix[otel]', or leave it out"
+                f"traces_endpoint needs OpenTelemetry: {how_to_install('otel')}, or leave it out"
             ) from error
         provider = TracerProvider(
             resource=Resource.create({"service.name": "streetfix"}), sampler=ParentBased(TraceIdRatioBased(share))

@@ -147,7 +147,7 @@ def test_a_command_that_is_not_there_says_what_to_install(
     done = run([str(installed / "bin" / "streetfix"), *arguments], tmp_path)
     assert done.returncode == 1
     assert f"the command '{arguments[0]}' is not part of this installation" in done.stderr
-    assert f'pip install "streetfix[{extra}]"' in done.stderr
+    assert f'pip install ".[{extra}]"' in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
 

@@ -18,7 +18,7 @@ OTHERS = [
     ROOT / "openapi" / "openapi.json", *sorted((ROOT / "proto").rglob("*.proto")),
     *(path for path in sorted((ROOT / "deploy").rglob("*")) if path.suffix in (".yaml", ".yml", ".md", ".txt", ".toml")),
 ]  # fmt: skip
-PAGES = [page for page in documents() if page.name != "decisions.md"]
+PAGES = documents()
 NUMBER = r"(?:\d[\d.,]*|two|three|four|five|six|ten)"
 #: What a document must not type: how fast the service is, and how often it errs by default.
 TYPED = {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model_training.baselines.learning import Report
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.voxel_map import VoxelMap
-from service.errors import ExtraMissingError
+from service.errors import ExtraMissingError, how_to_install
 
 VOXEL_M = 0.3
 EVERY_M = 1.0  # of the drive a scan is taken; those between see the same walls
@@ -73,9 +73,7 @@ def small_gicp_package() -> Any:
     try:
         import small_gicp
     except ModuleNotFoundError as error:
-        raise ExtraMissingError(
-            'ICP needs small_gicp: pip install "streetfix[odometry]"', field="small_gicp"
-        ) from error
+        raise ExtraMissingError(f"ICP needs small_gicp: {how_to_install('odometry')}", field="small_gicp") from error
     return small_gicp
 
 

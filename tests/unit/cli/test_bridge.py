@@ -42,7 +42,7 @@ def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.delitem(sys.modules, "service.bridge.messages")
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     assert run("ros2") == 1
-    assert 'pip install "streetfix[ros2]"' in capsys.readouterr().err
+    assert 'pip install ".[ros2]"' in capsys.readouterr().err
 
 
 def test_rclpy_without_ros_is_told(capsys: pytest.CaptureFixture[str]) -> None:

@@ -126,7 +126,7 @@ def test_a_mounted_command_may_have_commands_of_its_own(capsys: pytest.CaptureFi
 @pytest.mark.usefixtures("care")
 def test_a_missing_package_of_a_commands_command_names_the_extra(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("map", "merge") == 1
-    assert 'pip install "streetfix[mapping]"' in capsys.readouterr().err
+    assert 'pip install ".[mapping]"' in capsys.readouterr().err
 
 
 def test_only_the_called_command_is_imported(mount: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,7 +145,7 @@ def test_a_missing_package_names_the_extra(
 
     mount(**{name: needs_much})
     assert run(name.replace("_", "-")) == 1
-    assert f'pip install "streetfix[{extra}]"' in capsys.readouterr().err
+    assert f'pip install ".[{extra}]"' in capsys.readouterr().err
 
 
 def test_a_package_missing_at_import_names_the_extra(
@@ -208,7 +208,7 @@ def test_a_command_beside_the_service_says_where_it_is_to_be_had(
     assert run(command, "--help") == 1
     told = capsys.readouterr().err
     assert f"the command '{command}' is not part of this installation, which is the service alone" in told
-    assert f'pip install "streetfix[{extra}]"' in told
+    assert f'pip install ".[{extra}]"' in told
 
 
 def test_the_service_alone_lists_what_it_has(service_alone: None, capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,7 +89,7 @@ def test_without_registration_the_heaviest_cluster_says_the_street_whatever_the_
 ) -> None:
     """Places on both sides of a street's border vote across it; a cluster lies on one side."""
     outvoted = StreetVote(street=1, share=0.6, shares=((1, 0.6), (2, 0.4)))
-    monkeypatch.setattr("service.localization.localizer.vote", lambda *_: outvoted)
+    monkeypatch.setattr("service.localization.retrieval.vote", lambda *_: outvoted)
     answer = localizer.localize(replace(query, refine=False))
     assert answer.vote is outvoted
     assert answer.street == answer.hypotheses[0].street == 2

@@ -92,5 +92,5 @@ def test_without_an_endpoint_nothing_is_traced_and_nothing_is_imported(monkeypat
 
 def test_without_the_extra_an_endpoint_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "opentelemetry.exporter.otlp.proto.http.trace_exporter", None)
-    with pytest.raises(ExtraMissingError, match=r"streetfix\[otel\]"):
+    with pytest.raises(ExtraMissingError, match=r"pip install \"\.\[otel\]\""):
         Tracing.open("http://127.0.0.1:4318/v1/traces", share=1.0)

@@ -123,4 +123,4 @@ def test_a_missing_package_names_the_extra(bundle_path, tmp_path, monkeypatch, c
     with pytest.raises(SystemExit) as end:
         main(["view", str(bundle_path), option, str(tmp_path / "x")])
     assert end.value.code == 1
-    assert 'pip install "streetfix[view]"' in capsys.readouterr().err
+    assert 'pip install ".[view]"' in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""How readable the code and the documents are: ``make house`` writes ``reports/house.json``."""

@@ -1,0 +1,113 @@
+"""Which public functions of the library say what a caller must know."""
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.report import ROOT
+
+#: What other code may call: the core and the client.
+PACKAGES = ("client", "geometry", "imaging", "localization", "maps", "registration")
+_ARRAY = re.compile(r"NDArray|Float\d|Int\d|Bool\[")
+#: A shape: "(N, 3)", "(rows, columns)"; jaxtyping says it in the annotation.
+_SHAPE = re.compile(r"\([A-Za-z0-9_ ]+,[A-Za-z0-9_, ]*\)")
+_JAXTYPING = re.compile(r"(?:Float|Int|UInt|Bool|Shaped|Num)\d*\[")
+
+
+@dataclass(frozen=True, slots=True)
+class Lacking:
+    """A public function and what its docstring leaves out.
+
+    Attributes:
+        name: ``path:line name``.
+        what: "docstring", "Args", "Raises" or "shape".
+    """
+
+    name: str
+    what: str
+
+
+def public_functions(package: str) -> Iterator[tuple[Path, ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
+    """Public functions and methods of public classes of a package of ``service``: file, function, whether it is a method."""
+    for path in sorted((ROOT / "service" / package).rglob("*.py")):
+        if path.name.startswith("_") and path.name != "__init__.py":
+            continue
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.name.startswith("_"):
+                yield path, node, False
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                for inner in node.body:
+                    if isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef) and not inner.name.startswith("_"):
+                        yield path, inner, True
+
+
+def lacking(function: ast.FunctionDef | ast.AsyncFunctionDef, *, is_method: bool) -> str | None:
+    """What the docstring of a function leaves out: the first of its docstring, an argument, an error, a shape; or None.
+
+    Args:
+        function: public.
+        is_method: its first argument is the instance.
+    """
+    text = ast.get_docstring(function)
+    if text is None:
+        return "docstring"
+    given = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    given = given[1:] if is_method and not _is_static(function) else given
+    for argument in given:
+        if not re.search(rf"^\s+\*{{0,2}}{argument.arg}(?:, \w+)*:|^\s+(?:\w+, )*{argument.arg}:", text, re.MULTILINE):
+            return f"Args: {argument.arg}"
+    raises = any(isinstance(node, ast.Raise) and node.exc is not None for node in _own_nodes(function))
+    if raises and "Raises:" not in text:
+        return "Raises"
+    annotations = [ast.unparse(a.annotation) for a in given if a.annotation is not None]
+    annotations += [ast.unparse(function.returns)] if function.returns is not None else []
+    for annotation in annotations:
+        needs_shape = _ARRAY.search(annotation) and not _JAXTYPING.search(annotation)
+        if needs_shape and not _SHAPE.search(text):
+            return "shape"
+    return None
+
+
+def all_lacking() -> tuple[list[Lacking], int]:
+    """Public functions whose docstrings leave something out, and how many public functions there are."""
+    found, count = [], 0
+    for package in PACKAGES:
+        for path, function, is_method in public_functions(package):
+            count += 1
+            what = lacking(function, is_method=is_method)
+            if what is not None:
+                found.append(Lacking(f"{path.relative_to(ROOT)}:{function.lineno} {function.name}", what))
+    return found, count
+
+
+def code_lines(path: Path) -> int:
+    """Lines of a module with code: no docstrings, no comments, no blank lines.
+
+    Args:
+        path: of the module.
+    """
+    text = path.read_text()
+    of_docstrings: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(
+            node
+        ):
+            first = node.body[0]
+            of_docstrings.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
+    return sum(bool(line) and not line.startswith("#") and number not in of_docstrings for number, line in lines)
+
+
+def _is_static(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    return any(isinstance(each, ast.Name) and each.id == "staticmethod" for each in function.decorator_list)
+
+
+def _own_nodes(function: ast.AST) -> Iterator[ast.AST]:
+    """Nodes of a function without those of functions inside."""
+    for node in ast.iter_child_nodes(function):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        yield node
+        yield from _own_nodes(node)

@@ -1,0 +1,88 @@
+"""Which files of the service one real request passes through."""
+
+import asyncio
+import sys
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import httpx
+
+from benchmarks.report import ROOT
+from service.http.app import create_app
+from service.runtime.engine import Engine
+from service.runtime.settings import Settings
+
+_SERVICE = str(ROOT / "service") + "/"
+
+
+@dataclass(slots=True)
+class Trace:
+    """Files of ``service`` whose functions were called, in the order of their first calls.
+
+    Attributes:
+        before_engine: until the engine was called.
+        in_core: from that call to its return.
+    """
+
+    before_engine: list[str] = field(default_factory=list)
+    in_core: list[str] = field(default_factory=list)
+    _is_on: bool = False
+    _depth: int = 0
+    _asked: bool = False
+
+    def profile(self, frame: FrameType, event: str, _: Any) -> None:
+        """For ``sys.setprofile``: note the file of every call."""
+        if not self._is_on or not frame.f_code.co_filename.startswith(_SERVICE):
+            return
+        is_engine = frame.f_code in _ENGINE
+        if event == "call":
+            if is_engine:
+                self._depth += 1
+                self._asked = True
+            files = self.in_core if self._depth else self.before_engine
+            name = str(Path(frame.f_code.co_filename).relative_to(ROOT))
+            if (self._depth or not self._asked) and name not in files:
+                files.append(name)
+        elif event == "return" and is_engine:
+            self._depth -= 1
+
+
+_ENGINE: frozenset[CodeType] = frozenset({Engine.localize.__code__, Engine.localize_sequence.__code__})
+
+
+def trace_of_request(bundle: Path, parts: dict[str, tuple[str, bytes, str]]) -> Trace:
+    """Ask a service in this process once to warm up, then once more, traced.
+
+    Args:
+        bundle: map to serve.
+        parts: multipart fields of ``POST /v1/localize``: file name, bytes, media type.
+
+    Raises:
+        RuntimeError: the service did not answer 200.
+    """
+    trace = Trace()
+    threading.setprofile(trace.profile)  # worker threads start below
+    sys.setprofile(trace.profile)
+    try:
+        engine = Engine.open(Settings(maps=(bundle,), threads=1))
+        try:
+            asyncio.run(_ask_twice(engine, parts, trace))
+        finally:
+            engine.close()
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)  # type: ignore[arg-type]  # documented to take None
+    return trace
+
+
+async def _ask_twice(engine: Engine, parts: dict[str, tuple[str, bytes, str]], trace: Trace) -> None:
+    transport = httpx.ASGITransport(create_app(engine))
+    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
+        for trace._is_on in (False, True):
+            answer = await client.post("/v1/localize", files=parts)
+            if answer.status_code != 200:
+                raise RuntimeError(f"POST /v1/localize: {answer.status_code} {answer.text}")
+    trace._is_on = False

@@ -1,0 +1,94 @@
+"""The answer, put together from what the stages found."""
+
+from time import perf_counter
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.geometry.rigid import Transform, inverse, transform_from
+from service.imaging.query_view import QueryViews
+from service.localization.answer import Answer, Timings, require_finite
+from service.localization.frames import Frame
+from service.localization.hypotheses import Hypothesis
+from service.localization.outcome import Outcome
+from service.localization.refine import Refined
+from service.localization.rerank import reranked
+from service.localization.retrieval import Retrieved
+from service.maps.reader import MapBundle
+
+
+def compose(
+    bundle: MapBundle, frames: tuple[Frame, ...], retrieved: Retrieved, refined: Refined | None,
+    evidence: Float64[NDArray[np.float64], " F"] | None, outcome: Outcome, *, started: float, found: float,
+) -> Answer:  # fmt: skip
+    """Put an answer together.
+
+    Args:
+        bundle: the map.
+        frames: the reference first.
+        retrieved: places, clusters and vote.
+        refined: registered candidates; None if nothing was registered.
+        evidence: confidence features; None without ``refined``.
+        outcome: status, confidence and the candidates to tell.
+        started: when the answer began, ``time.perf_counter`` (s).
+        found: when retrieval had ended.
+
+    Raises:
+        NotFiniteError: a number of the answer is not finite, by a defect of ours or of the map.
+    """
+    done = perf_counter()
+    query, views, heaviest = frames[0].query, frames[0].views, retrieved.hypotheses[0]
+    T_map_camera = _pose_of(bundle, heaviest, views) if refined is None else refined.best.T_map_camera
+    told = max(query.neighbours, query.ranked)
+    answer = Answer(
+        status=outcome.status,
+        confidence=outcome.confidence,
+        street=_street_of(bundle, T_map_camera, heaviest, registered=refined is not None),
+        vote=retrieved.vote,
+        T_map_camera_guess=T_map_camera,
+        covariance=None if refined is None else refined.covariance,
+        candidates=outcome.candidates,
+        spread=outcome.spread,
+        reasons=outcome.reasons,
+        frames=len(frames),
+        evidence=evidence,
+        T_map_vehicle_guess=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
+        neighbours=reranked(retrieved.neighbours, outcome.candidates or ())[:told],
+        hypotheses=retrieved.hypotheses,
+        measured_share=views.measured_share,
+        height_m=views.height_m,
+        timings=_timings(frames, started, found, done, registered=refined is not None),
+    )
+    require_finite(answer)
+    return answer
+
+
+def _timings(frames: tuple[Frame, ...], started: float, found: float, done: float, *, registered: bool) -> Timings:
+    fuse_s, encode_s, search_s = (
+        sum(getattr(frame, name) for frame in frames) for name in ("fuse_s", "encode_s", "search_s")
+    )
+    return Timings(
+        fuse_ms=1e3 * fuse_s,
+        encode_ms=1e3 * encode_s,
+        search_ms=1e3 * (search_s + found - started),
+        register_ms=1e3 * (done - found) if registered else 0.0,
+        total_ms=1e3 * (done - started + fuse_s + encode_s + search_s),
+    )
+
+
+def _street_of(bundle: MapBundle, T_map_camera: Transform, heaviest: Hypothesis, *, registered: bool) -> int:
+    """The street under a registered position; else that of the heaviest cluster, which never spans two streets.
+
+    The vote of the nearest places crosses the border of a street more often (decision 0084).
+    """
+    if bundle.streets is None:
+        return -1
+    return bundle.streets.index_at(T_map_camera[:2, 3]) if registered else heaviest.street
+
+
+def _pose_of(bundle: MapBundle, hypothesis: Hypothesis, views: QueryViews) -> Transform:
+    """The camera at the position of a hypothesis, at its own height above the ground under the places' LiDAR."""
+    above_lidar_m = views.height_m - bundle.manifest.lidar_height_m
+    position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])
+    return transform_from(hypothesis.R_map_level @ views.R_level_camera, position_m)
