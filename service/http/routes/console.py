@@ -15,9 +15,13 @@ def router_for() -> APIRouter:
     router = APIRouter(tags=["console"], include_in_schema=False)
     files = built_files()
 
+    # Redirects are relative, so that a proxy may put the service below a path of its own.
+    @router.get("/", operation_id="getRoot")
+    async def get_root() -> Response:
+        return RedirectResponse("console/", status_code=307, headers=HEADERS)  # temporary: the console may be switched off
+
     @router.get("/console", operation_id="getConsole")
     async def get_console() -> Response:
-        # Relative, so that a proxy may put the service below a path of its own.
         return RedirectResponse("console/", status_code=308, headers=HEADERS)
 
     @router.get("/console/{name:path}", operation_id="getConsoleFile")

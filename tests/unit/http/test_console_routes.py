@@ -56,6 +56,12 @@ def test_the_address_without_a_slash_leads_to_the_page_whatever_lies_before_it(c
     assert (moved.status_code, moved.headers["location"]) == (308, "console/")
 
 
+def test_the_root_leads_to_the_page(client: httpx.Client, guarded: httpx.Client) -> None:
+    for each in (client, guarded):
+        moved = each.get("/")
+        assert (moved.status_code, moved.headers["location"]) == (307, "console/")
+
+
 def test_a_file_that_was_not_changed_is_not_sent_again(client: httpx.Client) -> None:
     etag = client.get("/console/").headers["etag"]
     again = client.get("/console/", headers={"If-None-Match": etag})
@@ -143,7 +149,7 @@ def test_switched_off_nothing_of_it_is_there_and_no_answer_is_kept(
 ) -> None:
     engine = Engine.open(Settings(maps=(bundle_path,), threads=1, console=False))
     client = client_of(engine)
-    for path in ("/console", "/console/", "/v1/maps/tiny/cloud", "/v1/samples", "/v1/answers"):
+    for path in ("/", "/console", "/console/", "/v1/maps/tiny/cloud", "/v1/samples", "/v1/answers"):
         assert client.get(path).status_code == 404, path
     assert client.post("/v1/localize", files=parts_of()).status_code == 200
     assert engine.last_answers.newest(5) == []
