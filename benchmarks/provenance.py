@@ -69,7 +69,7 @@ _CORE = (
     "model_training/stock",
 )
 _DATA = ("model_training/simulation", "model_training/datasets", "model_training/mapping", "model_training/evaluation")
-_ALL = ("service", "model_training", "native")
+_ALL = ("streetfix", "service", "model_training", "native")
 #: What rows of each report measure, by the beginning of their ids: the longest that fits counts, "" is for all others. Programs that
 #: measure are left out: a row is as old as what it measures.
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
@@ -153,7 +153,7 @@ def loaded_commit() -> str:
 
 def is_dirty() -> bool | None:
     """Whether the code differs from the commit that is checked out; None without Git."""
-    told = git("status", "--porcelain", "--", "service", "model_training", "benchmarks", "native")
+    told = git("status", "--porcelain", "--", "streetfix", "service", "model_training", "benchmarks", "native")
     return None if told is None else bool(told)
 
 

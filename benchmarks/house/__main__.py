@@ -1,8 +1,10 @@
 """``make house``: rows on readability -> ``reports/house.json``."""
 
+import argparse
 import json
 import tempfile
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.docs_blocks import code_blocks_run
@@ -20,19 +22,39 @@ MOST_LINES, LONGEST_LINE, EASE = 120, 200, 55.0
 
 
 def main() -> None:
-    """Measure and write all rows."""
+    """Measure the parts that are wanted; rows of the others stay."""
+    parts: dict[str, Callable[[Report], None]] = {
+        "documents": _document_rows, "docstrings": _docstring_rows, "request": _request_rows, "blocks": _block_rows
+    }  # fmt: skip
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.house", description="How readable code and documents are -> reports/house.json",
+        epilog="Example: python -m benchmarks.house --only documents docstrings",
+    )  # fmt: skip
+    parser.add_argument(
+        "--only", nargs="+", choices=list(parts), default=list(parts), help="parts to measure (default: all)"
+    )
     report = Report("house", "python -m benchmarks.house")
+    only = parser.parse_args().only
+    report.keep_others()
+    for name in only:
+        parts[name](report)
+    print(report.write())
+
+
+def _document_rows(report: Report) -> None:
+    """Length of README, the longest line of the documents, and reading ease of documents and docstrings."""
     documents = [page.read_text() for page in pages()]
     report.row("readme.lines", len(documents[0].splitlines()), "lines", bar=MOST_LINES, better="lower")
     longest = max(len(line) for text in documents for line in text.splitlines())
     report.row("docs.longest_line", longest, "characters", bar=LONGEST_LINE, better="lower")
     _reading_rows(report, documents)
-    _docstring_rows(report)
-    _request_rows(report)
+
+
+def _block_rows(report: Report) -> None:
+    """Share of the code blocks in README and docs that run."""
     ran, total = code_blocks_run()
     why = None if ran == total else f"{total - ran} of {total} failed"
     report.row("docs.code_blocks_run", ran / total, "share", bar=1.0, n=total, why=why)
-    print(report.write())
 
 
 def _reading_rows(report: Report, documents: list[str]) -> None:

@@ -88,7 +88,7 @@ def test_every_report_says_what_its_rows_measure_and_that_is_there():
 def test_the_longest_beginning_says_what_a_row_measures():
     assert "model_training/importing" in measured_paths("accuracy", "real.kitti_stereo.recall_at_1")
     assert "model_training/importing" not in measured_paths("accuracy", "full.unseen")
-    assert measured_paths("a report that is new", "a") == ("service", "model_training", "native")
+    assert measured_paths("a report that is new", "a") == ("streetfix", "service", "model_training", "native")
 
 
 @pytest.mark.parametrize("path", REPORTS, ids=lambda path: path.stem)

@@ -1,0 +1,25 @@
+"""``import streetfix``: the names that most programs need, each loaded when it is used."""
+
+import subprocess
+import sys
+
+import pytest
+
+import streetfix
+
+
+def test_every_name_is_there() -> None:
+    assert dir(streetfix) == sorted(streetfix.__all__)
+    for name in streetfix.__all__:
+        assert getattr(streetfix, name).__name__ == name
+
+
+def test_an_unknown_name_is_an_error_that_lists_the_known_ones() -> None:
+    with pytest.raises(AttributeError, match="Localizer, MapBundle"):
+        _ = streetfix.Locator
+
+
+def test_a_client_does_not_load_the_localizer() -> None:
+    told = "import sys, streetfix; streetfix.Client; print('onnxruntime' in sys.modules, 'faiss' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
