@@ -1,4 +1,4 @@
-"""The robot's side of the service: numpy arrays in, typed answers out, over HTTP or gRPC."""
+"""Clients of the service over HTTP and gRPC. They take NumPy arrays and return typed answers."""
 
 from service.client.asking import About, AboutSequence, Frame
 from service.client.async_client import AsyncClient

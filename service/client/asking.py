@@ -1,4 +1,4 @@
-"""Arrays and what is known beside them, as requests of the contract with their pictures; no transport is known here."""
+"""Build requests of the contract and encoded images from arrays, independent of the transport."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,18 +21,19 @@ Camera = PinholeCamera | schema.Camera
 
 
 class About(TypedDict, total=False):
-    """What may be said beside one pair of pictures.
+    """Optional data of a query.
 
     Attributes:
-        map: which one; needed where the service has several. ``name@version`` asks an older version.
-        gravity: down in the camera frame, three numbers of any length but zero, from an IMU.
-        T_vehicle_camera: (4, 4), where the camera sits; then ``vehicle_pose`` is answered too.
-        prior: where the camera is believed to be.
-        options: what to answer.
-        depth_scale_m: metres for each unit of the depth array; by default 0.001 for integers, 1 for floating values.
-        depth_kind: along the optical axis (the default), along the ray, or disparity.
-        max_range_m: what lies beyond is no measurement.
-        baseline_m: of the stereo rig, metres.
+        map: name of the map. Required if the service has several. ``name@version`` selects an older version.
+        gravity: (3,), downward direction in the camera frame, from an IMU. Any length except zero.
+        T_vehicle_camera: (4, 4), pose of the camera in the vehicle frame, metres. With it, the answer has ``vehicle_pose``.
+        prior: prior knowledge of the camera's pose.
+        options: what the answer contains.
+        depth_scale_m: metres (disparity: pixels) per unit of the depth array. The default is 0.001 for integers and 1 for
+            floating-point values.
+        depth_kind: ``z`` (along the optical axis, the default), ``range`` (along the ray) or ``disparity``.
+        max_range_m: larger ranges are no measurement, metres.
+        baseline_m: baseline of the stereo rig, metres. Required for disparity.
     """
 
     map: str | None
@@ -47,7 +48,16 @@ class About(TypedDict, total=False):
 
 
 class AboutSequence(TypedDict, total=False):
-    """What may be said beside a sequence; of the first frame's camera, as in ``About``."""
+    """Optional data of a sequence or a batch, as in ``About``.
+
+    In a sequence ``T_vehicle_camera`` and ``prior`` describe the camera of the first frame.
+
+    Attributes:
+        map: name of the map.
+        T_vehicle_camera: (4, 4), pose of the camera in the vehicle frame, metres.
+        prior: prior knowledge of the camera's pose.
+        options: what the answer contains.
+    """
 
     map: str | None
     T_vehicle_camera: NDArray[Any] | None
@@ -57,13 +67,14 @@ class AboutSequence(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Frame:
-    """A pair of pictures of a sequence or a batch.
+    """One colour image and one depth image of a sequence or a batch.
 
     Attributes:
-        rgb: (H, W, 3) uint8, sRGB.
-        depth: (H, W), metres as floating values, or uint16; 0 and NaN where nothing was measured.
+        rgb: (H, W, 3), sRGB.
+        depth: (H, W), metres as floating-point values, or uint16. 0 and NaN mean that nothing was measured.
         camera: rectified intrinsics, pixels.
-        T_reference_camera: (4, 4), where this camera stood against the first frame's; None in the first frame and in a batch.
+        T_reference_camera: (4, 4), transform from this camera to the first frame's camera, metres. None in the first frame
+            and in a batch.
         gravity, depth_scale_m, depth_kind, max_range_m, baseline_m: as in ``About``.
     """
 
@@ -80,17 +91,30 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Asked(Generic[D]):
-    """A request and its pictures, encoded: colour and depth of each frame."""
+    """A request with its encoded images.
+
+    Attributes:
+        document: the request of the contract, without images.
+        pictures: encoded colour image and encoded depth image of each frame.
+    """
 
     document: D
     pictures: tuple[tuple[bytes, bytes], ...]
 
 
 def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing) -> Asked[schema.LocalizeRequest]:
-    """A single pair.
+    """Build the request for a single query.
+
+    Args:
+        rgb: (H, W, 3), sRGB.
+        depth: (H, W), metres along the optical axis as floating-point values, or uint16.
+        camera: rectified intrinsics, pixels.
+        about: optional data of the query.
+        packing: how images are encoded.
 
     Raises:
-        RequestError: an array or a number makes no sense; its name is in ``field``.
+        RequestError: an argument is invalid. ``field`` names it.
+        TypeError: ``about`` has an unknown key.
     """
     _only_known(about, About)
     names = ("gravity", "depth_scale_m", "depth_kind", "max_range_m", "baseline_m")
@@ -101,10 +125,16 @@ def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing) 
 
 
 def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> Asked[schema.BatchRequest]:
-    """Pairs that are each answered on their own; what is said beside them holds for each.
+    """Build the request for a batch of independent queries.
+
+    Args:
+        frames: the queries. ``T_reference_camera`` must be None.
+        about: optional data that holds for every query.
+        packing: how images are encoded.
 
     Raises:
-        RequestError: as ``one``; or a frame stands against another, which only a sequence's do.
+        RequestError: as ``one``, or a frame has a ``T_reference_camera``.
+        TypeError: ``about`` has an unknown key.
     """
     _only_known(about, AboutSequence)
     for number, frame in enumerate(frames):
@@ -120,10 +150,16 @@ def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> 
 
 
 def sequence(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> Asked[schema.SequenceRequest]:
-    """Frames that are answered as one, the reference first.
+    """Build the request for a sequence, which gets one common answer.
+
+    Args:
+        frames: the first frame is the reference. Each further frame needs ``T_reference_camera``.
+        about: optional data of the sequence.
+        packing: how images are encoded.
 
     Raises:
         RequestError: as ``one``.
+        TypeError: ``about`` has an unknown key.
     """
     _only_known(about, AboutSequence)
     said = [_frame(frame, packing, f"frames.{number}.") for number, frame in enumerate(frames)]
@@ -136,7 +172,11 @@ def sequence(frames: Sequence[Frame], about: AboutSequence, packing: Packing) ->
 
 
 def _frame(frame: Frame, packing: Packing, where: str = "") -> tuple[dict[str, Any], tuple[bytes, bytes]]:
-    """What goes with one pair, and its pictures."""
+    """Return the request fields of one frame and its encoded images.
+
+    Raises:
+        RequestError: a value is invalid. ``field`` begins with ``where``.
+    """
     try:
         depth = encode_depth(frame.depth, scale_m=frame.depth_scale_m, codec=packing.depth_codec)
         pictures = (encode_rgb(frame.rgb, quality=packing.quality), depth.data)
@@ -153,9 +193,13 @@ def _frame(frame: Frame, packing: Packing, where: str = "") -> tuple[dict[str, A
 
 
 def _of_all(about: About | AboutSequence) -> dict[str, Any]:
-    """What a single pair and a sequence both say."""
+    """Return the request fields that a single query and a sequence have in common.
+
+    Raises:
+        RequestError: a value is invalid, or the prior has two positions.
+    """
     options, prior = about.get("options"), about.get("prior")
-    if prior is not None and prior.position is not None and prior.wgs84 is not None:  # gRPC could send the one alone
+    if prior is not None and prior.position is not None and prior.wgs84 is not None:  # gRPC could send only one of them
         raise RequestError("prior: position and wgs84 say the same thing; send one of them", field="prior")
     return {
         "map": about.get("map"), "prior": prior,
@@ -180,10 +224,10 @@ def _vector(vector: Sequence[float] | NDArray[Any] | None, field: str) -> dict[s
 
 
 def _transform(T: NDArray[Any] | None, field: str) -> dict[str, Any] | None:
-    """A 4 x 4 matrix as the contract says it.
+    """Convert a (4, 4) matrix to the contract's rigid transform.
 
     Raises:
-        RequestError: it is no rigid transform.
+        RequestError: the matrix is no rigid transform.
     """
     if T is None:
         return None
@@ -208,6 +252,6 @@ def _checked(make: Callable[[], D]) -> D:
     try:
         return make()
     except ValidationError as error:
-        from service.contract.convert import invalid  # it brings the whole service, which a good request does without
+        from service.contract.convert import invalid  # slow import of the whole service, only needed for errors
 
         raise invalid(error) from error

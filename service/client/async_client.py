@@ -1,4 +1,4 @@
-"""The client for those who do something else meanwhile."""
+"""The asynchronous HTTP client, for asyncio programs."""
 
 import asyncio
 import random
@@ -23,9 +23,9 @@ A = TypeVar("A")
 
 
 class AsyncClient:
-    """A service over HTTP, as ``Client`` has it, arguments and errors alike; for one event loop.
+    """Asynchronous HTTP client of a service, for one event loop. Arguments and errors are those of ``Client``.
 
-    Pictures are encoded in a thread, so that the loop goes on.
+    Images are encoded in a thread, so that the event loop is not blocked.
     """
 
     def __init__(
@@ -45,13 +45,13 @@ class AsyncClient:
         self._http = httpx.AsyncClient(**how, transport=transport)
 
     async def __aenter__(self) -> Self:
-        """Keep connections open inside."""
+        """Return the client. Its connections stay open inside the block."""
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close them."""
+        """Close all connections."""
         await self.close()
 
     async def close(self) -> None:
@@ -59,36 +59,62 @@ class AsyncClient:
         await self._http.aclose()
 
     async def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
-        """As ``Client.localize``."""
+        """Localize one query, as ``Client.localize`` does.
+
+        Args:
+            rgb: (H, W, 3), sRGB.
+            depth: (H, W), metres along the optical axis as floating-point values, or uint16 (millimetres unless
+                ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured.
+            camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
+            **about: optional data; see ``About``.
+        """
         asked = await asyncio.to_thread(asking.one, rgb, depth, camera, about, self._packing)
         return await self.call(rest.localize(asked))
 
     async def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
-        """As ``Client.localize_sequence``."""
+        """Localize the first frame of a sequence, as ``Client.localize_sequence`` does.
+
+        Args:
+            frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
+            **about: optional data; see ``AboutSequence``.
+        """
         asked = await asyncio.to_thread(asking.sequence, frames, about, self._packing)
         return await self.call(rest.localize_sequence(asked))
 
     async def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
     ) -> list[LocalizeAnswer | RefusedError]:
-        """As ``Client.localize_batch``."""
+        """Localize a batch of independent queries, as ``Client.localize_batch`` does.
+
+        Args:
+            frames: the queries. ``T_reference_camera`` must be None.
+            **about: optional data for every query; see ``AboutSequence``.
+        """
         asked = await asyncio.to_thread(asking.several, frames, about, self._packing)
         return await self.call(rest.localize_batch(asked))
 
     async def maps(self) -> list[MapEntry]:
-        """As ``Client.maps``."""
+        """Return all mounted maps, as ``Client.maps`` does."""
         return await self.call(rest.maps())
 
     async def streets(self, map_name: str) -> dict[str, Any]:
-        """As ``Client.streets``."""
+        """Return a map's streets as GeoJSON, as ``Client.streets`` does.
+
+        Args:
+            map_name: name of the map.
+        """
         return await self.call(rest.streets(map_name))
 
     async def coverage(self) -> dict[str, Any]:
-        """As ``Client.coverage``."""
+        """Return the area in which the maps can answer, as ``Client.coverage`` does."""
         return await self.call(rest.coverage())
 
     async def call(self, call: rest.Call[A]) -> A:
-        """As ``Client.call``."""
+        """Send a prepared call and read the response, with retries, as ``Client.call`` does.
+
+        Args:
+            call: the prepared HTTP call, for example from ``service.client.rest``.
+        """
         attempts = Attempts(self._policy, self._clock, self._draw)
         while True:
             try:

@@ -1,4 +1,4 @@
-"""The client that waits for its answers."""
+"""The synchronous HTTP client."""
 
 import random
 import time
@@ -22,26 +22,28 @@ A = TypeVar("A")
 
 
 class Client:
-    """A service over HTTP; safe to call from several threads.
+    """Synchronous HTTP client of a service. Several threads may use it at the same time.
 
     Args:
-        url: of the service, ``http://HOST:PORT``.
-        api_key: where the service asks for one.
-        timeout_s: for one attempt: to connect, and between two pieces of what is sent or comes back.
-        retry: when to ask again.
-        quality: of the JPEG that colour is sent as, 1 to 100; None sends PNG.
-        depth_codec: of the raw16 that depth is sent as; lz4 costs both sides less time and the link more bytes than zstd.
-        ca: PEM file of the authorities that may have signed the service's certificate; else the file of ``STREETFIX_CLIENT_CA``, of
-            ``SSL_CERT_FILE``, and the public authorities.
-        cert: PEM file of the client's own certificate, where the service asks for one; else that of ``STREETFIX_CLIENT_CERT``.
-        key: PEM file of its private key, not encrypted; else that of ``STREETFIX_CLIENT_KEY``.
-        transport: httpx', in place of sockets.
-        sleep: waits between attempts.
-        clock: monotonic seconds.
-        draw: a random number in [0, 1).
+        url: address of the service, ``http://HOST:PORT`` or ``https://HOST:PORT``.
+        api_key: API key, if the service requires one.
+        timeout_s: timeout of one attempt, seconds. It limits the connection, and the time between two pieces of data.
+        retry: when to try again. The default is ``RetryPolicy()``.
+        quality: JPEG quality of the colour image, 1 to 100. None sends PNG.
+        depth_codec: codec of the raw16 depth image. lz4 needs less processor time on both sides and more bytes than zstd.
+        ca: PEM file of the authorities that may have signed the service's certificate. The default is the file of
+            ``STREETFIX_CLIENT_CA``, then of ``SSL_CERT_FILE`` and the folder of ``SSL_CERT_DIR``, then the public authorities.
+        cert: PEM file of the client's own certificate, if the service requires one. The default is the file of
+            ``STREETFIX_CLIENT_CERT``.
+        key: PEM file of the unencrypted private key of ``cert``. The default is the file of ``STREETFIX_CLIENT_KEY``.
+        transport: httpx transport that replaces sockets, for tests.
+        sleep: function that waits for some seconds between attempts.
+        clock: function that returns monotonic seconds.
+        draw: function that returns a random number in [0, 1).
 
     Raises:
-        RequestError: the address is none, a number makes no sense, or a certificate lacks its key.
+        RequestError: the address or a number is invalid, TLS files are given for ``http://``, or only one of ``cert`` and
+            ``key`` is given.
         KeysError: a file of ``ca``, ``cert`` or ``key`` cannot be used.
     """
 
@@ -62,13 +64,13 @@ class Client:
         self._http = httpx.Client(**how, transport=transport)
 
     def __enter__(self) -> Self:
-        """Keep connections open inside."""
+        """Return the client. Its connections stay open inside the block."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close them."""
+        """Close all connections."""
         self.close()
 
     def close(self) -> None:
@@ -76,26 +78,30 @@ class Client:
         self._http.close()
 
     def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
-        """Ask where a pair of pictures was taken.
+        """Localize one query.
 
         Args:
-            rgb: (H, W, 3) uint8, sRGB.
-            depth: (H, W), metres along the optical axis as floating values, or uint16 (millimetres unless ``depth_scale_m`` says
-                otherwise); 0 and NaN where nothing was measured.
-            camera: rectified intrinsics, pixels; either picture may be a uniformly resized one of its.
-            **about: what else is known; see ``About``.
+            rgb: (H, W, 3), sRGB.
+            depth: (H, W), metres along the optical axis as floating-point values, or uint16 (millimetres unless
+                ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured.
+            camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
+            **about: optional data; see ``About``.
 
         Raises:
-            RequestError: an argument makes no sense.
-            RefusedError: the service answered with a problem.
-            UnavailableError: it refused for now, and did so until patience ended.
-            UnreachableError: nothing answers.
-            HandshakeError: TLS failed; the message says what to check.
+            RequestError: an argument is invalid.
+            RefusedError: the service refused the request.
+            UnavailableError: the service was temporarily unavailable until the retries ended.
+            UnreachableError: no Streetfix service answers, or not in time.
+            HandshakeError: TLS failed. The message says what to check.
         """
         return self.call(rest.localize(asking.one(rgb, depth, camera, about, self._packing)))
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
-        """Ask where the first of some frames was taken, whose cameras are known against each other, as by odometry.
+        """Localize the first frame of a sequence whose relative camera poses are known.
+
+        Args:
+            frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
+            **about: optional data; see ``AboutSequence``.
 
         Raises:
             StreetfixError: as ``localize``.
@@ -105,15 +111,22 @@ class Client:
     def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
     ) -> list[LocalizeAnswer | RefusedError]:
-        """Ask where each of some pairs was taken, each on its own; what one is refused with stands in its place.
+        """Localize a batch of independent queries.
+
+        Args:
+            frames: the queries. ``T_reference_camera`` must be None.
+            **about: optional data for every query; see ``AboutSequence``.
+
+        Returns:
+            One entry per query in the same order: the answer, or the error with which the service refused this query.
 
         Raises:
-            StreetfixError: as ``localize``, of the batch as a whole.
+            StreetfixError: as ``localize``, for the batch as a whole.
         """
         return self.call(rest.localize_batch(asking.several(frames, about, self._packing)))
 
     def maps(self) -> list[MapEntry]:
-        """All mounted maps.
+        """Return all mounted maps.
 
         Raises:
             StreetfixError: as ``localize``.
@@ -121,7 +134,12 @@ class Client:
         return self.call(rest.maps())
 
     def streets(self, map_name: str) -> dict[str, Any]:
-        """A map's streets, a GeoJSON FeatureCollection of polygons in map metres, or WGS-84 where the map is georeferenced.
+        """Return a map's streets as a GeoJSON FeatureCollection.
+
+        The polygons are in map metres, or in WGS-84 if the map is georeferenced.
+
+        Args:
+            map_name: name of the map.
 
         Raises:
             StreetfixError: as ``localize``.
@@ -129,7 +147,7 @@ class Client:
         return self.call(rest.streets(map_name))
 
     def coverage(self) -> dict[str, Any]:
-        """Where the maps can answer, a GeoJSON FeatureCollection with a MultiPolygon of each.
+        """Return the area in which the maps can answer: a GeoJSON FeatureCollection, one MultiPolygon per map.
 
         Raises:
             StreetfixError: as ``localize``.
@@ -137,7 +155,12 @@ class Client:
         return self.call(rest.coverage())
 
     def call(self, call: rest.Call[A]) -> A:
-        """Send a call of one's own making, as one with pictures from files, and read what comes back.
+        """Send a prepared call and read the response, with retries.
+
+        This is for calls that the other methods do not build, for example with images from files.
+
+        Args:
+            call: the prepared HTTP call, for example from ``service.client.rest``.
 
         Raises:
             StreetfixError: as ``localize``.

@@ -1,7 +1,7 @@
-"""Numpy pictures as the bytes that a service reads with the least work: depth as raw16+zstd, colour as JPEG.
+"""Encode NumPy images in formats that the service decodes at low cost: depth as raw16+zstd, colour as JPEG.
 
-Processor time of one core for a simulated 640 x 480 pair, as ratios to what RGB-D cameras' drivers write, a 16-bit PNG (depth)
-and a PNG (colour); the bytes beside them:
+The tables give processor time of one core and size for a simulated query of 640 x 480 pixels. All values are ratios to the
+formats that drivers of RGB-D cameras write: 16-bit PNG for depth and PNG for colour.
 
 ==================  ======  =======  =====
 depth               encode  decode   bytes
@@ -21,8 +21,8 @@ JPEG, quality 90    0.08    0.22     0.16
 JPEG, quality 95    0.09    0.25     0.22
 ==================  ======  =======  =====
 
-NPY decodes faster still, but its body is three times as long, and reading it costs a service more than unpacking saves: 1.04 of the
-processor time of a whole request without registration, on loopback.
+NPY decodes faster, but its body is three times as long. Reading the body costs the service more than the decoding saves.
+A whole request without registration needs 1.04 times the processor time with NPY (on loopback).
 """
 
 import io
@@ -37,22 +37,22 @@ from numpy.typing import NDArray
 from service.errors import RequestError
 from service.imaging.raw16 import Codec, write_raw16
 
-#: Best known: three in a hundred of a PNG's bytes more would not change an answer.
+#: Default JPEG quality. Images larger by 3 % of the PNG size do not change an answer.
 JPEG_QUALITY = 90
 _MOST_STORED = 65535
-#: Metres' depth is stored in steps of so many millimetres, the finest that holds the farthest measurement.
+#: Step sizes for depth in metres, mm. The encoder uses the finest step that can store the farthest measurement.
 _STEPS_MM = range(1, 11)
-#: What is said to lie further away than the coarsest step holds, no depth camera has measured.
+#: Largest depth that the coarsest step can store, metres. No depth camera measures more, so larger values are dropped.
 FARTHEST_M = 1e-3 * _STEPS_MM[-1] * _MOST_STORED
 
 
 @dataclass(frozen=True, slots=True)
 class EncodedDepth:
-    """A depth picture to send.
+    """An encoded depth image.
 
     Attributes:
-        data: raw16; NPY where floating values are sent as they are.
-        scale_m: metres (disparity: pixels) for each stored unit, which the request must say.
+        data: raw16, or NPY if floating-point values are sent unchanged.
+        scale_m: metres (disparity: pixels) per stored unit. The request must contain it.
     """
 
     data: bytes
@@ -61,11 +61,11 @@ class EncodedDepth:
 
 @dataclass(frozen=True, slots=True)
 class Packing:
-    """How pictures are sent.
+    """How images are encoded.
 
     Attributes:
-        quality: of the JPEG that colour is sent as; None sends PNG.
-        depth_codec: of raw16.
+        quality: JPEG quality of the colour image, 1 to 100. None sends PNG.
+        depth_codec: codec of the raw16 depth image.
     """
 
     quality: int | None = JPEG_QUALITY
@@ -73,14 +73,14 @@ class Packing:
 
 
 def encode_rgb(rgb: NDArray[np.uint8], *, quality: int | None = JPEG_QUALITY) -> bytes:
-    """A colour picture as JPEG, or as PNG.
+    """Encode a colour image as JPEG or PNG.
 
     Args:
         rgb: (H, W, 3), sRGB.
-        quality: of the JPEG, 1 to 100; None is a PNG, which loses nothing and costs the service five times as much to read.
+        quality: JPEG quality, 1 to 100. None encodes a lossless PNG, which costs the service five times as much to decode.
 
     Raises:
-        RequestError: the array is no colour picture, or the quality is none.
+        RequestError: the array is no colour image, or the quality is out of bounds.
     """
     if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or not rgb.size:
         raise RequestError(f"rgb: {_told(rgb)} is no colour picture; give uint8 (height, width, 3)", field="rgb")
@@ -93,19 +93,19 @@ def encode_rgb(rgb: NDArray[np.uint8], *, quality: int | None = JPEG_QUALITY) ->
 
 
 def encode_depth(depth: NDArray[Any], *, scale_m: float | None = None, codec: Codec = "zstd") -> EncodedDepth:
-    """A depth picture as raw16.
+    """Encode a depth image as raw16.
 
-    Floating metres become whole steps of 1 mm, or of up to 10 mm where the farthest measurement asks for it; so a value
-    is off by half a step at most.
+    Floating-point metres are rounded to steps of 1 mm, or up to 10 mm if the farthest measurement needs it. So the error is
+    at most half a step.
 
     Args:
-        depth: (H, W), floating values or uint16; 0, negative, NaN and infinite mean "no measurement".
-        scale_m: metres (disparity: pixels) for each unit of ``depth``: 0.001 for integers where it is None, and 1 for floating
-            values. Floating values with a scale of their own are sent as they are, as NPY.
-        codec: ``zstd``, or ``lz4``: a fifth more bytes, for two thirds of the time on either side.
+        depth: (H, W), floating-point values or uint16. 0, negative, NaN and infinite values mean "no measurement".
+        scale_m: metres (disparity: pixels) per unit of ``depth``. The default is 0.001 for integers and 1 for floating-point
+            values. Floating-point values with an explicit scale are sent unchanged as NPY.
+        codec: ``zstd`` or ``lz4``. lz4 needs a fifth more bytes, and two thirds of the time on either side.
 
     Raises:
-        RequestError: the array is no depth picture, or the scale is not positive.
+        RequestError: the array is no depth image, or the scale is not positive.
     """
     if not isinstance(depth, np.ndarray) or depth.ndim != 2 or not depth.size or depth.dtype.str[1:] not in _DTYPES:
         raise RequestError(
@@ -115,7 +115,7 @@ def encode_depth(depth: NDArray[Any], *, scale_m: float | None = None, codec: Co
         raise RequestError(
             f"depth_scale_m: {scale_m} is no scale; give metres for each unit, such as 0.001", field="depth_scale_m"
         )
-    if depth.dtype == np.uint16:
+    if depth.dtype.kind == "u":  # of either byte order, as a file may have it
         return EncodedDepth(write_raw16(depth, codec), 0.001 if scale_m is None else scale_m)
     if scale_m is not None:
         return EncodedDepth(_npy(depth), scale_m)
@@ -127,7 +127,7 @@ _DTYPES = frozenset({"f2", "f4", "f8", "u2"})
 
 
 def _in_steps(depth_m: NDArray[Any]) -> tuple[NDArray[np.uint16], float]:
-    """Metres in whole steps, and the metres of a step."""
+    """Round metres to the finest possible step. Return the (H, W) numbers of steps and the step, metres."""
     metres = depth_m.astype(np.float32, copy=False)
     with np.errstate(invalid="ignore"):
         measured = (metres > 0) & (metres <= FARTHEST_M)

@@ -1,4 +1,4 @@
-"""The client over gRPC: the same calls, the same answers."""
+"""The synchronous gRPC client, with the calls and answers of the HTTP client."""
 
 import random
 import time
@@ -24,7 +24,7 @@ from service.imaging.raw16 import Codec
 
 A = TypeVar("A")
 M = TypeVar("M")
-#: gRPC's own retries would come on top of ours, and know nothing of RetryInfo.
+#: gRPC's own retries are off: they would multiply with those of ``RetryPolicy`` and ignore ``RetryInfo``.
 _OPTIONS = (
     ("grpc.enable_retries", 0),
     ("grpc.max_receive_message_length", -1),
@@ -33,27 +33,30 @@ _OPTIONS = (
 
 
 class GrpcClient:
-    """A service over gRPC, with the methods of ``Client``; safe to call from several threads.
+    """Synchronous gRPC client of a service, with the methods of ``Client``. Several threads may use it at the same time.
 
     Args:
-        address: of the service, ``HOST:PORT``.
-        api_key: where the service asks for one.
-        timeout_s: for one attempt.
-        retry: when to ask again.
-        quality: of the JPEG that colour is sent as, 1 to 100; None sends PNG.
-        depth_codec: of the raw16 that depth is sent as; lz4 costs both sides less time and the link more bytes than zstd.
-        ca: PEM file of the authorities that may have signed the service's certificate; else the file of ``STREETFIX_CLIENT_CA``, of
-            ``SSL_CERT_FILE``, and the public authorities.
-        cert: PEM file of the client's own certificate, where the service asks for one; else that of ``STREETFIX_CLIENT_CERT``.
-        key: PEM file of its private key, not encrypted; else that of ``STREETFIX_CLIENT_KEY``.
-        tls: whether to speak TLS; None does where ``ca`` or ``cert`` is given, as an argument or as a variable of ours.
-        credentials: TLS of the caller's own making, in place of all that.
-        sleep: waits between attempts.
-        clock: monotonic seconds.
-        draw: a random number in [0, 1).
+        address: address of the service, ``HOST:PORT``.
+        api_key: API key, if the service requires one.
+        timeout_s: timeout of one whole attempt, seconds.
+        retry: when to try again. The default is ``RetryPolicy()``.
+        quality: JPEG quality of the colour image, 1 to 100. None sends PNG.
+        depth_codec: codec of the raw16 depth image. lz4 needs less processor time on both sides and more bytes than zstd.
+        ca: PEM file of the authorities that may have signed the service's certificate. The default is the file of
+            ``STREETFIX_CLIENT_CA``, then of ``SSL_CERT_FILE``, then the public authorities.
+        cert: PEM file of the client's own certificate, if the service requires one. The default is the file of
+            ``STREETFIX_CLIENT_CERT``.
+        key: PEM file of the unencrypted private key of ``cert``. The default is the file of ``STREETFIX_CLIENT_KEY``.
+        tls: whether to use TLS. None uses TLS if ``ca`` or ``cert`` is given, as an argument or as a variable
+            ``STREETFIX_CLIENT_*``.
+        credentials: channel credentials that replace all other TLS settings.
+        sleep: function that waits for some seconds between attempts.
+        clock: function that returns monotonic seconds.
+        draw: function that returns a random number in [0, 1).
 
     Raises:
-        RequestError: the address is none, a certificate lacks its key, or TLS is described twice or for a call without TLS.
+        RequestError: the address or the timeout is invalid, only one of ``cert`` and ``key`` is given, or TLS files are given
+            together with ``credentials`` or ``tls=False``.
         KeysError: a file of ``ca``, ``cert`` or ``key`` cannot be used.
     """
 
@@ -91,13 +94,13 @@ class GrpcClient:
         self._stub = LocalizationServiceStub(self._channel)  # type: ignore[no-untyped-call]  # generated code
 
     def __enter__(self) -> Self:
-        """Keep the channel open inside."""
+        """Return the client. Its channel stays open inside the block."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it."""
+        """Close the channel."""
         self.close()
 
     def close(self) -> None:
@@ -105,34 +108,56 @@ class GrpcClient:
         self._channel.close()
 
     def localize(self, rgb: Rgb, depth: Depth, camera: Camera, **about: Unpack[About]) -> LocalizeAnswer:
-        """As ``Client.localize``."""
+        """Localize one query, as ``Client.localize`` does.
+
+        Args:
+            rgb: (H, W, 3), sRGB.
+            depth: (H, W), metres along the optical axis as floating-point values, or uint16 (millimetres unless
+                ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured.
+            camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
+            **about: optional data; see ``About``.
+        """
         message = grpc_messages.request_message(asking.one(rgb, depth, camera, about, self._packing))
         return self._call(self._stub.Localize, message, grpc_messages.answer_of)
 
     def localize_sequence(self, frames: Sequence[Frame], **about: Unpack[AboutSequence]) -> LocalizeAnswer:
-        """As ``Client.localize_sequence``."""
+        """Localize the first frame of a sequence, as ``Client.localize_sequence`` does.
+
+        Args:
+            frames: the first frame is the reference. Each further frame needs ``T_reference_camera``, as from odometry.
+            **about: optional data; see ``AboutSequence``.
+        """
         message = grpc_messages.sequence_message(asking.sequence(frames, about, self._packing))
         return self._call(self._stub.LocalizeSequence, message, lambda got: grpc_messages.answer_of(got.answer))
 
     def localize_batch(
         self, frames: Sequence[Frame], **about: Unpack[AboutSequence]
     ) -> list[LocalizeAnswer | RefusedError]:
-        """As ``Client.localize_batch``."""
+        """Localize a batch of independent queries, as ``Client.localize_batch`` does.
+
+        Args:
+            frames: the queries. ``T_reference_camera`` must be None.
+            **about: optional data for every query; see ``AboutSequence``.
+        """
         message = grpc_messages.batch_message(asking.several(frames, about, self._packing))
         return self._call(self._stub.LocalizeBatch, message, _outcomes)
 
     def maps(self) -> list[MapEntry]:
-        """As ``Client.maps``."""
+        """Return all mounted maps, as ``Client.maps`` does."""
         return self._call(
             self._stub.ListMaps, pb.ListMapsRequest(), lambda got: [grpc_messages.map_of(each) for each in got.maps]
         )
 
     def streets(self, map_name: str) -> dict[str, Any]:
-        """As ``Client.streets``."""
+        """Return a map's streets as GeoJSON, as ``Client.streets`` does.
+
+        Args:
+            map_name: name of the map.
+        """
         return self._call(self._stub.GetStreets, pb.GetStreetsRequest(map=map_name), lambda got: geojson(got.geojson))
 
     def coverage(self) -> dict[str, Any]:
-        """As ``Client.coverage``."""
+        """Return the area in which the maps can answer, as ``Client.coverage`` does."""
         return self._call(self._stub.GetCoverage, pb.GetCoverageRequest(), lambda got: geojson(got.geojson))
 
     def _call(self, method: Callable[..., M], message: object, read: Callable[[M], A]) -> A:

@@ -1,4 +1,4 @@
-"""What ends a gRPC call, as errors of ours."""
+"""Convert errors of gRPC calls to ``StreetfixError``."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,19 +18,19 @@ REQUEST_ID = "x-request-id"
 
 @contextmanager
 def errors_of_grpc(address: str, timeout_s: float, tls: ClientTls | None) -> Iterator[None]:
-    """Errors of the library as ours.
+    """Convert the errors of gRPC calls inside the block to ``StreetfixError``.
 
     Args:
-        address: of the service.
-        timeout_s: that it had.
-        tls: that the client spoke; None: it spoke none.
+        address: address of the service, for messages.
+        timeout_s: timeout of the call, seconds, for messages.
+        tls: TLS settings of the client. None if the call does not use TLS.
 
     Raises:
         HandshakeError: TLS failed.
-        RefusedError: the service answered with a problem.
-        NoAnswerInTimeError: the time has ended.
+        RefusedError: the service refused the request.
+        NoAnswerInTimeError: the timeout ended.
         UnreachableError: the connection failed.
-        ForeignServiceError: what answers there does not know our calls, or answers what is none.
+        ForeignServiceError: the server does not know our calls, or its response violates the contract.
     """
     try:
         yield
@@ -43,7 +43,11 @@ def errors_of_grpc(address: str, timeout_s: float, tls: ClientTls | None) -> Ite
 
 
 def refused_in_batch(problem: pb.Problem) -> RefusedError:
-    """A problem of one request among several."""
+    """Return the error for one refused query of a batch.
+
+    Args:
+        problem: the problem that the service reported for this query.
+    """
     return refused(
         problem.title, problem.detail, problem=problem.code, status="", field=problem.field,
         may_come_back=problem.code in ("busy", "not-ready"),
@@ -74,7 +78,7 @@ def _of(error: grpc.RpcError, address: str, timeout_s: float, tls: ClientTls | N
         return ForeignServiceError(
             f"{address}: what answers there is no Streetfix ({said}); check the address", field="url"
         )
-    # What gRPC itself refuses, as a message beyond its limit, and what nobody foresaw.
+    # Refusals by gRPC itself, such as a message beyond its size limit, and unexpected errors.
     problem = "internal" if code == grpc.StatusCode.INTERNAL else ""
     return refused(code.name, said, problem=problem, status=code.name, request_id=_request_id(error))
 
@@ -92,10 +96,10 @@ def _refused(error: grpc.Call, told: dict[str, Message], info: error_details_pb2
 
 
 def _details(error: grpc.Call) -> dict[str, Message]:
-    """The details of google.rpc.Status that we know, by their type's name."""
+    """Return the known details of google.rpc.Status by the full name of their type."""
     try:
         status: status_pb2.Status | None = rpc_status.from_call(error)
-    except ValueError:  # a status whose code or message contradicts the trailers': somebody else's
+    except ValueError:  # status and trailers contradict each other: not our service
         return {}
     found: dict[str, Message] = {}
     for packed in () if status is None else status.details:

@@ -1,4 +1,4 @@
-"""Between the contract's models and protobuf messages, as a client needs it: requests there, answers back."""
+"""Convert requests of the contract to protobuf messages, and protobuf answers to models of the contract."""
 
 from typing import Any
 
@@ -11,18 +11,30 @@ _STATUS_PREFIX, _SECTION_PREFIX = "LOCALIZATION_STATUS_", "STREET_SECTION_"
 
 
 def request_message(asked: Asked[schema.LocalizeRequest]) -> pb.LocalizeRequest:
-    """A single pair."""
+    """Return the message for a single query.
+
+    Args:
+        asked: the request and its encoded images.
+    """
     return _pair(asked.document, asked.pictures[0])
 
 
 def batch_message(asked: Asked[schema.BatchRequest]) -> pb.LocalizeBatchRequest:
-    """Pairs each on its own."""
+    """Return the message for a batch of independent queries.
+
+    Args:
+        asked: the request and its encoded images.
+    """
     pairs = zip(asked.document.requests, asked.pictures, strict=True)
     return pb.LocalizeBatchRequest(requests=[_pair(request, pictures) for request, pictures in pairs])
 
 
 def sequence_message(asked: Asked[schema.SequenceRequest]) -> pb.LocalizeSequenceRequest:
-    """Frames as one."""
+    """Return the message for a sequence.
+
+    Args:
+        asked: the request and its encoded images.
+    """
     request = asked.document
     frames = [
         pb.SequenceFrame(
@@ -38,10 +50,13 @@ def sequence_message(asked: Asked[schema.SequenceRequest]) -> pb.LocalizeSequenc
 
 
 def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
-    """The contract's answer.
+    """Convert an answer to the contract's model.
+
+    Args:
+        message: the answer.
 
     Raises:
-        ValueError: a value that the contract does not have.
+        ValueError: a value violates the contract.
     """
     times = message.timings
     return schema.LocalizeAnswer.model_validate(
@@ -80,10 +95,13 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
 
 
 def map_of(message: pb.MapEntry) -> schema.MapEntry:
-    """A mounted map.
+    """Convert an entry of the list of maps to the contract's model.
+
+    Args:
+        message: the entry.
 
     Raises:
-        ValueError: a value that the contract does not have.
+        ValueError: a value violates the contract.
     """
     content = {name: getattr(message, name) for name in schema.MapEntry.model_fields if name != "versions"}
     return schema.MapEntry.model_validate(content | {"versions": list(message.versions)})

@@ -1,4 +1,4 @@
-"""What a service refuses, as an error of ours, the same through every face."""
+"""The client's error for a refused request, the same over REST and gRPC."""
 
 from service.errors import RefusedError, UnavailableError
 
@@ -7,17 +7,17 @@ def refused(
     title: str, detail: str, *, problem: str, status: str, field: str = "", request_id: str = "",
     may_come_back: bool = False, retry_after_s: float | None = None,
 ) -> RefusedError:  # fmt: skip
-    """The error for a problem that a service answered with.
+    """Return the error for a problem that the service reported.
 
     Args:
-        title: what kind of problem it is.
+        title: kind of the problem.
         detail: what happened and what to do.
-        problem: its code.
-        status: as the face spelled it.
-        field: at fault.
-        request_id: by which the operator finds it.
-        may_come_back: the service refused for now only.
-        retry_after_s: its advice, if it gave one.
+        problem: code of the problem.
+        status: status code of HTTP or gRPC as text. Empty for a query of a gRPC batch.
+        field: field of the request that is wrong. Empty if none is.
+        request_id: id with which the operator finds the request in the log.
+        may_come_back: True if the service refused only temporarily. Then the error is an ``UnavailableError``.
+        retry_after_s: advised wait before the next attempt, seconds. None without advice.
     """
     where = f" [field {field}]" if field else ""
     error = (UnavailableError if may_come_back else RefusedError)(

@@ -1,4 +1,4 @@
-"""Requests of the contract as HTTP, and what comes back as answers or errors of ours; sending is the clients' own."""
+"""Prepare HTTP calls from requests, and convert responses to answers or errors. The clients send the calls."""
 
 import json
 import math
@@ -22,19 +22,20 @@ from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedErro
 
 A = TypeVar("A")
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-#: Statuses that say "not now".
+#: HTTP statuses of a temporary refusal.
 _COME_BACK = (429, 503)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Call(Generic[A]):
-    """One call.
+    """A prepared HTTP call.
 
     Attributes:
-        method: of HTTP.
-        path: below the service's address.
-        read: the answer from the body of a good response; ValueError (or ValidationError) says that it is none.
-        files: parts of a multipart body.
+        method: HTTP method.
+        path: path below the service's address.
+        read: function that reads the answer from the body of a successful response. It raises ValueError (or
+            ValidationError) if the body is not an answer.
+        files: parts of a multipart body: file name, content and media type, by part name.
     """
 
     method: str
@@ -44,7 +45,16 @@ class Call(Generic[A]):
 
 
 class Problem(BaseModel):
-    """What a service refused and why, as far as it said so (RFC 9457)."""
+    """A problem that the service reported (RFC 9457). Missing fields keep their defaults.
+
+    Attributes:
+        title: kind of the problem.
+        detail: what happened and what to do.
+        code: code of the problem.
+        field: field of the request that is wrong.
+        request_id: id with which the operator finds the request in the log.
+        status: HTTP status.
+    """
 
     title: str = ""
     detail: str = ""
@@ -64,18 +74,30 @@ class _Outcomes(BaseModel):
 
 
 def localize(asked: Asked[schema.LocalizeRequest]) -> Call[schema.LocalizeAnswer]:
-    """A single pair."""
+    """Return the call for a single query.
+
+    Args:
+        asked: the request and its encoded images.
+    """
     (rgb, depth), *_ = asked.pictures
     return Call("POST", "/v1/localize", schema.LocalizeAnswer.model_validate_json, _parts(asked, rgb=rgb, depth=depth))
 
 
 def localize_sequence(asked: Asked[schema.SequenceRequest]) -> Call[schema.LocalizeAnswer]:
-    """Frames as one."""
+    """Return the call for a sequence.
+
+    Args:
+        asked: the request and its encoded images.
+    """
     return Call("POST", "/v1/localize/sequence", schema.LocalizeAnswer.model_validate_json, _numbered(asked))
 
 
 def localize_batch(asked: Asked[schema.BatchRequest]) -> Call[list[schema.LocalizeAnswer | RefusedError]]:
-    """Pairs each on its own."""
+    """Return the call for a batch of independent queries.
+
+    Args:
+        asked: the request and its encoded images.
+    """
 
     def read(body: bytes) -> list[schema.LocalizeAnswer | RefusedError]:
         return [_outcome(each) for each in _Outcomes.model_validate_json(body).outcomes]
@@ -84,25 +106,32 @@ def localize_batch(asked: Asked[schema.BatchRequest]) -> Call[list[schema.Locali
 
 
 def maps() -> Call[list[schema.MapEntry]]:
-    """All mounted maps."""
+    """Return the call for the list of mounted maps."""
     return Call("GET", "/v1/maps", lambda body: schema.MapList.model_validate_json(body).maps)
 
 
 def streets(map_name: str) -> Call[dict[str, Any]]:
-    """GeoJSON of a map's streets."""
+    """Return the call for the GeoJSON of a map's streets.
+
+    Args:
+        map_name: name of the map.
+    """
     return Call("GET", f"/v1/maps/{quote(map_name, safe='')}/streets", geojson)
 
 
 def coverage() -> Call[dict[str, Any]]:
-    """GeoJSON of where the maps can answer."""
+    """Return the call for the GeoJSON of the area in which the maps can answer."""
     return Call("GET", "/v1/coverage", geojson)
 
 
 def geojson(body: bytes) -> dict[str, Any]:
-    """A FeatureCollection.
+    """Parse a GeoJSON FeatureCollection.
+
+    Args:
+        body: the JSON text.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is no FeatureCollection.
     """
     found = json.loads(body)
     if not isinstance(found, dict) or found.get("type") != "FeatureCollection":
@@ -111,11 +140,17 @@ def geojson(body: bytes) -> dict[str, Any]:
 
 
 def settings_for(url: str, *, api_key: str | None, timeout_s: float, tls: ClientTls) -> dict[str, Any]:
-    """What both of httpx' clients are made with.
+    """Return the keyword arguments for ``httpx.Client`` and ``httpx.AsyncClient``.
+
+    Args:
+        url: address of the service.
+        api_key: API key. None sends none.
+        timeout_s: timeout of one attempt, seconds.
+        tls: TLS settings. They apply only to ``https://``.
 
     Raises:
-        RequestError: the address is none, the time is not positive, or TLS is described for an address without TLS.
-        KeysError: a file of TLS cannot be used.
+        RequestError: the address is invalid, the timeout is not positive, or TLS arguments are given for ``http://``.
+        KeysError: a TLS file cannot be used.
     """
     if not (timeout_s > 0 and math.isfinite(timeout_s)):
         raise RequestError(f"timeout_s: {timeout_s} is no time to wait; give seconds", field="timeout_s")
@@ -131,26 +166,30 @@ def settings_for(url: str, *, api_key: str | None, timeout_s: float, tls: Client
         )
     return {
         "base_url": url.rstrip("/"), "timeout": timeout_s,
-        # Without TLS the library would still load all public authorities; this context trusts nobody.
+        # Without TLS httpx would still load all public authorities. An empty context saves that time.
         "verify": tls.context() if address.scheme == "https" else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT),
         "headers": {} if api_key is None else {"Authorization": f"Bearer {api_key}"},
-        # A proxy named in the environment is for other machines: it could not reach this one's loopback.
+        # A proxy of the environment is for other machines. It cannot reach the loopback of this machine.
         "trust_env": address.host not in _LOOPBACK,
     }  # fmt: skip
 
 
 def answer_of(call: Call[A], response: httpx.Response) -> A:
-    """What a response says.
+    """Return the answer of a response.
+
+    Args:
+        call: the call that was sent.
+        response: its response.
 
     Raises:
-        RefusedError: a problem.
-        ForeignServiceError: it is no response of a Streetfix.
+        RefusedError: the service refused the request.
+        ForeignServiceError: the response does not come from Streetfix, or follows another contract.
     """
     if not response.is_success:
         raise _problem_of(response)
     try:
         return call.read(response.content)
-    except ValueError as error:  # ValidationError and JSONDecodeError among them
+    except ValueError as error:  # includes ValidationError and JSONDecodeError
         raise ForeignServiceError(
             f"{response.url}: what answers there is no Streetfix, or of another contract; check the address", field="url"
         ) from error  # fmt: skip
@@ -158,17 +197,18 @@ def answer_of(call: Call[A], response: httpx.Response) -> A:
 
 @contextmanager
 def errors_of_httpx(url: str, timeout_s: float, tls: ClientTls) -> Iterator[None]:
-    """Errors of the library as ours.
+    """Convert the errors of httpx inside the block to ``StreetfixError``.
 
     Args:
-        url: of the service.
-        timeout_s: that it had.
-        tls: that the client spoke, where the address is one of TLS.
+        url: address of the service.
+        timeout_s: timeout of the attempt, seconds, for messages.
+        tls: TLS settings of the client.
 
     Raises:
         HandshakeError: TLS failed.
-        NoAnswerInTimeError: the time has ended after the service was reached.
+        NoAnswerInTimeError: the timeout ended after the connection was made.
         UnreachableError: the connection failed.
+        ForeignServiceError: the response cannot be decoded, or has too many redirects.
         RequestError: the request cannot be sent.
     """
     try:
@@ -220,7 +260,12 @@ def _problem_of(response: httpx.Response) -> RefusedError:
 
 
 def retry_after_s(header: str | None, *, now: datetime | None = None) -> float | None:
-    """Seconds that ``Retry-After`` says, as a number or as a date; None where it says nothing that makes sense."""
+    """Return the seconds of a ``Retry-After`` header, or None if the header is missing or malformed.
+
+    Args:
+        header: value of the header, a number of seconds or a date (RFC 9110).
+        now: current time with time zone, for tests. None reads the clock.
+    """
     if header is None:
         return None
     if header.strip().isdecimal():
@@ -229,7 +274,7 @@ def retry_after_s(header: str | None, *, now: datetime | None = None) -> float |
         moment = parsedate_to_datetime(header)
     except ValueError:
         return None
-    if moment.tzinfo is None:  # RFC 9110: GMT in any case
+    if moment.tzinfo is None:  # RFC 9110: dates are always in GMT
         moment = moment.replace(tzinfo=UTC)
     return max(0.0, (moment - (now or datetime.now(UTC))).total_seconds())
 

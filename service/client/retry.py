@@ -1,4 +1,4 @@
-"""When to ask again: by the service's own advice, within a budget of attempts and time."""
+"""Decide when to retry: as the service advises, within a budget of attempts and time."""
 
 import random
 import time
@@ -10,13 +10,15 @@ from service.errors import RequestError, StreetfixError, UnavailableError, Unrea
 
 @dataclass(frozen=True, slots=True)
 class RetryPolicy:
-    """A caller's patience.
+    """Limits of the retries of one call.
 
     Attributes:
-        attempts: at most, the first among them; 1 never asks again.
-        total_s: no attempt begins later than this after the first.
-        backoff_s: before the second attempt where the service gave no advice, doubled before each further one.
-        jitter: share of a wait by which it is drawn out at random, so that robots that were refused together do not come back together.
+        attempts: maximum number of attempts, including the first. 1 never retries.
+        total_s: latest start of an attempt, seconds after the call began.
+        backoff_s: wait before the second attempt if the service gives no advice, seconds. It doubles before each further
+            attempt.
+        jitter: largest random extension of a wait, as a share of the wait. It spreads the retries of robots that were refused
+            at the same time.
     """
 
     attempts: int = 4
@@ -25,7 +27,7 @@ class RetryPolicy:
     jitter: float = 0.25
 
     def __post_init__(self) -> None:
-        """Refuse what is no patience.
+        """Check that all numbers are within bounds.
 
         Raises:
             RequestError: a number is out of bounds.
@@ -39,12 +41,12 @@ class RetryPolicy:
 
 @dataclass(slots=True)
 class Attempts:
-    """The attempts of one call.
+    """Counter of the attempts of one call.
 
     Args:
-        policy: the caller's patience.
-        clock: monotonic seconds.
-        draw: a random number in [0, 1).
+        policy: limits of the retries.
+        clock: function that returns monotonic seconds.
+        draw: function that returns a random number in [0, 1).
     """
 
     policy: RetryPolicy
@@ -54,17 +56,17 @@ class Attempts:
     _began_s: float = 0.0
 
     def __post_init__(self) -> None:
-        """Let the time begin."""
+        """Start the clock of the call."""
         self._began_s = self.clock()
 
     def wait_after(self, error: StreetfixError) -> float:
-        """Seconds to wait before the next attempt.
+        """Return the wait before the next attempt, seconds.
 
         Args:
-            error: what the last attempt met.
+            error: error of the last attempt.
 
         Raises:
-            StreetfixError: the error itself, where asking again is of no use, or patience has ended.
+            StreetfixError: the given error, if a retry cannot help or the budget is used up.
         """
         wait_s = self._advised_s(error)
         if wait_s is None or self._made >= self.policy.attempts:
@@ -79,5 +81,6 @@ class Attempts:
         own_s: float = self.policy.backoff_s * 2 ** (self._made - 1)
         if isinstance(error, UnavailableError):
             return own_s if error.retry_after_s is None else error.retry_after_s
-        # A connection that fails says nothing of the request, and every call only asks. What took too long would take long again.
+        # A failed connection is worth a retry, because no call changes the service. The subclasses, such as
+        # NoAnswerInTimeError, are not: a request that took too long would take long again.
         return own_s if type(error) is UnreachableError else None

@@ -1,4 +1,4 @@
-"""TLS of a client: which authorities it trusts, which certificate it shows, and what a failed handshake means."""
+"""TLS of a client: trusted authorities, client certificate and explanations of a failed handshake."""
 
 import os
 import ssl
@@ -11,24 +11,29 @@ import httpx
 
 from service.errors import HandshakeError, KeysError, RequestError
 
-#: Variables that stand in for arguments that were not given. The service ignores all names that begin so.
+#: Environment variables that replace missing arguments. The service ignores names with the prefix STREETFIX_CLIENT_.
 CA, CERT, KEY = "STREETFIX_CLIENT_CA", "STREETFIX_CLIENT_CERT", "STREETFIX_CLIENT_KEY"
-#: The usual variables of OpenSSL; they only matter where no authority is given.
+#: OpenSSL's own variables. They apply only if no authority is given.
 _CERT_FILE, _CERT_DIR = "SSL_CERT_FILE", "SSL_CERT_DIR"
 
 
 @dataclass(frozen=True, slots=True)
 class TlsFile:
-    """A PEM file and who named it, for messages."""
+    """A PEM file.
+
+    Attributes:
+        path: path of the file.
+        named_by: argument or environment variable that gave the path, for messages.
+    """
 
     path: Path
     named_by: str
 
     def read(self) -> bytes:
-        """Its bytes.
+        """Return the content of the file.
 
         Raises:
-            KeysError: it cannot be read.
+            KeysError: the file cannot be read.
         """
         try:
             return self.path.read_bytes()
@@ -38,19 +43,25 @@ class TlsFile:
             ) from error
 
     def unusable(self, why: str, remedy: str) -> KeysError:
-        """The error for a file that cannot be used."""
+        """Return the error for a file that cannot be used.
+
+        Args:
+            why: what is wrong with the file.
+            remedy: what the user should do.
+        """
         return KeysError(f"{self.path}: {why}; {remedy} ({self.named_by})", field=self.named_by)
 
 
 @dataclass(frozen=True, slots=True)
 class ClientTls:
-    """What a client brings to a handshake.
+    """TLS settings of a client.
 
     Attributes:
-        ca: PEM of the authorities that may have signed the service's certificate, and nobody else's; None trusts the public ones.
-        cert: PEM chain that the client shows where the service asks for one (mutual TLS); None shows nothing.
-        key: PEM private key of ``cert``, not encrypted.
-        ca_folder: of authorities, where ``SSL_CERT_DIR`` alone names some.
+        ca: PEM file of the only authorities that may have signed the service's certificate. None trusts ``ca_folder``, or else
+            the public authorities.
+        cert: PEM chain of the client's certificate, for mutual TLS. None sends no certificate.
+        key: unencrypted PEM private key of ``cert``.
+        ca_folder: folder of authorities from ``SSL_CERT_DIR``. It is used only over HTTP and only if ``ca`` is None.
     """
 
     ca: TlsFile | None = None
@@ -63,13 +74,19 @@ class ClientTls:
         cls, ca: str | Path | None = None, cert: str | Path | None = None, key: str | Path | None = None, *,
         environ: Mapping[str, str] | None = None,
     ) -> Self:  # fmt: skip
-        """From arguments, or where they are None from the environment.
+        """Read the settings from the arguments, and from the environment for each argument that is None.
 
-        ``STREETFIX_CLIENT_CA``, ``STREETFIX_CLIENT_CERT`` and ``STREETFIX_CLIENT_KEY`` stand in for the arguments. Without any of
-        the two for ``ca``, ``SSL_CERT_FILE`` and then ``SSL_CERT_DIR`` name the authorities.
+        ``STREETFIX_CLIENT_CA``, ``STREETFIX_CLIENT_CERT`` and ``STREETFIX_CLIENT_KEY`` replace missing arguments. If neither
+        ``ca`` nor its variable is given, ``SSL_CERT_FILE`` and then ``SSL_CERT_DIR`` name the authorities.
+
+        Args:
+            ca: PEM file of the trusted authorities.
+            cert: PEM chain of the client's certificate.
+            key: unencrypted PEM private key of ``cert``.
+            environ: environment variables. None reads those of the process.
 
         Raises:
-            RequestError: a certificate without its key, or a key without its certificate.
+            RequestError: only one of certificate and key is given.
         """
         known = os.environ if environ is None else environ
 
@@ -91,21 +108,24 @@ class ClientTls:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether an argument or a variable of ours asks for TLS; ``SSL_CERT_FILE`` is for all programs of the machine."""
+        """Whether an argument or a variable ``STREETFIX_CLIENT_*`` requests TLS.
+
+        ``SSL_CERT_FILE`` does not count, because it applies to all programs of the machine.
+        """
         return self.cert is not None or (self.ca is not None and self.ca.named_by != _CERT_FILE)
 
     @property
     def is_argument(self) -> bool:
-        """Whether an argument asks for TLS."""
+        """Whether an argument requests TLS."""
         return any(
             each is not None and each.named_by in ("ca", "cert", "key") for each in (self.ca, self.cert, self.key)
         )
 
     def context(self) -> ssl.SSLContext:
-        """For Python's own TLS.
+        """Return a context for Python's ``ssl`` module.
 
         Raises:
-            KeysError: a file cannot be read or is none; it names the file and the remedy.
+            KeysError: a file cannot be read or used. The message names the file and the remedy.
         """
         if self.ca is not None:
             context = ssl.create_default_context(cadata=_authorities(self.ca))
@@ -114,7 +134,7 @@ class ClientTls:
         else:
             context = httpx.create_ssl_context(trust_env=False)
         if self.cert is not None and self.key is not None:
-            for file in (self.cert, self.key):  # OpenSSL does not say which of the two it cannot read
+            for file in (self.cert, self.key):  # OpenSSL does not report which file is unreadable
                 file.read()
             try:
                 context.load_cert_chain(self.cert.path, self.key.path, password=refuse_password)
@@ -130,29 +150,35 @@ class ClientTls:
         return context
 
     def pems(self) -> tuple[bytes | None, bytes | None, bytes | None]:
-        """Authorities, private key and certificate chain as ``grpc.ssl_channel_credentials`` takes them.
+        """Return authorities, private key and certificate chain for ``grpc.ssl_channel_credentials``.
+
+        ``ca_folder`` is ignored, because gRPC takes no folder of authorities.
 
         Raises:
             KeysError: as ``context``.
         """
-        self.context()  # gRPC would say of a bad file that the service is not there
+        self.context()  # checks the files: gRPC would report a bad file as an unreachable service
         return tuple(None if each is None else each.read() for each in (self.ca, self.key, self.cert))  # type: ignore[return-value]
 
 
 class EncryptedKeyError(Exception):
-    """OpenSSL wants a password."""
+    """OpenSSL requested a password, because the private key is encrypted."""
 
 
 def refuse_password() -> str:
-    """Without it OpenSSL would ask at the terminal."""
+    """Refuse to give a password. Without this callback OpenSSL would ask at the terminal.
+
+    Raises:
+        EncryptedKeyError: always.
+    """
     raise EncryptedKeyError
 
 
 def _authorities(file: TlsFile) -> str:
-    """A file's certificates, checked.
+    """Return the text of a PEM file after checking that it has certificates.
 
     Raises:
-        KeysError: it has none.
+        KeysError: the file has no certificate or cannot be read.
     """
     remedy = "give the authority's certificate in PEM, which begins with -----BEGIN CERTIFICATE-----"
     try:
@@ -164,11 +190,11 @@ def _authorities(file: TlsFile) -> str:
 
 
 def handshake_error(address: str, reason: str) -> HandshakeError | None:
-    """The error for a handshake that failed; None where the reason is not one of TLS.
+    """Return the error for a failed handshake, or None if the reason does not concern TLS.
 
     Args:
-        address: of the service.
-        reason: as OpenSSL or gRPC says it.
+        address: address of the service.
+        reason: message of OpenSSL or gRPC.
     """
     folded = reason.lower()
     for words, remedy in _REMEDIES:
@@ -177,7 +203,7 @@ def handshake_error(address: str, reason: str) -> HandshakeError | None:
     return None
 
 
-#: What OpenSSL (REST) and BoringSSL (gRPC) say, and what to check; the first that fits.
+#: Parts of messages of OpenSSL (REST) and BoringSSL (gRPC), and the remedy. The first match applies.
 _REMEDIES = (
     (("wrong_version_number", "wrong version number", "record layer failure"),
      "what listens there does not speak TLS: check the port, or ask without TLS (http://)"),
@@ -196,7 +222,14 @@ _REMEDIES = (
 
 
 def closed_hint(*, speaks_tls: bool, shows_certificate: bool) -> str:
-    """What a connection that was closed without a word may mean: since TLS 1.3 a client hears of a refusal only after its own part."""
+    """Return the likely reason for a connection that the service closed without a message.
+
+    Since TLS 1.3 a client learns of a refused certificate only after its own part of the handshake.
+
+    Args:
+        speaks_tls: True if the client uses TLS.
+        shows_certificate: True if the client has a certificate.
+    """
     if not speaks_tls:
         return "if the service speaks TLS, so must the client: https://, or --ca, ca= over gRPC"
     if not shows_certificate:
@@ -205,7 +238,11 @@ def closed_hint(*, speaks_tls: bool, shows_certificate: bool) -> str:
 
 
 def ssl_reason(error: BaseException) -> str | None:
-    """What OpenSSL said among an error's causes, if anything."""
+    """Return OpenSSL's message from an error or its causes, or None if there is none.
+
+    Args:
+        error: the error.
+    """
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, ssl.SSLError):

@@ -8,7 +8,7 @@ from fastapi.openapi.utils import get_openapi
 
 from service.contract import schema
 from service.contract.oscp import GeoPoseRequest
-from service.http import problems
+from service.http import problems, reference
 from service.http.asking import Asking
 from service.http.auth import AuthMiddleware
 from service.http.host_check import HostMiddleware
@@ -47,6 +47,7 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
             app.include_router(routes)
         for routes in (samples.router_for(engine.settings), answers.router_for(engine)):
             app.include_router(routes)
+    app.include_router(reference.router_for(app))
     if keys is not None:
         app.add_middleware(AuthMiddleware, keys=keys)
     app.add_middleware(HostMiddleware, hosts=AllowedHosts.of(engine.settings))

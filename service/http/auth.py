@@ -17,7 +17,7 @@ _PAGE = "/console"
 
 def needs_no_key(path: str) -> bool:
     """Whether anybody may ask for a path."""
-    return path in OPEN or path in ("/", _PAGE) or path.startswith(f"{_PAGE}/")
+    return path in OPEN or path in ("/", "/docs", _PAGE) or path.startswith(f"{_PAGE}/")
 
 
 def require_operator(request: Request, settings: Settings) -> None:

@@ -51,8 +51,9 @@ def test_what_is_no_quality_is_refused(quality: int) -> None:
         encode_rgb(RGB, quality=quality)
 
 
-def test_millimetres_arrive_as_they_are() -> None:
-    values = np.array([[0, 1, 1500], [65535, 2, 3]], np.uint16)
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_millimetres_arrive_as_they_are_in_either_byte_order(order: str) -> None:
+    values = np.array([[0, 1, 1500], [65535, 2, 3]], f"{order}u2")
     np.testing.assert_allclose(read(values), values * 0.001, rtol=1e-6)
 
 
