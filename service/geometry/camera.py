@@ -1,4 +1,4 @@
-"""The pinhole camera. Pixels are (u, v) with the centre of the first pixel at (0, 0)."""
+"""The pinhole camera model. Pixels are (u, v). The centre of the first pixel is at (0, 0)."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,17 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
-    """Intrinsics of a rectified camera, pixels; ``distortion`` (OpenCV order) is for pictures not yet rectified."""
+    """Intrinsics of a pinhole camera.
+
+    Attributes:
+        width: image width, pixels.
+        height: image height, pixels.
+        fx: horizontal focal length, pixels.
+        fy: vertical focal length, pixels.
+        cx: u of the principal point, pixels.
+        cy: v of the principal point, pixels.
+        distortion: distortion coefficients in OpenCV order. Empty for rectified images.
+    """
 
     width: int
     height: int
@@ -21,11 +31,18 @@ class PinholeCamera:
 
     @property
     def matrix(self) -> Float64[NDArray[np.float64], "3 3"]:
-        """K."""
+        """The camera matrix K, pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def scaled_to(self, width: int, height: int) -> "PinholeCamera":
-        """The same camera with its picture resized; pixel centres, not corners, are at whole numbers."""
+        """Return the intrinsics for a resized image.
+
+        Pixel centres are at integers, not pixel corners. So the principal point is shifted by half a pixel before scaling.
+
+        Args:
+            width: new image width, pixels.
+            height: new image height, pixels.
+        """
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(
             width,
@@ -38,6 +55,6 @@ class PinholeCamera:
         )
 
     def rays_of_pixels(self) -> Float64[NDArray[np.float64], "H W 3"]:
-        """Directions with z = 1 in the optical frame through every pixel's centre (no distortion)."""
+        """Return the ray through each pixel centre in the optical frame, scaled to z = 1, without distortion."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)

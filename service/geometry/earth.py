@@ -1,6 +1,7 @@
-"""Between WGS-84 and a map frame that is east, north, up at its origin.
+"""Conversion between WGS-84 and a map frame whose axes are east, north and up at its origin.
 
-Exact through earth-centred coordinates (Bowring's start, then Newton's steps on the way back; NIMA TR8350.2 for the ellipsoid).
+The conversion goes through earth-centred coordinates and is exact. The way back to latitude and height iterates 10 times.
+The iteration starts at the latitude that is exact for height 0. Ellipsoid: NIMA TR8350.2.
 """
 
 from dataclasses import dataclass
@@ -9,16 +10,23 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+#: Semi-major axis (m) and flattening of the WGS-84 ellipsoid.
 _A, _F = 6378137.0, 1 / 298.257223563
+#: Squared first eccentricity of the ellipsoid.
 _E2 = _F * (2 - _F)
 
 
 @dataclass(frozen=True, slots=True)
 class Georeference:
-    """Where on the Earth a map's origin lies; x is east there, y north, z up. Degrees, metres above the ellipsoid.
+    """WGS-84 position of a map's origin. At the origin x points east, y north and z up.
+
+    Attributes:
+        latitude_deg: geodetic latitude, degrees, -90 to 90.
+        longitude_deg: longitude, degrees, -180 to 180.
+        height_m: height above the ellipsoid, metres, at most 100 km up or down.
 
     Raises:
-        ValueError: a number is no place on the Earth, naming it.
+        ValueError: a number is out of bounds or NaN. The message names the attribute.
     """
 
     latitude_deg: float
@@ -26,7 +34,11 @@ class Georeference:
     height_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no place."""
+        """Check that all numbers are within bounds.
+
+        Raises:
+            ValueError: a number is out of bounds or NaN.
+        """
         limits = {"latitude_deg": 90.0, "longitude_deg": 180.0, "height_m": 1e5}
         for name, most in limits.items():
             value = getattr(self, name)
@@ -34,27 +46,43 @@ class Georeference:
                 raise ValueError(f"{name}: {value!r} is not between -{most:g} and {most:g}")
 
     def to_map(self, latitude_deg: float, longitude_deg: float, height_m: float) -> Float64[NDArray[np.float64], "3"]:
-        """Map coordinates (m) of a place on the Earth."""
+        """Return the map coordinates (m) of a WGS-84 position.
+
+        Args:
+            latitude_deg: geodetic latitude, degrees.
+            longitude_deg: longitude, degrees.
+            height_m: height above the ellipsoid, metres.
+        """
         away = _earth_centred(latitude_deg, longitude_deg, height_m) - self._origin()
         local: Float64[NDArray[np.float64], 3] = self._east_north_up() @ away
         return local
 
     def to_earth(self, position_m: Float64[NDArray[np.float64], "3"]) -> tuple[float, float, float]:
-        """Latitude and longitude (degrees) and height (m) of map coordinates."""
+        """Return latitude (degrees), longitude (degrees) and height above the ellipsoid (m) of a map position.
+
+        Args:
+            position_m: x, y, z in the map frame, metres.
+        """
         x, y, z = (self._origin() + self._east_north_up().T @ position_m).tolist()
         flat = float(np.hypot(x, y))
         latitude = float(np.arctan2(z, flat * (1 - _E2)))
         height = 0.0
         for _ in range(10):
             n = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
-            # Near the poles the distance from the axis says nothing about the height, near the equator z does not.
+            # The division needs the larger of cosine and sine. The cosine is 0 at a pole, the sine is 0 at the equator.
             cosine, sine = np.cos(latitude), np.sin(latitude)
             height = float(flat / cosine - n if cosine > abs(sine) else z / sine - n * (1 - _E2))
             latitude = float(np.arctan2(z, flat * (1 - _E2 * n / (n + height))))
         return float(np.rad2deg(latitude)), float(np.rad2deg(np.arctan2(y, x))), height
 
     def R_enu_map(self, position_m: Float64[NDArray[np.float64], "3"]) -> Float64[NDArray[np.float64], "3 3"]:
-        """From map axes to east, north and up at a position of the map; they part by a degree in a hundred kilometres."""
+        """Return the rotation from map axes to east, north and up at a map position.
+
+        The two sets of axes differ by about one degree per 100 km from the origin.
+
+        Args:
+            position_m: x, y, z in the map frame, metres.
+        """
         latitude_deg, longitude_deg, _ = self.to_earth(position_m)
         turned: Float64[NDArray[np.float64], "3 3"] = (
             _east_north_up(latitude_deg, longitude_deg) @ self._east_north_up().T
@@ -69,7 +97,7 @@ class Georeference:
 
 
 def _east_north_up(latitude_deg: float, longitude_deg: float) -> Float64[NDArray[np.float64], "3 3"]:
-    """Rows: east, north and up at a place, earth-centred."""
+    """Return the unit vectors east, north and up of a position as rows, in earth-centred axes."""
     b, l = np.deg2rad([latitude_deg, longitude_deg])  # noqa: E741  # geodesy's own letters
     return np.array([
         [-np.sin(l), np.cos(l), 0.0],

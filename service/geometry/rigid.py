@@ -1,4 +1,4 @@
-"""Rigid transforms: 4x4 matrices in float64, frames in their names (``T_map_camera`` takes camera to map)."""
+"""Rigid transforms as 4x4 matrices in float64. ``T_map_camera`` maps points from the camera frame to the map frame."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -8,12 +8,17 @@ Transform = Float64[NDArray[np.float64], "4 4"]
 Rotation = Float64[NDArray[np.float64], "3 3"]
 Points = Float64[NDArray[np.float64], "N 3"]
 
-#: Optical frame (x right, y down, z forward) into body frame (x forward, y left, z up), REP-103.
+#: Rotation from the optical frame (x right, y down, z forward) to the body frame (x forward, y left, z up), REP-103.
 R_BODY_OPTICAL: NDArray[np.float64] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def transform_from(rotation: Rotation, translation_m: Float64[NDArray[np.float64], "3"]) -> Transform:
-    """Put a rotation and a translation (metres) into one 4x4 matrix."""
+    """Combine a rotation and a translation into one 4x4 matrix.
+
+    Args:
+        rotation: R_a_b.
+        translation_m: origin of frame b in frame a, metres.
+    """
     T = np.eye(4)
     T[:3, :3] = rotation
     T[:3, 3] = translation_m
@@ -21,38 +26,63 @@ def transform_from(rotation: Rotation, translation_m: Float64[NDArray[np.float64
 
 
 def transform_points(T_a_b: Transform, points_b: Points) -> Points:
-    """Take points (metres) from frame b to frame a."""
+    """Transform points from frame b to frame a.
+
+    Args:
+        T_a_b: transform from frame b to frame a, translation in metres.
+        points_b: points in frame b, metres.
+    """
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def inverse(T_a_b: Transform) -> Transform:
-    """T_b_a, without a general matrix inverse."""
+    """Return T_b_a, computed from the transposed rotation.
+
+    Args:
+        T_a_b: transform from frame b to frame a.
+    """
     R = T_a_b[:3, :3]
     return transform_from(R.T.copy(), -R.T @ T_a_b[:3, 3])
 
 
 def rotation_x(angle_rad: float) -> Rotation:
-    """Rotation about x (paper, eq. 7)."""
+    """Return the rotation about the x axis (paper, eq. 7).
+
+    Args:
+        angle_rad: angle by the right-hand rule, radians.
+    """
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def rotation_y(angle_rad: float) -> Rotation:
-    """Rotation about y (paper, eq. 8)."""
+    """Return the rotation about the y axis (paper, eq. 8).
+
+    Args:
+        angle_rad: angle by the right-hand rule, radians.
+    """
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def rotation_z(angle_rad: float) -> Rotation:
-    """Rotation about z (paper, eq. 6)."""
+    """Return the rotation about the z axis (paper, eq. 6).
+
+    Args:
+        angle_rad: angle by the right-hand rule, radians.
+    """
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def rotation_taking(a: Float64[NDArray[np.float64], "3"], b: Float64[NDArray[np.float64], "3"]) -> Rotation:
-    """The smallest rotation that turns unit vector a into unit vector b (Rodrigues).
+    """Return the smallest rotation that turns unit vector a into unit vector b (Rodrigues).
 
-    Opposite vectors have no smallest rotation; any perpendicular axis is taken.
+    Opposite vectors have no unique smallest rotation. Then the function turns by 180 degrees about a perpendicular axis.
+
+    Args:
+        a: unit vector before the rotation.
+        b: unit vector after the rotation, in the same frame.
     """
     axis = np.cross(a, b)
     cosine = float(a @ b)
@@ -67,7 +97,11 @@ def rotation_taking(a: Float64[NDArray[np.float64], "3"], b: Float64[NDArray[np.
 
 
 def quaternion_xyzw_from(rotation: Rotation) -> Float64[NDArray[np.float64], "4"]:
-    """Unit quaternion x, y, z, w with w >= 0 (Shepperd's method, the largest component first)."""
+    """Return the unit quaternion x, y, z, w with w >= 0 (Shepperd's method, the largest component first).
+
+    Args:
+        rotation: rotation matrix.
+    """
     m = rotation
     squares = np.array([1 + m[0, 0] - m[1, 1] - m[2, 2], 1 - m[0, 0] + m[1, 1] - m[2, 2],
                         1 - m[0, 0] - m[1, 1] + m[2, 2], 1 + m[0, 0] + m[1, 1] + m[2, 2]])  # fmt: skip
@@ -87,7 +121,11 @@ def quaternion_xyzw_from(rotation: Rotation) -> Float64[NDArray[np.float64], "4"
 
 
 def rotation_from_quaternion_xyzw(q_xyzw: Float64[NDArray[np.float64], "4"]) -> Rotation:
-    """Rotation matrix of a quaternion x, y, z, w of any length but zero."""
+    """Return the rotation matrix of a quaternion.
+
+    Args:
+        q_xyzw: quaternion x, y, z, w. Any length except zero.
+    """
     x, y, z, w = q_xyzw / np.linalg.norm(q_xyzw)
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -97,15 +135,27 @@ def rotation_from_quaternion_xyzw(q_xyzw: Float64[NDArray[np.float64], "4"]) -> 
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """The same angle in [-pi, pi)."""
+    """Return the same angle in [-pi, pi).
+
+    Args:
+        angle_rad: any angle, radians.
+    """
     return float((angle_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
 def heading_of_camera(T_map_camera: Transform) -> float:
-    """Heading of the optical axis, radians, counter-clockwise from map x."""
+    """Return the heading of the optical axis, radians, counter-clockwise from map x.
+
+    Args:
+        T_map_camera: camera pose. The optical axis is z.
+    """
     return float(np.arctan2(T_map_camera[1, 2], T_map_camera[0, 2]))
 
 
 def heading_of_body(T_map_body: Transform) -> float:
-    """Heading of the x axis of a vehicle or LiDAR, radians, counter-clockwise from map x."""
+    """Return the heading of the x axis of a vehicle or LiDAR, radians, counter-clockwise from map x.
+
+    Args:
+        T_map_body: pose of the vehicle or LiDAR. The forward axis is x.
+    """
     return float(np.arctan2(T_map_body[1, 0], T_map_body[0, 0]))

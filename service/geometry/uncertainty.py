@@ -1,4 +1,4 @@
-"""What is known of one point of a rigid body from what is known of another."""
+"""Propagate the covariance of a pose to another reference point of the same rigid body."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -8,15 +8,17 @@ from numpy.typing import NDArray
 def covariance_at(
     covariance: Float64[NDArray[np.float64], "6 6"], from_m: Float64[NDArray[np.float64], "3"], to_m: Float64[NDArray[np.float64], "3"]
 ) -> Float64[NDArray[np.float64], "6 6"]:  # fmt: skip
-    """What a pose's covariance at one point of a rigid body says of another point of it.
+    """Propagate a pose covariance from one reference point of a rigid body to another (adjoint).
+
+    All arguments use the same axes.
 
     Args:
-        covariance: translation (m) first, then rotation (rad), in the axes that the points are given in, about ``from_m``.
-        from_m: the point that it is about.
-        to_m: the other one.
+        covariance: covariance about ``from_m``: translation (m) first, then rotation (rad).
+        from_m: reference point of ``covariance``, metres.
+        to_m: new reference point, metres.
     """
     x, y, z = to_m - from_m
     lever = np.eye(6)
-    lever[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # turning about one moves the other: rotation x lever
+    lever[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # translation at to_m: t + rotation x (to_m - from_m)
     moved: Float64[NDArray[np.float64], "6 6"] = lever @ covariance @ lever.T
     return moved

@@ -1,15 +1,19 @@
-"""How bright a cell is against the rest of its view: the one cue that a LiDAR's return and a picture's grey both have.
+"""Brightness of a cell relative to its view: a cue that LiDAR intensity and image grey level share.
 
-Neither has a scale that the other knows: exposure, gamma, the sensor's own calibration. So both are told in spreads about the
-mean of the logarithm, over the cells that have a range, which takes out any factor and any power.
+The two have no common scale. Exposure, gamma and the calibration of the sensor differ. So the logarithm is normalised: its mean
+is subtracted, and the result is divided by its standard deviation. Both are taken over the cells with a range. The result does
+not change if a gain or a gamma changes (decision 0023).
 """
 
 import numpy as np
 from jaxtyping import Bool, Float32
 from numpy.typing import NDArray
 
-FLOOR = 0.03  # of the mean: darker than this is black, whatever it is
-LEAST_SPREAD = 0.05  # of the logarithm: a view flatter than this tells nothing (a sensor without intensity)
+#: Offset under the logarithm, as a share of the mean. All values well below it count as equally black.
+FLOOR = 0.03
+#: Smallest standard deviation of the logarithm. A flatter view carries no information, e.g. from a sensor without intensity.
+LEAST_SPREAD = 0.05
+#: Largest absolute brightness, standard deviations.
 LIMIT = 3.0
 
 
@@ -19,12 +23,16 @@ def brightness(
     measured: Bool[NDArray[np.bool_], "rows columns"],
     seen: Bool[NDArray[np.bool_], "rows columns"],
 ) -> Float32[NDArray[np.float32], "rows columns"]:
-    """Brightness of a view in spreads about its mean, within +-3; 0 outside ``seen``, and everywhere if there is none.
+    """Normalise the brightness of a view to standard deviations from its mean.
 
     Args:
-        values: intensity of a LiDAR's returns, or of a picture (paper, eq. 9); not negative, of any scale.
-        measured: cells with a range; mean and spread are taken over these.
-        seen: cells whose value means something; a picture's sky has brightness and no range.
+        values: intensity of LiDAR returns, or of an image (paper, eq. 9). Not negative, any scale.
+        measured: cells with a range. Mean and standard deviation are taken over these cells.
+        seen: cells whose value is valid. The sky of an image has a brightness and no range.
+
+    Returns:
+        Brightness in standard deviations, clipped to +-3. It is 0 outside ``seen``. It is 0 everywhere if the measured cells
+        have no positive mean, or if their logarithm varies less than ``LEAST_SPREAD``.
     """
     of_measured = values[measured]
     mean = float(of_measured.mean()) if of_measured.size else 0.0

@@ -1,4 +1,7 @@
-"""The edge where unchecked bytes become pictures; inside, nobody checks again."""
+"""Decode and check the images of a request.
+
+Unchecked bytes enter here. Code behind this module relies on these checks and does not repeat them.
+"""
 
 import cv2
 import numpy as np
@@ -24,31 +27,32 @@ __all__ = ["DepthEncoding", "DepthKind", "ImageLimits", "decode_depth", "decode_
 Rgb = UInt8[NDArray[np.uint8], "H W 3"]
 Depth = Float32[NDArray[np.float32], "H W"]
 
-#: How far the aspect ratio of a picture may lie from the camera's: rounding when resizing, not cropping.
+#: Largest relative difference between the aspect ratios of image and camera. It allows for rounding after resizing, not for
+#: cropping.
 ASPECT_TOLERANCE = 0.01
 _RGB_FORMATS = ("JPEG", "PNG", "WebP")
-#: OpenCV's flags for a part of the size; the bit that says RGB goes with each.
+#: OpenCV flag bits that decode a JPEG at 1 / divisor of its size. Each is combined with the flag for RGB order.
 _REDUCED = {1: 0, 2: 16, 4: 32, 8: 64}
 
 
 def decode_rgb(
     data: bytes, *, limits: ImageLimits = DEFAULT_LIMITS, camera: PinholeCamera | None = None, finest_rad: float = 0.0
 ) -> Rgb:
-    """Decode a colour picture: JPEG, PNG or WebP, in the stored orientation (an EXIF rotation is not applied).
+    """Decode a colour image (JPEG, PNG or WebP) in its stored orientation.
 
-    Grey pictures get three equal channels, alpha is dropped, 16 bits become 8.
+    An EXIF rotation is not applied. Grey images get three equal channels. Alpha is dropped. 16 bits become 8.
 
     Args:
-        data: the encoded picture.
-        limits: what it may cost.
-        camera: whose picture it is, at any scale.
-        finest_rad: a JPEG whose pixels are finer is decoded at a half, a quarter or an eighth of its size, as long as
-            its pixels stay finer; the decoder then leaves out the work, and pixels are means instead of samples.
+        data: bytes of the encoded image.
+        limits: largest number of bytes and pixels.
+        camera: camera of the image, at any scale. None: always decode at full size.
+        finest_rad: angle between the rays that the caller samples, radians. A JPEG is decoded at 1/2, 1/4 or 1/8 of its size
+            if its pixels then still cover no more than this angle. This saves time, and pixels become means instead of samples.
 
     Raises:
         DecodeError: the bytes are damaged, cut off or missing.
-        UnsupportedFormatError: another format.
-        TooLargeError: more bytes, or by its header more pixels, than the limits allow.
+        UnsupportedFormatError: the format is not JPEG, PNG or WebP.
+        TooLargeError: the image has more bytes, or by its header more pixels, than the limits allow.
     """
     field = "rgb"
     require_bytes(data, limits, field=field)
@@ -82,28 +86,30 @@ def decode_depth(
     max_range_m: float | None = None,
     limits: ImageLimits = DEFAULT_LIMITS,
 ) -> Depth:
-    """Decode a depth picture (formats: see ``read_depth_values``) to metres along the optical axis.
+    """Decode a depth image to metres along the optical axis.
+
+    ``read_depth_values`` lists the formats.
 
     Args:
-        data: the encoded picture.
-        camera: the camera whose request this is; the picture may be a uniformly resized one of its.
-        encoding: ``carla`` for CARLA's 24-bit PNG, ``compressed_depth`` for the data of ROS' compressedDepth; auto or None tell by
-            the first bytes.
-        scale_m: metres (disparity: pixels) for each stored unit, obeyed in every format. Where it is None, the format
-            decides: 0.001 for 16-bit integers, 1 for floating values, and for CARLA 1000 m for all 24 bits.
-        kind: what is stored: z, range along the ray, or disparity.
-        baseline_m: metres between the two cameras; needed for disparity.
-        max_range_m: what lies beyond is no measurement.
-        limits: what the picture may cost.
+        data: bytes of the encoded image.
+        camera: camera of the request. The image may be a uniformly resized one of this camera.
+        encoding: ``carla`` for the 24-bit PNG of CARLA, ``compressed_depth`` for the data of ROS compressedDepth.
+            ``auto`` or None: the first bytes decide.
+        scale_m: metres (disparity: pixels) per stored unit, used for every format. None: the format decides. It is 0.001 for
+            integers, 1 for floating values, and 1000 / (2^24 - 1) for CARLA (far plane at 1000 m).
+        kind: stored quantity: z, range along the ray, or disparity.
+        baseline_m: distance between the two cameras, metres. Disparity needs it.
+        max_range_m: limit of the sensor, metres. Values beyond it count as not measured.
+        limits: largest number of bytes and pixels.
 
     Returns:
-        z, metres; 0 where nothing was measured (0, negative, NaN and infinite values).
+        Depth z in metres. 0 means "not measured" (stored values that are 0, negative, NaN or infinite).
 
     Raises:
         DecodeError: the bytes are damaged, cut off or missing.
-        UnsupportedFormatError: another format or sample type.
-        TooLargeError: more bytes, or by its header more pixels, than the limits allow.
-        RequestError: scale, baseline or limit is missing or not positive.
+        UnsupportedFormatError: the format or the sample type is not read as depth.
+        TooLargeError: the image has more bytes, or by its header more pixels, than the limits allow.
+        RequestError: the scale, the baseline or the limit is missing or not positive.
     """
     values = read_depth_values(data, encoding=encoding, limits=limits)
     if scale_m is None:
@@ -117,10 +123,17 @@ def decode_depth(
 def require_sizes(
     rgb: UInt8[NDArray[np.uint8], "H W 3"], depth_m: Float32[NDArray[np.float32], "h w"], camera: PinholeCamera
 ) -> None:
-    """Refuse pictures that are not the camera's, each at any uniform scale of its own.
+    """Refuse images whose aspect ratio is not that of the camera.
+
+    Each image may have a uniform scale of its own.
+
+    Args:
+        rgb: colour image, sRGB.
+        depth_m: depth z, metres.
+        camera: camera of the request, pixels.
 
     Raises:
-        ImageSizeError: an aspect ratio is more than 1 % off the camera's.
+        ImageSizeError: an aspect ratio differs from that of the camera by more than 1 %.
     """
     for field, picture in (("rgb", rgb), ("depth", depth_m)):
         height, width = picture.shape[:2]

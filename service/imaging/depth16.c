@@ -1,8 +1,8 @@
 /* Two lossless codecs of 16-bit depth pictures. */
 
-/* Takes the filters off the rows of a 16-bit grey PNG (RFC 2083, section 6): out has height x width native values.
- * raw holds height rows of one filter byte and 2 x width sample bytes, the higher one first; Python has checked its size.
- * Returns the number of rows before the first whose filter is unknown. */
+/* Reverses the row filters of a 16-bit grey PNG (RFC 2083, section 6), in place. out gets height x width values in native byte order.
+ * raw holds height rows, each of one filter byte and 2 x width sample bytes in big-endian order. Python has checked its size.
+ * Returns height, or the index of the first row with an unknown filter. */
 
 #include <stdint.h>
 #include <stdlib.h>
@@ -16,7 +16,7 @@ static uint8_t paeth(int a, int b, int c) {
 
 int64_t streetfix_unfilter(uint8_t *raw, int64_t height, int64_t width, uint16_t *out) {
     const int64_t bytes = 2 * width;
-    const uint8_t *before = NULL; /* the row above, unfiltered in place; none is zeros */
+    const uint8_t *before = NULL; /* the unfiltered row above; NULL counts as zeros */
     for (int64_t y = 0; y < height; y++) {
         uint8_t *row = raw + y * (bytes + 1) + 1;
         switch (row[-1]) {
@@ -40,7 +40,7 @@ int64_t streetfix_unfilter(uint8_t *raw, int64_t height, int64_t width, uint16_t
                     for (int64_t k = 2; k < bytes; k++) row[k] = (uint8_t)(row[k] + row[k - 2]);
                     break;
                 }
-                int a0 = 0, a1 = 0, c0 = 0, c1 = 0; /* left and above left, of both bytes of a sample */
+                int a0 = 0, a1 = 0, c0 = 0, c1 = 0; /* bytes on the left (a) and above left (c), for both bytes of a sample */
                 for (int64_t k = 0; k < bytes; k += 2) {
                     const int b0 = before[k], b1 = before[k + 1];
                     a0 = (uint8_t)(row[k] + paeth(a0, b0, c0));
@@ -61,7 +61,8 @@ int64_t streetfix_unfilter(uint8_t *raw, int64_t height, int64_t width, uint16_t
     return height;
 }
 
-/* Nibbles of 32-bit words, the highest first; a number is groups of three bits, the lowest first, the fourth says that more follow. */
+/* Reader of nibbles from little-endian 32-bit words, highest nibble first. A number is a sequence of nibbles: three bits of value,
+ * lowest group first, and a fourth bit that is set if another nibble follows. */
 typedef struct {
     const uint8_t *at, *end;
     uint32_t word;
@@ -90,8 +91,8 @@ static uint32_t number_of(Nibbles *n) {
     return 0;
 }
 
-/* RVL (Wilson, ISS 2017), as ROS' compressedDepth carries it: runs of zeros, and of differences in zigzag.
- * Returns the number of pixels that were read; fewer than there are if the data are damaged or end early. */
+/* Decodes RVL (Wilson, ISS 2017) as in ROS compressedDepth: runs of zeros alternate with runs of zigzag-coded differences.
+ * Returns the number of decoded pixels. The number is less than pixels if the data are damaged or end early. */
 int64_t streetfix_rvl(const uint8_t *data, int64_t length, int64_t pixels, uint16_t *out) {
     Nibbles n = {data, data + length, 0, 0, 0};
     int64_t done = 0;

@@ -1,4 +1,4 @@
-"""The compiled codecs of 16-bit depth."""
+"""Load the compiled codecs of 16-bit depth images."""
 
 import ctypes
 from ctypes import c_int64, c_void_p
@@ -7,15 +7,16 @@ from pathlib import Path
 
 from service.compiled import load
 
+#: Library that the build compiles from ``depth16.c``.
 LIBRARY = Path(__file__).with_name("_depth16.so")
 
 
 @cache
 def library() -> ctypes.CDLL:
-    """Loaded once.
+    """Load the library at the first call and return the same one afterwards.
 
     Raises:
-        StreetfixError: it was not compiled.
+        StreetfixError: the library was not compiled.
     """
     found = load(LIBRARY)
     found.streetfix_unfilter.argtypes = [c_void_p, c_int64, c_int64, c_void_p]

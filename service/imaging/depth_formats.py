@@ -1,6 +1,6 @@
-"""Depth pictures as arrays of raw values; what the values mean is said in ``depth_units``.
+"""Read depth images as arrays of raw values. ``depth_units`` converts these values to metres.
 
-Every reader checks the size that the header states against the limits before it touches the data.
+Every reader first checks the size that the header states against the limits. Only then does the reader touch the data.
 """
 
 import io
@@ -18,12 +18,12 @@ from service.imaging.png16 import is_plain_grey16, read_grey16
 from service.imaging.raw16 import read_raw16
 from service.imaging.ros_depth import read_ros_depth
 
-#: ``auto`` (as None) tells by the first bytes; ``carla`` is CARLA's depth in the three channels of an 8-bit PNG;
-#: ``compressed_depth`` is the data of a ROS message of compressed_depth_image_transport, PNG or RVL.
+#: How a depth image is encoded. ``auto`` (like None): the first bytes decide. ``carla``: depth of CARLA in three channels of an
+#: 8-bit PNG. ``compressed_depth``: data of a ROS message of compressed_depth_image_transport, PNG or RVL.
 DepthEncoding = Literal["auto", "carla", "compressed_depth"]
 Values = Shaped[NDArray[Any], "H W"]
 
-#: CARLA's far plane: it means "nothing hit", and so no measurement.
+#: Stored value of CARLA's far plane. The ray hit nothing, so this value counts as not measured.
 CARLA_FAR_VALUE = 2**24 - 1
 _MAX_NPY_HEADER_BYTES = 1024
 _NPY_DTYPES = frozenset({"f2", "f4", "f8", "u2"})
@@ -31,21 +31,23 @@ _FIELD = "depth"
 
 
 def read_depth_values(data: bytes, *, encoding: DepthEncoding | None, limits: ImageLimits) -> Values:
-    """Read the raw values of a depth picture.
+    """Read the raw values of a depth image.
 
     Args:
-        data: a 16-bit grey PNG, an 8-bit colour PNG of CARLA's (``encoding="carla"``), a float TIFF, an NPY of float16,
-            float32, float64 or uint16, or raw16 (``service.imaging.raw16``).
-        encoding: how to read it where the first bytes do not tell, else None.
-        limits: what the picture may cost.
+        data: bytes of the image. Formats: 16-bit grey PNG, 8-bit colour PNG of CARLA (``encoding="carla"``), float TIFF,
+            NPY of float16, float32, float64 or uint16, raw16 (``service.imaging.raw16``), and the data of ROS compressedDepth
+            (``encoding="compressed_depth"``, see ``service.imaging.ros_depth``).
+        encoding: how to read the bytes. ``auto`` or None: the first bytes decide.
+        limits: largest number of bytes and pixels.
 
     Returns:
-        Values as stored; integers are uint16 (CARLA's uint32), the others floating.
+        Stored values. Integers are uint16 (CARLA: uint32, with 0 for the far plane), all others are floating. Inverse depth of
+        ROS compressedDepth is already converted to float32 metres.
 
     Raises:
-        DecodeError: the bytes are not the picture they say they are.
-        UnsupportedFormatError: a format, or a sample type, that we do not read as depth.
-        TooLargeError: more bytes or pixels than the limits allow.
+        DecodeError: the bytes are damaged, cut off or missing.
+        UnsupportedFormatError: the format or the sample type is not read as depth.
+        TooLargeError: the image has more bytes or pixels than the limits allow.
     """
     require_bytes(data, limits, field=_FIELD)
     if encoding == "compressed_depth":
@@ -67,10 +69,20 @@ def read_depth_values(data: bytes, *, encoding: DepthEncoding | None, limits: Im
 
 
 def opencv_decode(data: bytes, flags: int, *, field: str) -> NDArray[Any]:
-    """Decode with OpenCV, in the stored orientation: intrinsics belong to the stored pixels, not to an EXIF note.
+    """Decode an image with OpenCV in its stored orientation.
+
+    Intrinsics belong to the stored pixels, so an EXIF rotation must not be applied. The caller's flags ensure this.
+
+    Args:
+        data: bytes of the encoded image.
+        flags: flags of ``cv2.imdecode``.
+        field: part of the request that the error names.
+
+    Returns:
+        Pixels, (H, W) or (H, W, C). The flags decide the number of channels, their order and the type.
 
     Raises:
-        DecodeError: OpenCV refuses the bytes.
+        DecodeError: OpenCV cannot decode the bytes.
     """
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

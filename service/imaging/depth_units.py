@@ -1,4 +1,4 @@
-"""What the values of a depth picture mean: z, range or disparity, as metres along the optical axis."""
+"""Convert the stored values of a depth image (z, range or disparity) to metres along the optical axis."""
 
 from typing import Any, Literal
 
@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 
-#: z along the optical axis, range along the ray, or disparity between rectified pictures, pixels.
+#: Stored quantity: z along the optical axis, range along the ray, or disparity between rectified images (pixels).
 DepthKind = Literal["z", "range", "disparity"]
 Depth = Float32[NDArray[np.float32], "H W"]
 
-#: Metres for each value of CARLA's 24-bit depth: its far plane lies at 1000 m.
+#: Metres per stored unit of CARLA's 24-bit depth. Its far plane lies at 1000 m.
 CARLA_SCALE_M = 1000 / (2**24 - 1)
-#: What is said to be nearer or further away, no camera has seen: it is no measurement, and squares and inverses stay numbers.
+#: Smallest and largest valid depth, metres. No camera measures values outside, so they count as not measured.
+#: Within these bounds, squares and inverses stay finite.
 LEAST_M, MOST_M = 1e-4, 1e6
-#: Metres for each value of a 16-bit picture where the request names no scale: millimetres, as RGB-D cameras write.
+#: Metres per stored unit of an integer image if the request names no scale: millimetres, as RGB-D cameras write.
 INTEGER_SCALE_M = 0.001
 
 
@@ -31,18 +32,19 @@ def depth_from_values(
     baseline_m: float | None,
     max_range_m: float | None,
 ) -> Depth:
-    """Turn stored values into metres along the optical axis.
+    """Convert stored values to metres along the optical axis.
 
     Args:
-        values: as stored; 0, negative, NaN and infinite mean "no measurement".
-        scale_m: metres (disparity: pixels) for each stored unit.
-        kind: what is stored.
-        camera: the colour camera at any uniform scale of this picture; its fx and rays are scaled to it.
-        baseline_m: between the two cameras, metres; needed for disparity.
-        max_range_m: the sensor's limit on z (on the range, where range is stored); what lies beyond is no measurement.
+        values: stored values. 0, negative, NaN and infinite values mean "not measured".
+        scale_m: metres (disparity: pixels) per stored unit.
+        kind: stored quantity.
+        camera: colour camera, at any uniform scale of this image. Its fx and its rays are scaled to this image.
+        baseline_m: distance between the two cameras, metres. Disparity needs it.
+        max_range_m: limit of the sensor, metres. It applies to z, or to the range if the range is stored. Values beyond it
+            count as not measured.
 
     Returns:
-        z, metres; 0 where nothing was measured.
+        Depth z in metres, 0 where nothing was measured. Values outside ``LEAST_M`` to ``MOST_M`` count as not measured.
 
     Raises:
         RequestError: the scale, the baseline or the limit is missing or not positive.
@@ -58,7 +60,8 @@ def depth_from_values(
             baseline_m = _require_positive(baseline_m, "depth.baseline_m", "metres between the cameras")
             depth = np.divide(np.float32(scaled.fx * baseline_m), depth)
         elif kind == "z" and np.issubdtype(values.dtype, np.unsignedinteger):
-            # What is stored is finite, not negative, and 0 where nothing was measured.
+            # Unsigned integers are finite and not negative, and 0 already means "not measured". So no mask is
+            # needed if no stored value can lie outside the limits.
             limit_m = MOST_M if max_range_m is None else min(max_range_m, MOST_M)
             if scale_m >= LEAST_M and float(np.iinfo(values.dtype).max) * scale_m <= limit_m:
                 return depth
@@ -72,9 +75,13 @@ def depth_from_values(
 
 
 def ray_lengths(camera: PinholeCamera) -> Float64[NDArray[np.float64], "H W"]:
-    """How much longer than z the way from the camera is, at every pixel: 1 in the centre, more towards the corners.
+    """Compute the ratio of range to z for every pixel.
 
-    A distorted picture's rays are those of its pixels before rectification.
+    The ratio is 1 on the optical axis and grows towards the corners. With distortion coefficients, the rays are those of the
+    distorted pixels, i.e. before rectification.
+
+    Args:
+        camera: intrinsics, pixels. Its width and height give the shape of the result.
     """
     if not camera.distortion:
         x, y = (np.arange(camera.width) - camera.cx) / camera.fx, (np.arange(camera.height) - camera.cy) / camera.fy

@@ -1,6 +1,6 @@
-"""Fusion of colour and depth by IHS (paper, II.VII): depth takes the place of the intensity, the colour stays.
+"""Fuse colour and depth by IHS (paper, II.VII): depth replaces the intensity, and the colour stays.
 
-The network is handed floating planes, never a clipped RGB picture; ``picture_of`` is for people.
+The network gets planes of floating values, never a clipped RGB image. ``picture_of`` draws an image for people.
 """
 
 import numpy as np
@@ -13,19 +13,20 @@ Rgb = UInt8[NDArray[np.uint8], "H W 3"]
 Depth = Float32[NDArray[np.float32], "H W"]
 Fused = Float32[NDArray[np.float32], "3 H W"]
 
-#: Grey levels of the nearest and of the farthest depth in a picture for people; between the ends colour has room.
+#: Grey levels of the nearest and of the farthest depth in an image for people. They keep away from white and black, so colour
+#: has room.
 NEAR_LEVEL, FAR_LEVEL = 215.0, 40.0
 
 
 def fuse(rgb: Rgb, depth_m: Depth) -> Fused:
-    """Put depth in the place of intensity and keep the colour planes (paper, II.VII, eq. 9).
+    """Replace the intensity by depth and keep the colour planes (paper, II.VII, eq. 9).
 
     Args:
-        rgb: sRGB.
-        depth_m: metres along the optical axis; 0 where nothing was measured.
+        rgb: sRGB image.
+        depth_m: metres along the optical axis, 0 where nothing was measured.
 
     Returns:
-        depth_m, V1, V2; V1 and V2 in steps of one grey level (white is 255), never clipped or rounded.
+        Planes depth_m, V1 and V2. V1 and V2 are in grey levels (white is 255), never clipped or rounded.
     """
     return fuse_planes(rgb.astype(np.float32), depth_m)
 
@@ -33,28 +34,31 @@ def fuse(rgb: Rgb, depth_m: Depth) -> Fused:
 def fuse_planes(
     rgb: Float32[NDArray[np.float32], "*shape 3"], depth_m: Float32[NDArray[np.float32], "*shape"]
 ) -> Float32[NDArray[np.float32], "3 *shape"]:
-    """Do what ``fuse`` does, for colours and depths of any arrangement: pictures, view grids, single points.
+    """Fuse colour and depth like ``fuse``, for arrays of any shape: images, view grids, single points.
 
     Args:
         rgb: sRGB in 0..255, e.g. resampled.
-        depth_m: metres (depth or range, as the caller has it); 0 where nothing was measured.
+        depth_m: depth or range in metres, 0 where nothing was measured.
 
     Returns:
-        depth_m, V1 (within +-208.2) and V2 (within +-180.3), planes first.
+        Planes depth_m, V1 (within +-208.2) and V2 (within +-180.3), with the plane as first axis.
     """
     _, v1, v2 = ihs_linear(rgb)
     return np.stack([depth_m, v1, v2])
 
 
 def picture_of(fused: Fused, max_range_m: float) -> Rgb:
-    """Draw fused planes as the 2.5D picture that the paper shows: for people, not for the network.
+    """Draw fused planes as the 2.5D image that the paper shows, for people and not for the network.
 
-    Near is bright, ``max_range_m`` and beyond are dark, and what was not measured is black. The colour keeps its
-    hue and as much of its saturation as fits between black and white.
+    Near pixels are bright. Pixels at ``max_range_m`` and beyond are dark. Pixels without a measurement are black. The colour
+    keeps its hue, and as much of its saturation as fits between black and white.
 
     Args:
         fused: depth in metres, V1 and V2 in grey levels.
-        max_range_m: the depth drawn darkest, metres.
+        max_range_m: depth that is drawn darkest, metres.
+
+    Returns:
+        sRGB image for display.
     """
     depth_m, v1, v2 = fused
     nearness = 1 - np.clip(depth_m / max_range_m, 0, 1)

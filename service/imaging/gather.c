@@ -1,8 +1,8 @@
-/* Resamples a depth and a colour picture onto the cells of a view grid: each cell looks along several rays, its range is
- * the median of those that meet a measurement, its colour the mean of those that meet a pixel.
+/* Resamples a depth and a colour image to the cells of a view grid. Each cell has several rays. Its range is the median over the rays
+ * that hit a measurement. Its colour is the mean over the rays that hit a pixel.
  *
- * Rays lie sample by sample (all cells' first rays, then all second ones ...), so that every loop over cells is one
- * over neighbours in memory. Sizes and pointers are checked in Python; pixels outside a picture are never read. */
+ * Rays are stored sample by sample: the first rays of all cells, then the second rays of all cells, and so on. So every loop over
+ * cells reads contiguous memory. Python checks sizes and pointers. Pixels outside an image are never read. */
 
 #include <math.h>
 #include <stdint.h>
@@ -19,11 +19,11 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_END,
 };
 
-/* Where each ray of a block meets a picture: flat index of the pixel, -1 outside. Rounds half to even, as rint does. */
+/* Projects each ray of a block into an image: flat index of the pixel, -1 outside. Rounds half to even, like rint. */
 static void pixels(const float *x, const float *y, const float *z, int64_t count, const Picture *p, int32_t *index) {
     const float fx = (float)p->fx, fy = (float)p->fy, cx = (float)p->cx, cy = (float)p->cy;
     const float w = (float)p->width, h = (float)p->height;
-    const float magic = 12582912.0f; /* 1.5 * 2^23: adding it leaves no room for a fraction */
+    const float magic = 12582912.0f; /* 1.5 * 2^23: a float of this size has no fractional bits, so adding it rounds */
     const int32_t width = (int32_t)p->width;
     for (int64_t i = 0; i < count; i++) {
         const int ahead = z[i] > 1e-3f;
@@ -53,7 +53,9 @@ static const int NETWORK[25][2] = {{0, 1}, {3, 4}, {6, 7}, {1, 2}, {4, 5}, {7, 8
                                    {0, 3}, {3, 6}, {0, 3}, {1, 4}, {4, 7}, {1, 4}, {2, 5}, {5, 8}, {2, 5},
                                    {1, 3}, {5, 7}, {2, 6}, {4, 6}, {2, 4}, {2, 3}, {5, 6}};
 
-/* rays: SAMPLES x 3 x cells, level frame; R: camera from level, row by row; ranges and seen: cells; colour: cells x 3. */
+/* rays: SAMPLES x 3 x cells, level frame of the view. R: rotation from this frame to the optical frame, row-major.
+ * depth: z, metres. min_range, max_range: metres. fewest: rays with a measurement that a range needs.
+ * Output: ranges (metres, 0 without a range) and seen have one value per cell, colour (0..255) has cells x 3 values. */
 void streetfix_gather(const float *rays, int64_t cells, const double *R, const float *depth, const Picture *depth_picture,
                       const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range, int64_t fewest,
                       float *ranges, float *colour, uint8_t *seen) {
@@ -83,7 +85,7 @@ void streetfix_gather(const float *rays, int64_t cells, const double *R, const f
                 float found = INFINITY;
                 if (at[i] >= 0) {
                     seen[first + i] = 1;
-                    /* A ray of unit length has its depth at z / ray_z. */
+                    /* Range from depth: the unit ray has the z component z[i]. */
                     const float d = depth[at[i]] / z[i];
                     if (d >= least && d <= most) {
                         found = d;

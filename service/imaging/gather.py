@@ -1,4 +1,7 @@
-"""A picture pair onto the cells of a view grid, in compiled code: the dearest step of a query after decoding, otherwise."""
+"""Resample a colour and a depth image to the cells of a view grid, in compiled code.
+
+Without compiled code, this step of a query would cost the most after decoding.
+"""
 
 import ctypes
 from ctypes import POINTER, byref, c_double, c_int64, c_void_p
@@ -15,14 +18,22 @@ from service.geometry.rigid import Rotation
 from service.imaging.as_c import CPicture, c_picture
 from service.imaging.view_grid import ViewGrid
 
+#: Library that the build compiles from ``gather.c``.
 LIBRARY = Path(__file__).with_name("_gather.so")
-#: Each cell is sampled by 3 x 3 rays; the median of the measured ones stands, if there are at least this many.
+#: Each cell is sampled by ``SUB_RAYS`` x ``SUB_RAYS`` rays.
 SUB_RAYS = 3
+#: A cell gets a range, the median over its rays, only if at least so many of its rays hit a measurement.
 FEWEST_SAMPLES = 3
 
 
 def finest_rad(grid: ViewGrid) -> float:
-    """Angle between neighbouring rays: a picture whose pixels are finer says no more."""
+    """Compute the angle between neighbouring rays, radians.
+
+    An image with finer pixels does not improve the resampled view.
+
+    Args:
+        grid: view grid that the images are resampled to.
+    """
     return grid.column_rad / SUB_RAYS
 
 
@@ -48,20 +59,24 @@ def gather(
     Float32[NDArray[np.float32], "rows columns 3"],
     Bool[NDArray[np.bool_], "rows columns"],
 ]:
-    """Range, colour and whether the camera looks there, of every cell of a view.
+    """Resample a colour and a depth image to the range, colour and visibility of every cell of a view.
 
     Args:
-        rgb: sRGB, of the camera's aspect.
-        depth_m: z, metres, 0 where nothing was measured; of the camera's aspect.
-        camera: pinhole intrinsics.
-        R_camera_view: from the view's level frame (x along its heading) to the optical one.
-        grid: the view grid.
+        rgb: sRGB image with the aspect ratio of the camera.
+        depth_m: z, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
+        camera: pinhole intrinsics, pixels.
+        R_camera_view: rotation from the level frame of the view (x along its heading, z up) to the optical frame, (3, 3).
+        grid: view grid.
 
     Returns:
-        Median range (metres, 0 where fewer than ``FEWEST_SAMPLES`` rays meet a measurement within the grid's limits), mean
-        colour (0..255, black where the camera does not look), and whether it does.
+        ranges: median range in metres. 0 where fewer than ``FEWEST_SAMPLES`` rays hit a measurement within the grid's limits.
+        colour: mean colour in 0..255, black where no ray hits the colour image.
+        seen: whether a ray of the cell hits the depth image.
+
+    Raises:
+        ValueError: ``rgb`` is not (H, W, 3), or ``depth_m`` is not (h, w).
     """
-    # The kernel reads by these sizes, so what it is given must have them.
+    # The compiled code trusts these shapes and reads memory by them.
     rgb, depth_m = np.ascontiguousarray(rgb, np.uint8), np.ascontiguousarray(depth_m, np.float32)
     if rgb.ndim != 3 or rgb.shape[2] != 3 or depth_m.ndim != 2:
         raise ValueError(f"rgb {rgb.shape} and depth {depth_m.shape} are no pictures")
@@ -81,7 +96,10 @@ def gather(
 
 @cache
 def _sub_rays(grid: ViewGrid) -> Float32[NDArray[np.float32], "samples 3 cells"]:
-    """Unit rays, level frame, ``SUB_RAYS`` squared for each cell; sample by sample, as the kernel reads them."""
+    """Compute ``SUB_RAYS`` squared unit rays for each cell, in the level frame.
+
+    The first axis is the sample, because the compiled code reads sample by sample.
+    """
     rows, columns = grid.elevations_rad, grid.azimuths_rad
     spread = (np.arange(SUB_RAYS) - (SUB_RAYS - 1) / 2) / SUB_RAYS
     row_step, column_step = abs(rows[1] - rows[0]), abs(columns[1] - columns[0])

@@ -1,9 +1,13 @@
-"""Intensity, hue and saturation, both ways the paper gives: linear (eq. 9) and geometric (eq. 10-13).
+"""Intensity, hue and saturation in both forms of the paper: linear (eq. 9) and geometric (eq. 10-13).
 
-The scale of I differs. Linear: I = (R + G + B) / sqrt(3), so white of RGB in 0..1 has I = sqrt(3) (and white of
-0..255 has 441.67). Geometric: I = (R + G + B) / 3, so white has I = 1 (or 255). So does the zero of the hue: linear
-counts from blue and passes green before red, geometric counts from red and passes green before blue, which makes
-``H_linear = 4 pi / 3 - H_geometric``.
+The two forms differ in the scale of I and in the zero of the hue:
+
+- Linear: I = (R + G + B) / sqrt(3). White has I = sqrt(3) for RGB in 0..1, and 441.67 for RGB in 0..255.
+  The hue is 0 at blue and passes green before red.
+- Geometric: I = (R + G + B) / 3. White has I = 1 for RGB in 0..1, and 255 for RGB in 0..255.
+  The hue is 0 at red and passes green before blue.
+
+So ``H_linear = 4 pi / 3 - H_geometric``.
 """
 
 from typing import TypeVar
@@ -12,30 +16,31 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-#: Every function gives back the precision that it was given.
+#: Floating type. Every function returns the precision of its input.
 F = TypeVar("F", np.float32, np.float64)
 
-#: Rows I, V1, V2 (eq. 9). The rows are orthonormal, so the inverse is the transpose.
+#: Matrix with rows I, V1, V2 (eq. 9). The rows are orthonormal, so the inverse is the transpose.
 IHS_FROM_RGB: NDArray[np.float64] = np.array([
     [1 / np.sqrt(3), 1 / np.sqrt(3), 1 / np.sqrt(3)],
     [-1 / np.sqrt(6), -1 / np.sqrt(6), 2 / np.sqrt(6)],
     [-1 / np.sqrt(2), 1 / np.sqrt(2), 0.0],
 ])  # fmt: skip
 
-#: Colour smaller than this share of the intensity is rounding, not colour: such a pixel is grey and has hue 0.
+#: A pixel is grey, with hue 0, if its channels differ by no more than this share of the largest one. Such a difference is
+#: rounding, not colour.
 GREY_SHARE = 1e-6
 
 
 def ihs_linear(
     rgb: Float[NDArray[F], "*shape 3"],
 ) -> tuple[Float[NDArray[F], "*shape"], Float[NDArray[F], "*shape"], Float[NDArray[F], "*shape"]]:
-    """Turn RGB into I, V1 and V2 (paper, eq. 9).
+    """Convert RGB to I, V1 and V2 (paper, eq. 9).
 
     Args:
-        rgb: any scale, e.g. 0..1 or 0..255; any arrangement, a single colour being (1, 3).
+        rgb: any scale, e.g. 0..1 or 0..255, and any shape (..., 3). A single colour is (1, 3).
 
     Returns:
-        I, V1, V2 on the same scale: for RGB in 0..1, I in 0..sqrt(3), V1 in +-2/sqrt(6), V2 in +-1/sqrt(2).
+        I, V1 and V2 on the scale of ``rgb``. For RGB in 0..1: I in 0..sqrt(3), V1 in +-2/sqrt(6), V2 in +-1/sqrt(2).
     """
     ihs = rgb @ IHS_FROM_RGB.T.astype(rgb.dtype)
     return ihs[..., 0], ihs[..., 1], ihs[..., 2]
@@ -44,7 +49,13 @@ def ihs_linear(
 def rgb_from_linear(
     i: Float[NDArray[F], "*shape"], v1: Float[NDArray[F], "*shape"], v2: Float[NDArray[F], "*shape"]
 ) -> Float[NDArray[F], "*shape 3"]:
-    """Turn I, V1 and V2 back into RGB: the exact inverse of eq. 9, never clipped."""
+    """Convert I, V1 and V2 to RGB: the exact inverse of eq. 9, never clipped.
+
+    Args:
+        i: intensity as in eq. 9, any scale.
+        v1: first colour plane, on the scale of ``i``.
+        v2: second colour plane, on the scale of ``i``.
+    """
     rgb: NDArray[F] = np.stack([i, v1, v2], axis=-1) @ IHS_FROM_RGB.astype(i.dtype)
     return rgb
 
@@ -52,11 +63,17 @@ def rgb_from_linear(
 def hue_saturation_linear(
     v1: Float[NDArray[F], "*shape"], v2: Float[NDArray[F], "*shape"]
 ) -> tuple[Float[NDArray[F], "*shape"], Float[NDArray[F], "*shape"]]:
-    """Turn V1 and V2 into hue and saturation (paper, eq. 9; the quadrant by atan2, where the paper has arctan).
+    """Convert V1 and V2 to hue and saturation (paper, eq. 9).
+
+    The paper has arctan. We use atan2, which gives the quadrant too.
+
+    Args:
+        v1: first colour plane, on the scale of RGB.
+        v2: second colour plane, on the scale of RGB.
 
     Returns:
-        Hue, radians in [0, 2 pi): blue 0, green 2 pi / 3, red 4 pi / 3, and 0 where there is no colour.
-        Saturation, on the scale of RGB: 0 for grey, at most sqrt(2/3) of full scale.
+        Hue: radians in [0, 2 pi). Blue is 0, green 2 pi / 3, red 4 pi / 3. It is 0 without colour.
+        Saturation: on the scale of RGB. It is 0 for grey, and at most sqrt(2/3) of full scale.
     """
     return _positive_angle(np.arctan2(v2, v1)), np.hypot(v1, v2)
 
@@ -64,25 +81,30 @@ def hue_saturation_linear(
 def planes_from_hue_saturation(
     h_rad: Float[NDArray[F], "*shape"], s: Float[NDArray[F], "*shape"]
 ) -> tuple[Float[NDArray[F], "*shape"], Float[NDArray[F], "*shape"]]:
-    """Turn the linear hue and saturation back into V1 and V2."""
+    """Convert linear hue and saturation to V1 and V2: the inverse of ``hue_saturation_linear``.
+
+    Args:
+        h_rad: hue, radians.
+        s: saturation, on the scale of RGB.
+    """
     return s * np.cos(h_rad), s * np.sin(h_rad)
 
 
 def ihs_geometric(
     rgb: Float[NDArray[F], "*shape 3"],
 ) -> tuple[Float[NDArray[F], "*shape"], Float[NDArray[F], "*shape"], Float[NDArray[F], "*shape"]]:
-    """Turn RGB into intensity, hue and saturation of the colour cube (paper, eq. 10-13).
+    """Convert RGB to intensity, hue and saturation of the colour cube (paper, eq. 10-13).
 
-    The hue is the angle of eq. 10 and 11, computed by atan2: arccos loses half of the digits near red and cyan, and
-    divides zero by zero on grey.
+    The hue is the angle of eq. 10 and 11. We compute it by atan2, because arccos loses half of the digits near red and cyan.
+    On grey, the equations divide zero by zero.
 
     Args:
-        rgb: not negative; any scale.
+        rgb: not negative, any scale, any shape (..., 3).
 
     Returns:
-        I, on the scale of RGB (white has 1 for RGB in 0..1).
-        H, radians in [0, 2 pi): red 0, green 2 pi / 3, blue 4 pi / 3, and 0 where there is no colour.
-        S in 0..1: 0 for grey and black, 1 where one channel is zero.
+        I: on the scale of RGB. White has 1 for RGB in 0..1.
+        H: radians in [0, 2 pi). Red is 0, green 2 pi / 3, blue 4 pi / 3. It is 0 without colour.
+        S: in 0..1. It is 0 for grey and black, and 1 where one channel is zero.
     """
     r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     intensity = ((r + g + b) / 3).astype(rgb.dtype)
@@ -99,15 +121,15 @@ def ihs_geometric(
 def rgb_from_geometric(
     i: Float[NDArray[F], "*shape"], h_rad: Float[NDArray[F], "*shape"], s: Float[NDArray[F], "*shape"]
 ) -> Float[NDArray[F], "*shape 3"]:
-    """Turn intensity, hue and saturation of the colour cube back into RGB (the sectors of Gonzalez and Woods).
+    """Convert intensity, hue and saturation of the colour cube to RGB (the sectors of Gonzalez and Woods).
 
     Args:
         i: intensity, any scale.
-        h_rad: any angle.
-        s: 0..1.
+        h_rad: hue, any angle in radians.
+        s: saturation, 0..1.
 
     Returns:
-        RGB on the scale of ``i``, never clipped: bright and saturated colours outside the cube stay outside.
+        RGB on the scale of ``i``, never clipped. Bright and saturated colours outside the cube stay outside.
     """
     third = 2 * np.pi / 3
     hue = np.mod(h_rad, 2 * np.pi)
@@ -116,7 +138,7 @@ def rgb_from_geometric(
     low = i * (1 - s)
     first = i * (1 + s * np.cos(within) / np.cos(np.pi / 3 - within))
     second = 3 * i - (low + first)
-    # Sector 0 (red to green) has first = R, second = G, low = B; each further sector turns the channels by one.
+    # Sector 0 (red to green) has first = R, second = G, low = B. Each further sector shifts the channels by one.
     turned = np.stack([first, second, low], axis=-1)
     channel = (np.arange(3) - sector[..., None]) % 3
     rgb: NDArray[F] = np.take_along_axis(turned, channel, axis=-1).astype(i.dtype)
@@ -124,7 +146,7 @@ def rgb_from_geometric(
 
 
 def _positive_angle(angle_rad: Float[NDArray[F], "*shape"]) -> Float[NDArray[F], "*shape"]:
-    """The same angle in [0, 2 pi), also where rounding would give 2 pi itself."""
+    """Wrap an angle in [-2 pi, 2 pi) to [0, 2 pi), also where rounding would give 2 pi."""
     full = angle_rad.dtype.type(2 * np.pi)
     turned = np.where(angle_rad < 0, angle_rad + full, angle_rad)
     positive: NDArray[F] = np.where(turned >= full, 0, turned).astype(angle_rad.dtype)

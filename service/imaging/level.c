@@ -1,6 +1,7 @@
-/* Fits the ground of a depth picture: a plane z = a x + b y + c in the nominal level frame, under a prior, reweighted.
+/* Fits the ground of a depth image: a plane z = a x + b y + c in the nominal level frame, by least squares under a prior. Each round
+ * keeps the points in an inlier band around the plane of the previous round.
  *
- * Sizes are checked in Python; `points` has room for every pixel that is read. */
+ * Python checks sizes. `points` has room for every pixel that is read. */
 
 #include <math.h>
 #include <stdint.h>
@@ -8,9 +9,9 @@
 #include "picture.h"
 
 typedef struct {
-    double near_m, reach_m, below_m;                /* of z along the axis; a ground point lies below -below_m */
-    double height_m, tilt_prior, height_prior_m;    /* mean of the offset; deviations of slopes and offset */
-    double noise_m, noise_per_m, correlated;        /* of one point across the plane; so many err together */
+    double near_m, reach_m, below_m;                /* limits of depth z; a ground point lies below -below_m */
+    double height_m, tilt_prior, height_prior_m;    /* prior: offset is -height_m; sigmas of slopes and offset */
+    double noise_m, noise_per_m, correlated;        /* sigma across the plane: constant, per metre; points counted as one */
 } Ground;
 
 typedef struct {
@@ -28,7 +29,7 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_END,
 };
 
-/* Solves the symmetric, positive definite H s = g. */
+/* Solves H s = g for a symmetric, positive definite H (lower triangle given) by Cholesky decomposition. */
 static void solve(double H[3][3], const double g[3], double s[3]) {
     double L[3][3] = {{0}};
     for (int i = 0; i < 3; i++)
@@ -50,8 +51,9 @@ static void solve(double H[3][3], const double g[3], double s[3]) {
     }
 }
 
-/* R: level from camera, row by row; bands: how far a point may lie from the plane, metres, metres a metre, share of it above; a round each;
- * out: slopes and offset. */
+/* R: rotation from the optical frame to the nominal level frame, row-major. step: distance between the pixels that are read.
+ * bands: a, b, c for each round. At the horizontal distance r, a point may lie a + b r below the plane and c (a + b r) above it (metres).
+ * out: slopes a, b and offset c (metres) of the plane. */
 void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, const double *R, const Ground *o,
                           const double *bands, int64_t rounds, Point *points, double *out) {
     int64_t count = 0;

@@ -1,7 +1,8 @@
-"""The local level of a depth picture: which way is up, and how high the camera stands.
+"""Level a depth image: find the vertical axis and the height of the camera above the ground.
 
-Map views are level with the ground under the vehicle, so queries must be too. A depth picture shows little ground and
-a stereo one shows it badly, so the plane is fitted under a prior (gravity or the mounting, and the usual height).
+Map views are level with the ground under the vehicle, so query views must be level too. A depth image shows little ground, and a
+stereo depth image shows it with much noise. So the ground plane is fitted under a prior: the direction of gravity or of the
+mounting, and the usual height (decisions 0005 and 0009).
 """
 
 import ctypes
@@ -19,17 +20,25 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, Rotation, rotation_taking
 from service.imaging.as_c import CPicture, c_picture
 
+#: Library that the build compiles from ``level.c``.
 LIBRARY = Path(__file__).with_name("_level.so")
-STEP_PIXELS = 80  # the picture is read at about this many columns
+#: The fit reads about this many columns of the image.
+STEP_PIXELS = 80
+#: Largest depth z of a ground point, metres.
 REACH_M = 14.0
+#: Smallest depth z of a ground point, metres.
 NEAR_M = 1.0
+#: Standard deviation of the prior of each slope of the plane (decision 0009).
 TILT_PRIOR_RAD = np.deg2rad(1.5)
+#: Standard deviation of the prior of the camera's height (decision 0009).
 HEIGHT_PRIOR_M = 0.12
-NOISE_M, NOISE_PER_M = 0.08, 0.01  # of one ground point, across the plane; more for each metre of its distance
-CORRELATED = 15.0  # so many neighbouring points err together: the fit counts them once
-#: How far a point may lie from the plane of the round before: metres, metres for each metre of distance, and the share of that which
-#: counts above it. The last are narrow, and narrower above: pavements stand a kerb above the road, lie further ahead than it in
-#: any picture, and tilt a plane through both by half a degree (decision log).
+#: Standard deviation of one ground point across the plane: constant part (m), and part per metre of horizontal distance.
+NOISE_M, NOISE_PER_M = 0.08, 0.01
+#: Number of neighbouring points with correlated errors. The fit counts so many points as one (decision 0081).
+CORRELATED = 15.0
+#: Inlier band around the plane of the previous round, one row (a, b, c) per round. At the horizontal distance r, a point may lie
+#: a + b * r below the plane and c * (a + b * r) above it (metres). The last bands are narrow, and narrower above. Otherwise
+#: pavements would tilt the plane by half a degree, because they lie a kerb above the road and further ahead (decision 0081).
 BANDS = np.array([
     (0.5, 0.08, 1.0), (0.35, 0.05, 1.0), (0.25, 0.03, 1.0), (0.11, 0.016, 0.7), (0.08, 0.012, 0.7), (0.06, 0.008, 0.7), (0.06, 0.008, 0.7),
 ])  # fmt: skip
@@ -37,14 +46,25 @@ BANDS = np.array([
 
 @dataclass(frozen=True, slots=True)
 class CameraLevel:
-    """``R_level_camera``: optical axes into the level frame (x along the axis's horizontal part, z up); height, m."""
+    """Orientation and height of a camera relative to the ground.
+
+    Attributes:
+        R_level_camera: rotation from the optical frame to the level frame (x along the horizontal part of the optical axis,
+            z up along the normal of the ground).
+        height_m: height of the camera above the ground, metres.
+    """
 
     R_level_camera: Rotation
     height_m: float
 
 
 def nominal_level(down_camera: Float64[NDArray[np.float64], "3"] | None) -> Rotation:
-    """R_level_camera from gravity (any length, camera axes), or of a camera that looks straight ahead."""
+    """Compute ``R_level_camera`` from gravity, or for a camera that looks straight ahead.
+
+    Args:
+        down_camera: direction of gravity in the camera frame, any length, not parallel to the optical axis. None: the camera is
+            taken as level.
+    """
     if down_camera is None:
         return R_BODY_OPTICAL.copy()
     up = -down_camera / np.linalg.norm(down_camera)
@@ -60,20 +80,24 @@ def level_camera(
     down_camera: Float64[NDArray[np.float64], "3"] | None,
     nominal_height_m: float,
 ) -> CameraLevel:
-    """Fit the ground of a depth picture under a prior.
+    """Fit the ground plane of a depth image under a prior and level the camera with it.
 
     Args:
-        depth_m: z, metres, 0 where nothing was measured; same aspect as the camera.
-        camera: intrinsics at the picture's own or another size of the same aspect.
-        down_camera: gravity in the camera frame, if an IMU measured it.
-        nominal_height_m: usual height of the camera above the ground.
+        depth_m: z, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
+        camera: intrinsics, pixels, at any size with the same aspect ratio.
+        down_camera: direction of gravity in the camera frame, any length, if an IMU measured it. Else None.
+        nominal_height_m: usual height of the camera above the ground, metres.
+
+    Returns:
+        Level of the camera. Without visible ground, this is the prior.
     """
     R = nominal_level(down_camera)
     slope_x, slope_y, ground = _fit_ground(depth_m, camera, R, nominal_height_m)
     normal = np.array([-slope_x, -slope_y, 1.0])
     normal /= np.linalg.norm(normal)
     R_level = rotation_taking(normal, np.array([0.0, 0.0, 1.0])) @ R
-    # Tilting moves the axis's horizontal part a little; the heading of a view is the axis's, so turn it back to x.
+    # The tilt rotates the horizontal part of the optical axis a little away from x. The heading of a view is that of the optical
+    # axis, so rotate the axis back to x.
     axis = R_level[:, 2]
     flat = float(np.hypot(axis[0], axis[1]))
     if flat > 1e-6:
@@ -88,7 +112,7 @@ class _Ground(Structure):
     )]  # fmt: skip
 
 
-#: Room for one ground point: position in the nominal level frame, horizontal distance (m), weight (1/m^2).
+#: Ground point in the work buffer of the fit: position in the nominal level frame (m), horizontal distance (m), weight (1/m^2).
 _POINT = np.dtype([(name, "<f8") for name in ("x", "y", "z", "reach", "certainty")])
 
 
@@ -105,7 +129,10 @@ def _library() -> ctypes.CDLL:
 def _fit_ground(
     depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R: Rotation, height_m: float
 ) -> tuple[float, float, float]:
-    """Slopes and offset of z = a x + b y + c near z = -height, level frame R; the prior alone where no ground is seen."""
+    """Fit slopes a, b and offset c (m) of the ground z = a x + b y + c in the nominal level frame.
+
+    The prior is a = b = 0 and c = -height_m. It is the result if the image shows no ground.
+    """
     depth_m, R = np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(R, np.float64)
     height, width = depth_m.shape
     if R.shape != (3, 3):

@@ -1,5 +1,9 @@
-"""NumPy reads the header of an NPY as Python text, and what it raises over damaged ones is the parser's own."""
+"""Errors that NumPy raises for a damaged NPY header.
+
+NumPy parses the header as Python source text, so errors of the Python parser come through.
+"""
 
 import tokenize
 
+#: Errors to catch around NumPy's header readers.
 NPY_HEADER_ERRORS = (ValueError, TypeError, SyntaxError, EOFError, MemoryError, RecursionError, tokenize.TokenError)

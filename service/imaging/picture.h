@@ -1,4 +1,4 @@
-/* A picture's size and intrinsics, as Python passes them (CPicture in as_c.py). */
+/* Size and intrinsics of an image, in the layout that Python passes (CPicture in as_c.py). */
 #ifndef STREETFIX_PICTURE_H
 #define STREETFIX_PICTURE_H
 #include <stdint.h>

@@ -1,7 +1,7 @@
-"""Size and sample type of a picture from its first bytes, so that limits are met before anything is allocated.
+"""Read size and sample type of an image from its header, to enforce limits before decoding allocates memory.
 
-A picture of a few hundred bytes may claim, and on decoding take, gigabytes. These readers only look at headers: they
-allocate nothing, follow no more than a bounded number of segments, and leave decoding to OpenCV.
+An image of a few hundred bytes may need gigabytes when it is decoded. These readers look at headers only. They allocate nothing
+and follow a bounded number of segments. OpenCV does the decoding.
 """
 
 import struct
@@ -27,19 +27,22 @@ _MAX_JPEG_SEGMENTS = 1000
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xD8)})
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
-#: Length, kind and checksum round the data of a chunk, bytes.
+#: Size of length, kind and checksum of a chunk, bytes.
 _PNG_CHUNK_FRAME = 12
 _MAX_PNG_CHUNKS = 50_000
 
 
 @dataclass(frozen=True, slots=True)
 class ImageLimits:
-    """What a picture may cost. Ours, 2026-11: a 4K camera's picture as PNG fits, a decompression bomb does not.
+    """Limits on the cost of an image.
+
+    Ours, 2026-11: a PNG of a 4K camera fits, a decompression bomb does not.
 
     Attributes:
-        max_bytes: of the encoded part.
-        max_pixels: width x height of the decoded picture.
-        reserve: called with a picture's field and pixels when its header is read, before it is decoded; may raise.
+        max_bytes: largest size of the encoded part, bytes.
+        max_pixels: largest width x height of the decoded image.
+        reserve: called with the field and the number of pixels, after the header is read and before the image is decoded. It may
+            raise.
     """
 
     max_bytes: int = 32 * 2**20
@@ -47,12 +50,21 @@ class ImageLimits:
     reserve: Callable[[str, int], None] | None = None
 
 
+#: Limits where the caller gives none.
 DEFAULT_LIMITS = ImageLimits()
 
 
 @dataclass(frozen=True, slots=True)
 class PictureHeader:
-    """What a picture says of itself; ``is_float`` means IEEE samples."""
+    """Size and sample type that the header of an image states.
+
+    Attributes:
+        height: rows, pixels.
+        width: columns, pixels.
+        channels: samples per pixel.
+        bits: bits per sample.
+        is_float: whether samples are IEEE floating values.
+    """
 
     height: int
     width: int
@@ -62,11 +74,15 @@ class PictureHeader:
 
 
 def format_of(data: bytes, *, field: str) -> Format:
-    """Tell a format by its first bytes.
+    """Detect the format of an image from its first bytes.
+
+    Args:
+        data: bytes of the encoded image.
+        field: part of the request that errors name.
 
     Raises:
         DecodeError: there are no bytes.
-        UnsupportedFormatError: none of ours.
+        UnsupportedFormatError: the format is none of ``Format``.
     """
     if not data:
         raise DecodeError(f"The part `{field}` is empty (0 bytes); send the picture's bytes in it.", field=field)
@@ -85,9 +101,13 @@ def format_of(data: bytes, *, field: str) -> Format:
 def header_of(data: bytes, format_: Format, *, field: str) -> PictureHeader:
     """Read the header of a JPEG, PNG, WebP or TIFF.
 
+    Args:
+        data: bytes of the encoded image.
+        format_: its format, from ``format_of``: JPEG, PNG, WebP or TIFF.
+        field: part of the request that errors name.
+
     Raises:
-        DecodeError: the header is damaged, or the end of the file is missing.
-        UnsupportedFormatError: a TIFF with a layout that we do not read.
+        DecodeError: the header is damaged, or the file is cut off.
     """
     readers = {"JPEG": _jpeg, "PNG": _png, "WebP": _webp, "TIFF": _tiff}
     try:
@@ -102,8 +122,13 @@ def header_of(data: bytes, format_: Format, *, field: str) -> PictureHeader:
 def require_bytes(data: bytes, limits: ImageLimits, *, field: str) -> None:
     """Refuse a part with too many bytes.
 
+    Args:
+        data: bytes of the part.
+        limits: limits of the request.
+        field: part of the request that errors name.
+
     Raises:
-        TooLargeError: more than ``limits.max_bytes``.
+        TooLargeError: the part has more than ``limits.max_bytes`` bytes.
     """
     if len(data) > limits.max_bytes:
         raise TooLargeError(
@@ -114,11 +139,17 @@ def require_bytes(data: bytes, limits: ImageLimits, *, field: str) -> None:
 
 
 def require_pixels(height: int, width: int, limits: ImageLimits, *, field: str) -> None:
-    """Refuse a picture with too many pixels, as its header says, and reserve what decoding it takes.
+    """Refuse an image with too many pixels, and reserve what its decoding needs.
+
+    Args:
+        height: rows that the header states, pixels.
+        width: columns that the header states, pixels.
+        limits: limits of the request.
+        field: part of the request that errors name.
 
     Raises:
-        TooLargeError: more than ``limits.max_pixels``.
-        StreetfixError: ``limits.reserve`` has no room for it.
+        TooLargeError: the image has more than ``limits.max_pixels`` pixels.
+        StreetfixError: ``limits.reserve`` has no room for the image.
     """
     if height * width > limits.max_pixels:
         raise TooLargeError(
@@ -131,7 +162,12 @@ def require_pixels(height: int, width: int, limits: ImageLimits, *, field: str) 
 
 
 def damaged(field: str, why: str) -> DecodeError:
-    """The error for bytes that are not the picture they begin as."""
+    """Make the error for an image whose bytes do not match its format or its header.
+
+    Args:
+        field: part of the request that the error names.
+        why: what is wrong, as a clause of the error message.
+    """
     return DecodeError(f"The picture `{field}` cannot be decoded: {why}; send the whole file unchanged.", field=field)
 
 
@@ -144,7 +180,10 @@ def _png(data: bytes, field: str) -> PictureHeader:
 
 
 def _require_png_chunks(data: bytes, field: str) -> None:
-    """Refuse chunks that reach beyond the data: decoders allocate what a chunk says before they read it."""
+    """Refuse a PNG with a chunk that reaches beyond the data, with too many chunks, or without an end.
+
+    Decoders allocate the stated size of a chunk before they read it.
+    """
     at = len(_PNG_SIGNATURE)
     for _ in range(_MAX_PNG_CHUNKS):
         length, kind = struct.unpack_from(">I4s", data, at)

@@ -1,7 +1,7 @@
-"""16-bit grey PNG, a depth camera's own format, in under half of the time that a general decoder takes.
+"""Decode 16-bit grey PNG, the native format of depth cameras, in less than half of the time of a general decoder.
 
-It inflates with libdeflate, at once and into a buffer of the size that the header allows, and takes the filters off in
-compiled code; what a PNG may be besides (interlaced, of other samples) is left to OpenCV. Pixels are the same (a test compares them).
+libdeflate inflates all data at once, into a buffer of the size that the header allows. Compiled code reverses the row filters.
+OpenCV decodes every other kind of PNG (interlaced, other samples). Both give the same pixels (a test compares them).
 """
 
 import ctypes
@@ -20,22 +20,28 @@ _FIRST_CHUNK = struct.Struct(">I4sIIBBBBB")
 
 
 def is_plain_grey16(data: bytes) -> bool:
-    """Whether ``read_grey16`` reads it: 16-bit grey, not interlaced."""
+    """Check whether ``read_grey16`` can read a PNG: 16-bit grey and not interlaced.
+
+    Args:
+        data: bytes of the file, with a complete header chunk.
+    """
     length, kind, _, _, bits, colour, compression, filters, interlace = _FIRST_CHUNK.unpack_from(data, _SIGNATURE_BYTES)
     return (length, kind, bits, colour, compression, filters, interlace) == (13, b"IHDR", 16, 0, 0, 0, 0)
 
 
 def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[NDArray[np.uint16], "H W"]:
-    """Pixels of a PNG that ``is_plain_grey16``, whose chunks were seen to end within the data.
+    """Decode a PNG for which ``is_plain_grey16`` is true.
+
+    ``header_of`` must have checked before that no chunk reaches beyond the data.
 
     Args:
-        data: the file.
-        height: as its header says, checked against the limits.
-        width: the same.
-        field: to name in errors.
+        data: bytes of the file.
+        height: rows that the header states, checked against the limits.
+        width: columns that the header states, checked against the limits.
+        field: part of the request that errors name.
 
     Raises:
-        DecodeError: a checksum does not fit, or the pixels are damaged or cut off.
+        DecodeError: a checksum is wrong, or the pixels are damaged, cut off or too many.
     """
     needed = height * (1 + 2 * width)
     parts: list[memoryview] = []
@@ -51,7 +57,7 @@ def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[N
             elif kind == b"IEND":
                 break
             at = end + 4
-        # One byte of room beyond what is needed tells a picture that is too long.
+        # One spare byte reveals an image with more data than its header states.
         raw = deflate.zlib_decompress(parts[0] if len(parts) == 1 else b"".join(parts), needed + 1)
     except (deflate.DeflateError, struct.error) as error:
         raise damaged(field, "its pixels are damaged, cut off, or far more than its header says") from error

@@ -1,4 +1,4 @@
-"""From one RGB and one depth picture to the planes that the encoder reads."""
+"""Convert one RGB and one depth image to the planes that the encoder reads."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,14 @@ from service.imaging.view_grid import PLANES, Planes, ViewGrid, heights_of
 
 @dataclass(frozen=True, slots=True)
 class QueryView:
-    """The planes of a query and what was found on the way."""
+    """One view of a query.
+
+    Attributes:
+        planes: input planes of the encoder, see ``service.imaging.view_grid.PLANES``.
+        R_level_camera: rotation from the optical frame to the level frame, (3, 3).
+        height_m: height of the camera above the ground, metres.
+        measured_share: share of cells with a range.
+    """
 
     planes: Planes
     R_level_camera: Rotation
@@ -28,7 +35,15 @@ class QueryView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueryViews:
-    """The same query seen at several turns, counter-clockwise against the optical axis (rad)."""
+    """Several views of one query at different headings.
+
+    Attributes:
+        planes: input planes of the encoder for each heading, see ``service.imaging.view_grid.PLANES``.
+        turns_rad: heading of each view relative to the optical axis, counter-clockwise, radians.
+        R_level_camera: rotation from the optical frame to the level frame, (3, 3).
+        height_m: height of the camera above the ground, metres.
+        measured_share: share of cells with a range, over all views.
+    """
 
     planes: Float32[NDArray[np.float32], "T 6 rows columns"]
     turns_rad: tuple[float, ...]
@@ -48,7 +63,21 @@ def query_view(
     nominal_height_m: float = 1.5,
     turn_rad: float = 0.0,
 ) -> QueryView:
-    """One view of a query, at any heading against the optical axis (counter-clockwise); see ``query_views``."""
+    """Compute one view of a query at any heading. ``query_views`` describes the method.
+
+    Args:
+        rgb: sRGB image with the aspect ratio of the camera.
+        depth_m: z, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
+        camera: pinhole intrinsics, pixels.
+        grid: view grid of the map.
+        rows_seen: rows that the survey of the map covers. The other rows are blanked.
+        down_camera: direction of gravity in the camera frame, any length, if known.
+        nominal_height_m: usual height of the camera above the ground, metres.
+        turn_rad: heading of the view relative to the optical axis, counter-clockwise, radians.
+
+    Raises:
+        NoDepthError: no cell of the grid holds a measurement (raised by ``query_views``).
+    """
     views = query_views(
         rgb, depth_m, camera, grid=grid, rows_seen=rows_seen, turns=(0,), turn_rad=turn_rad,
         down_camera=down_camera, nominal_height_m=nominal_height_m,
@@ -68,18 +97,20 @@ def query_views(
     down_camera: Float64[NDArray[np.float64], "3"] | None = None,
     nominal_height_m: float = 1.5,
 ) -> QueryViews:
-    """Level, resample to the view grid, fuse (paper, section 3, testing stage).
+    """Level a query, resample it to the view grid, and fuse colour and depth (paper, section 3, testing stage).
+
+    All views are cut out of one wide view.
 
     Args:
-        rgb: sRGB, of the camera's aspect.
-        depth_m: z, metres, 0 where nothing was measured; of the camera's aspect.
-        camera: pinhole intrinsics.
-        grid: the map's view grid.
-        rows_seen: rows that the map's survey covers; the others are cut here too.
-        turns: headings of the views, in whole columns of the grid counter-clockwise: all of them are cut out of one wide view.
-        turn_rad: what those are counted from, against the optical axis.
-        down_camera: gravity in the camera frame, if known.
-        nominal_height_m: of the camera above the ground, where the picture does not show it.
+        rgb: sRGB image with the aspect ratio of the camera.
+        depth_m: z, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
+        camera: pinhole intrinsics, pixels.
+        grid: view grid of the map.
+        rows_seen: rows that the survey of the map covers. The other rows are blanked here too (decision 0006).
+        turns: headings of the views relative to ``turn_rad``, in whole columns of the grid, counter-clockwise.
+        turn_rad: heading relative to the optical axis that ``turns`` start from, counter-clockwise, radians.
+        down_camera: direction of gravity in the camera frame, any length, if known.
+        nominal_height_m: usual height of the camera above the ground, metres. It is the prior of the ground fit.
 
     Raises:
         NoDepthError: no cell of the grid holds a measurement.
@@ -92,7 +123,7 @@ def query_views(
     ranges *= seen
     colour *= seen[..., None]
     intensity, v1, v2 = ihs_linear(colour)
-    # Depth takes the place of the intensity, the colour stays (``service.imaging.fusion``).
+    # Depth replaces the intensity, and the colour stays (``service.imaging.fusion``).
     wide = np.stack([ranges, v1, v2, heights_of(ranges, level.height_m, grid), seen])
     planes = np.empty((len(turns), len(PLANES), grid.rows, grid.columns), np.float32)
     for view, turn in zip(planes, turns, strict=True):

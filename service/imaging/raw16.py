@@ -1,8 +1,8 @@
-"""Depth as it lies in memory, packed by a quick general codec: the cheapest to send and to read.
+"""Read and write raw16: depth as uint16 values, compressed by a fast general codec.
 
-``SFD1``, width and height as little-endian uint32, then one frame of little-endian uint16 rows, of zstd or of lz4: which of the two
-says the frame itself. zstd is a little smaller than a PNG and takes half of its time to read; lz4 is a fifth larger than zstd and takes
-two thirds of that.
+raw16 is the cheapest format to send and to read. The bytes are ``SFD1``, width and height as little-endian uint32, then one frame
+of little-endian uint16 rows. The frame is zstd or lz4, and its first bytes tell the codec. zstd is a little smaller than PNG and
+takes half of its time to read. lz4 is a fifth larger than zstd and takes two thirds of the time of zstd.
 """
 
 import struct
@@ -24,11 +24,19 @@ _LZ4_FRAME = b"\x04\x22\x4d\x18"
 
 
 def read_raw16(data: bytes, limits: ImageLimits, *, field: str) -> Values:
-    """Read what ``write_raw16`` writes.
+    """Decode a depth image that ``write_raw16`` wrote.
+
+    Args:
+        data: bytes of the image, with the signature ``SFD1``.
+        limits: largest number of pixels.
+        field: part of the request that errors name.
+
+    Returns:
+        Stored values, without a unit.
 
     Raises:
-        DecodeError: the bytes are cut off, or not of the size that their header says.
-        TooLargeError: more pixels than the limits allow.
+        DecodeError: the bytes are damaged or cut off, or their size differs from the header.
+        TooLargeError: the image has more pixels than the limits allow.
     """
     if len(data) < _HEADER.size:
         raise damaged(field, "its raw16 header ends early")
@@ -43,11 +51,11 @@ def read_raw16(data: bytes, limits: ImageLimits, *, field: str) -> Values:
 
 
 def write_raw16(values: NDArray[Any], codec: Codec = "zstd") -> bytes:
-    """Pack a depth picture.
+    """Encode a depth image as raw16.
 
     Args:
-        values: (H, W), uint16, as a 16-bit PNG would hold them.
-        codec: zstd for a thin link, lz4 where processors are dearer than bytes.
+        values: (H, W), uint16 values as in a 16-bit PNG.
+        codec: ``zstd`` for a slow link, ``lz4`` if processor time costs more than bytes.
     """
     height, width = values.shape
     raw = values.astype("<u2", copy=False).tobytes()
@@ -76,7 +84,8 @@ def _from_zstd(frame: memoryview, needed: int, where: str, field: str) -> bytes:
 def _from_lz4(frame: memoryview, needed: int, where: str, field: str) -> bytes:
     unpacking = lz4.frame.LZ4FrameDecompressor()
     try:
-        raw: bytes = unpacking.decompress(frame, max_length=needed + 1)  # one byte of room tells what is too long
+        # One spare byte reveals a frame that is too long.
+        raw: bytes = unpacking.decompress(frame, max_length=needed + 1)
     except (RuntimeError, EOFError) as error:
         raise damaged(field, "its lz4 frame is damaged or cut off") from error
     if len(raw) != needed or not unpacking.eof or unpacking.unused_data:

@@ -1,6 +1,6 @@
-"""Depth as ROS' compressed_depth_image_transport publishes it: a header of 12 bytes, then PNG or RVL.
+"""Read depth as ROS compressed_depth_image_transport publishes it: a header of 12 bytes, then PNG or RVL.
 
-16UC1 is stored as it is, 32FC1 as inverse depth: the header's two numbers A and B say depth = A / (value - B), metres.
+16UC1 is stored unchanged. 32FC1 is stored as inverse depth. The header holds A and B, and depth = A / (value - B) in metres.
 """
 
 import ctypes
@@ -21,11 +21,19 @@ _PNG = b"\x89PNG"
 
 
 def read_ros_depth(data: bytes, limits: ImageLimits, *, field: str) -> Shaped[NDArray[Any], "H W"]:
-    """Values of a compressedDepth message's data: uint16 as the camera gave them, or float32 metres.
+    """Read the data of a ROS compressedDepth message.
+
+    Args:
+        data: bytes of the field ``data`` of the message.
+        limits: largest number of pixels.
+        field: part of the request that errors name.
+
+    Returns:
+        uint16 values of the camera (16UC1), or float32 metres with 0 for "not measured" (32FC1).
 
     Raises:
-        DecodeError: it is damaged, or neither PNG nor RVL.
-        TooLargeError: more pixels than the limits allow.
+        DecodeError: the data are damaged, or neither PNG nor RVL.
+        TooLargeError: the image has more pixels than the limits allow.
     """
     if len(data) <= _HEADER.size:
         raise damaged(field, "its compressedDepth header ends early")

@@ -1,4 +1,7 @@
-"""How much there is to tell apart in what a picture shows: a bare wall says less than a crossing, wherever it is held against a map."""
+"""Statistics of a view that tell how distinctive its geometry is.
+
+A bare wall constrains a pose less than a crossing, in any map.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -9,27 +12,30 @@ from numpy.typing import NDArray
 
 from service.imaging.view_grid import ViewGrid
 
-#: Cells between the points that span a surface's tilt; more of them, less of the depth's noise in it.
+#: Cells between the points that span a surface normal. A larger distance reduces the effect of depth noise.
 _APART = 3
-#: Neighbours whose ranges differ by more than this share lie on two surfaces; and cells that are ``_APART`` by more than this.
+#: Relative range difference above which two cells lie on different surfaces: for neighbours, and for cells ``_APART`` apart.
 _EDGE, _BREAK = 0.15, 0.3
-#: Of a normal's length; what is more level than this is ground or ceiling.
+#: Largest vertical part of the unit normal of an upright surface. Other surfaces are ground or ceiling.
 _UPRIGHT = 0.7
-#: Rows from this elevation on look over the ground, degrees.
+#: Rows above this elevation do not look at the ground, degrees.
 _LEVEL_DEG = 1.0
+#: ``Shape.far`` needs more measured cells than this.
 _FEWEST = 20
+#: Offset under the logarithm of an eigenvalue. It keeps the logarithm finite.
 _LEAST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Figures of one view.
+    """Statistics of one view.
 
     Attributes:
-        facings: how much upright surfaces face different ways: logarithm of the smaller eigenvalue of their horizontal normals'
-            mean outer product; log 0.5 where all ways are alike, log 0.001 where all face one way.
-        far: logarithm of the median range (m) above the horizon; of the grid's limit where hardly anything is measured there.
-        edges: share of neighbouring cells, in a row, that lie on two surfaces.
+        facings: variety of the directions that upright surfaces face. It is the logarithm of the smaller eigenvalue of the mean
+            outer product of their horizontal unit normals. About log 0.5: all directions are equally frequent. log 0.001: all
+            surfaces face one direction, or there is no upright surface.
+        far: logarithm of the median range (m) above the horizon. With 20 measured cells or fewer, of the grid's largest range.
+        edges: share of horizontally neighbouring measured cells that lie on different surfaces.
     """
 
     facings: float
@@ -38,7 +44,12 @@ class Shape:
 
 
 def shape_of(ranges_m: Float32[NDArray[np.float32], "rows columns"], grid: ViewGrid) -> Shape:
-    """Of the ranges of one view (m), 0 where nothing was measured."""
+    """Compute the statistics of one view.
+
+    Args:
+        ranges_m: range of each cell, metres, 0 where nothing was measured.
+        grid: view grid of the ranges.
+    """
     above = ranges_m[grid.elevations_rad > np.deg2rad(_LEVEL_DEG)]
     above = above[above > 0]
     far = float(np.median(above)) if len(above) > _FEWEST else grid.max_range_m

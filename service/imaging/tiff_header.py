@@ -1,18 +1,28 @@
-"""The first directory of a TIFF (TIFF 6.0, sections 2 and 8): size and sample type, nothing else."""
+"""Read size and sample type from the first directory of a TIFF (TIFF 6.0, sections 2 and 8)."""
 
 import struct
 from dataclasses import dataclass
 
 _WIDTH, _HEIGHT, _BITS, _CHANNELS, _TILE_WIDTH, _TILE_HEIGHT, _SAMPLE_FORMAT = 256, 257, 258, 277, 322, 323, 339
 _NEEDED = frozenset({_WIDTH, _HEIGHT, _BITS, _CHANNELS, _TILE_WIDTH, _TILE_HEIGHT, _SAMPLE_FORMAT})
-#: Field types that whole numbers come in: BYTE, SHORT, LONG.
+#: Field types of whole numbers: BYTE, SHORT, LONG.
 _TYPES = {1: "B", 3: "H", 4: "I"}
+#: Values up to this size lie in the directory entry itself. Larger ones lie at an offset.
 _INLINE_BYTES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class TiffTags:
-    """Pixels, samples a pixel, bits a sample; ``sample_format`` 1 unsigned, 2 signed, 3 IEEE float."""
+    """Size and sample type of a TIFF.
+
+    Attributes:
+        height: rows, pixels.
+        width: columns, pixels.
+        channels: samples per pixel.
+        bits: bits per sample.
+        sample_format: 1 unsigned, 2 signed, 3 IEEE float.
+        tile_pixels: pixels per tile, 0 without tiles.
+    """
 
     height: int
     width: int
@@ -23,9 +33,12 @@ class TiffTags:
 
 
 def read_tiff_tags(data: bytes) -> TiffTags | None:
-    """Read the tags that say how much decoding will take, or None where the directory is damaged.
+    """Read the tags that determine the memory for decoding. Return None if the directory is damaged.
 
-    A tag that is given twice counts as damage: decoders differ on which one they believe.
+    A repeated tag counts as damage, because decoders differ on which one they use.
+
+    Args:
+        data: bytes of the file.
 
     Raises:
         struct.error: the directory lies beyond the end of the data.

@@ -1,8 +1,8 @@
-"""The view grid: azimuth x elevation cells of metric range, the one image space of map views and queries.
+"""The view grid: cells of metric range by azimuth and elevation, the common image space of map views and query views.
 
-A row looks at one elevation (top first), a column at one azimuth (left first), both in a *level frame*: x along the
-heading of the view, z up (normal to the local ground). A cell is a ray, not an area: its value is the range along the
-ray through its centre, metres; 0 is "no measurement". Both sides forget what lies beyond ``max_range_m``.
+A row has one elevation (top first). A column has one azimuth (left first). Both are angles in the *level frame*: x along the
+heading of the view, z up (normal to the local ground). A cell stands for a ray, not for an area. Its value is the range along the
+ray through its centre, metres, and 0 means "not measured". Map and query discard ranges beyond ``max_range_m``.
 """
 
 from dataclasses import dataclass, replace
@@ -13,21 +13,34 @@ from numpy.typing import NDArray
 
 from service.imaging.brightness import brightness
 
-#: What the encoder is given of a view, in this order: range (m) in the place of intensity, V1 and V2 (grey levels,
-#: eq. 9; 0 where there is no colour), height above the local ground (m), 1 where the sensor could have measured, and
-#: brightness (``service.imaging.brightness``): of the LiDAR's return on one side, of the picture on the other.
+#: Input planes of the encoder, in this order: range (m), which replaces the intensity. V1 and V2 (grey levels, eq. 9; 0 without
+#: colour). Height above the local ground (m). 1 where the sensor could have measured. Brightness of the LiDAR return or of the
+#: image (``service.imaging.brightness``, standard deviations).
 PLANES = ("range_m", "v1", "v2", "height_m", "observed", "brightness")
 
 Ranges = Float32[NDArray[np.float32], "rows columns"]
-#: Range (m) and intensity (as the sensor gives it) of a LiDAR, all round; and of what lies ahead.
+#: Range (m) and intensity (unit of the sensor) of a LiDAR over 360 degrees.
 Panorama = Float32[NDArray[np.float32], "2 rows around"]
+#: Range (m) and intensity (unit of the sensor) of a LiDAR in one view.
 LidarView = Float32[NDArray[np.float32], "2 rows columns"]
 Planes = Float32[NDArray[np.float32], "6 rows columns"]
 
 
 @dataclass(frozen=True, slots=True)
 class ViewGrid:
-    """Shape and limits of the view grid; the defaults are the prototype's best (feasibility, November 2026)."""
+    """Shape and limits of the view grid.
+
+    The defaults are the best of the prototype (feasibility study, November 2026).
+
+    Attributes:
+        rows: number of elevations.
+        columns: number of azimuths.
+        azimuth_span_deg: horizontal field of view, degrees.
+        elevation_top_deg: elevation of the top row, degrees.
+        elevation_bottom_deg: elevation of the bottom row, degrees.
+        min_range_m: smallest valid range, metres.
+        max_range_m: largest valid range, metres.
+    """
 
     rows: int = 32
     columns: int = 128
@@ -39,12 +52,12 @@ class ViewGrid:
 
     @property
     def elevations_rad(self) -> Float64[NDArray[np.float64], " rows"]:
-        """Elevation of every row, the top row first; the first and last lie on the limits."""
+        """Elevation of every row, radians, top row first. The first and the last row lie on the limits."""
         return np.deg2rad(np.linspace(self.elevation_top_deg, self.elevation_bottom_deg, self.rows))
 
     @property
     def azimuths_rad(self) -> Float64[NDArray[np.float64], " columns"]:
-        """Azimuth of every column's centre against the heading, counter-clockwise, so the left column is positive."""
+        """Azimuth of every column's centre from the heading, radians, counter-clockwise. The left column is positive."""
         span = np.deg2rad(self.azimuth_span_deg)
         azimuths: Float64[NDArray[np.float64], " columns"] = (
             span / 2 - span * (np.arange(self.columns) + 0.5) / self.columns
@@ -53,37 +66,45 @@ class ViewGrid:
 
     @property
     def column_rad(self) -> float:
-        """Azimuth from a column to the next."""
+        """Angle between neighbouring columns, radians."""
         return float(np.deg2rad(self.azimuth_span_deg)) / self.columns
 
     def widened(self, columns: int) -> "ViewGrid":
-        """The same with so many further columns on either side."""
+        """Return this grid with further columns on each side. The angle between columns stays the same.
+
+        Args:
+            columns: number of columns to add on the left, and again on the right.
+        """
         count = self.columns + 2 * columns
         return replace(self, columns=count, azimuth_span_deg=self.azimuth_span_deg * count / self.columns)
 
     @property
     def around(self) -> int:
-        """Columns of a panorama: 360 degrees at twice the view's density, so any heading lies within a half column."""
+        """Number of columns of a panorama: 360 degrees at twice the density of a view.
+
+        Any heading then lies within half a panorama column.
+        """
         return round(2 * self.columns * 360.0 / self.azimuth_span_deg)
 
     def rays_level(self) -> Float64[NDArray[np.float64], "rows columns 3"]:
-        """Unit rays of the cells in the level frame (x along the heading, y left, z up)."""
+        """Compute the unit rays of the cells in the level frame (x along the heading, y left, z up)."""
         elevation, azimuth = np.meshgrid(self.elevations_rad, self.azimuths_rad, indexing="ij")
         flat = np.cos(elevation)
         return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 4"], grid: ViewGrid) -> Panorama:
-    """Range and intensity all round of a levelled scan: each cell takes the point whose ray is nearest to the cell's.
+    """Project a levelled scan to a panorama of range and intensity.
 
-    Rows that fall between two beams are filled where the cells above and below agree on one surface.
+    Each cell takes the point whose ray is nearest to the ray of the cell (decision 0004). Gaps between two beams are filled where
+    the cells on both sides lie on one surface.
 
     Args:
-        points_level: x, y, z (metres, z up, origin at the sensor; azimuth 0 is x) and intensity.
-        grid: rows and limits; the panorama has ``grid.around`` columns, column 0 at azimuth -pi.
+        points_level: x, y, z in the level frame (metres, z up, origin at the sensor, azimuth 0 along x), and intensity.
+        grid: rows and limits. The panorama has ``grid.around`` columns. Column 0 is at azimuth -pi.
 
     Returns:
-        Range, metres, and intensity; both 0 where nothing was measured within the limits.
+        Range (metres) and intensity. Both are 0 where nothing was measured within the limits.
     """
     x, y, z, intensity = points_level.T
     flat = np.hypot(x, y)
@@ -97,7 +118,7 @@ def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 4"], grid
     column = np.rint(column_exact).astype(np.int64) % around
     good = (row >= 0) & (row < grid.rows) & (distance >= grid.min_range_m) & (distance <= grid.max_range_m)
     cell = (row * around + column)[good]
-    # Written far ones first, so that the nearest to the cell's own ray is written last and stays.
+    # Written in the order of falling distance to the ray of the cell, so that the nearest point is written last and stays.
     off = np.abs(row_exact - row)[good] + np.abs(column_exact - np.rint(column_exact))[good]
     order = np.argsort(-off, kind="stable")
     panorama = np.zeros((2, grid.rows * around), np.float32)
@@ -107,7 +128,10 @@ def panorama_from_points(points_level: Float32[NDArray[np.float32], "N 4"], grid
 
 
 def _fill_between_beams(panorama: Panorama) -> Panorama:
-    """Fill gaps of one to three rows, and single columns, whose two sides lie on one surface (within 10 % of range)."""
+    """Fill gaps of one to three rows, and of one column, whose two sides lie on one surface.
+
+    The ranges of the two sides may differ by 15, 20 or 25 % across one, two or three rows, and by 10 % across a column.
+    """
     filled = panorama.copy()
     rows = panorama.shape[1]
     for gap in (1, 2, 3):
@@ -126,7 +150,13 @@ def _fill_between_beams(panorama: Panorama) -> Panorama:
 
 
 def view_from_panorama(panorama: Panorama, heading_rad: float, grid: ViewGrid) -> LidarView:
-    """Cut the view that looks along a heading (radians, against the panorama's x) out of a panorama."""
+    """Cut the view along a heading out of a panorama.
+
+    Args:
+        panorama: range and intensity over 360 degrees.
+        heading_rad: heading of the view from x of the panorama's level frame, counter-clockwise, radians.
+        grid: view grid, the one of the panorama.
+    """
     azimuth = heading_rad + grid.azimuths_rad
     column = np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(np.int64) % grid.around
     return panorama[:, :, column]
@@ -139,13 +169,15 @@ def survey_planes(
     rows_seen: Bool[NDArray[np.bool_], " rows"],
     grid: ViewGrid,
 ) -> Planes:
-    """The encoder's planes of a LiDAR view: no colour, and observed wherever the survey's beams reach.
+    """Compute the input planes of the encoder for a LiDAR view.
+
+    A LiDAR view has no colour. It is observed in all rows that the beams of the survey reach.
 
     Args:
         view: range (metres) and intensity.
-        sensor_height_m: of the LiDAR above the local ground.
-        rows_seen: rows that the survey's sensor covers; the others are blank on both sides.
-        grid: the view grid.
+        sensor_height_m: height of the LiDAR above the local ground, metres.
+        rows_seen: rows that the LiDAR of the survey covers. The other rows are blank in map views and query views (decision 0006).
+        grid: view grid.
     """
     planes = np.zeros((len(PLANES), grid.rows, grid.columns), np.float32)
     ranges, intensity = view
@@ -160,6 +192,12 @@ def survey_planes(
 def heights_of(
     ranges: Float32[NDArray[np.float32], "*lead rows columns"], sensor_height_m: float, grid: ViewGrid
 ) -> Float32[NDArray[np.float32], "*lead rows columns"]:
-    """Height above the local ground, metres, of every measured cell; 0 elsewhere."""
+    """Compute the height above the local ground of every measured cell, metres, and 0 elsewhere.
+
+    Args:
+        ranges: range of each cell, metres, 0 where nothing was measured.
+        sensor_height_m: height of the sensor above the local ground, metres.
+        grid: view grid of the ranges.
+    """
     sine = np.sin(grid.elevations_rad).astype(np.float32)[:, None]
     return np.where(ranges > 0, ranges * sine + np.float32(sensor_height_m), np.float32(0))

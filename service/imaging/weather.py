@@ -1,9 +1,10 @@
-"""Removal of rain and snow from a LiDAR scan by the principal components of each point's neighbourhood.
+"""Remove rain and snow from a LiDAR scan by the principal components of each point's neighbourhood.
 
-The paper's reference 19 cleans clouds by PCA and stops there; which components mean noise is ours (2026-11). Drops and
-flakes hang alone in the air near the sensor: few of the beams that pass them return from there, and those that do
-lie on no line and no plane. Structure takes all the beams of its direction, or at least forms a line (a pole, a ring
-of the scan on the ground) or a plane.
+Reference 19 of the paper cleans point clouds by PCA and says no more. The rule that identifies noise is ours (2026-11).
+
+- Drops and flakes are isolated in the air near the sensor. Few of the beams in their direction return from them. These returns
+  lie on no line and no plane.
+- Structure returns all beams of its direction. Or it forms at least a plane or a line (a pole, a ring of the scan on the ground).
 """
 
 from dataclasses import dataclass
@@ -19,19 +20,21 @@ _AROUND = np.array([(a, e, r) for a in (-1, 0, 1) for e in (-1, 0, 1) for r in (
 
 @dataclass(frozen=True, slots=True)
 class WeatherFilter:
-    """Limits of the removal. Ours, 2026-11; the counts do not depend on the number of channels.
+    """Limits of the removal.
+
+    Ours, 2026-11. The counts do not depend on the number of channels of the LiDAR.
 
     Attributes:
-        cell_deg: side of a cell as seen from the sensor; its depth is the same share of its range, so that cells grow
-            with the range as the distance between beams does. A neighbourhood is 3 x 3 x 3 cells.
-        max_range_m: farther points are kept: drops and flakes return too little light from there.
-        min_neighbours: a neighbourhood with fewer points, the point itself among them, is noise.
-        solid_share: from this share of the returns of the neighbourhood's directions on, it is structure.
-        flat_ratio: thickness over width (roots of the smallest and of the largest eigenvalue) under which a
-            neighbourhood between the two is a plane or a line, and so structure.
-        plane_sigmas: how far off the plane of its neighbourhood a point may lie, in thicknesses of the neighbourhood:
-            a flake before a wall is not the wall.
-        plane_share: and how far beyond that, as a share of its range.
+        cell_deg: angle of a cell as seen from the sensor, degrees. The depth of the cell is the same share of its range. So cells
+            grow with the range, like the distance between beams. A neighbourhood has 3 x 3 x 3 cells.
+        max_range_m: points beyond this range are kept, metres. Drops and flakes return too little light from there.
+        min_neighbours: a neighbourhood with fewer points, including the point itself, is noise.
+        solid_share: a neighbourhood is structure if it holds at least this share of all returns in its directions.
+        flat_ratio: a neighbourhood below ``solid_share`` is still structure if its thickness divided by its width is below this
+            ratio. It is then a plane or a line. Thickness and width are the roots of the smallest and the largest eigenvalue.
+        plane_sigmas: largest distance of a point from the plane of its neighbourhood, as a multiple of the thickness. It removes
+            a flake in front of a wall.
+        plane_share: addition to this largest distance, as a share of the range.
     """
 
     cell_deg: float = 3.0
@@ -45,7 +48,15 @@ class WeatherFilter:
 
 @dataclass(frozen=True, slots=True)
 class _Neighbourhoods:
-    """Of every point: what the 3 x 3 x 3 cells around it hold, and how many points lie in their directions at all."""
+    """Neighbourhood of every point: the 3 x 3 x 3 cells around it.
+
+    Attributes:
+        count: points in the neighbourhood.
+        count_at_any_range: points in the directions of the neighbourhood, at any range.
+        mean: mean of the points, metres.
+        normal: unit eigenvector of the smallest eigenvalue.
+        eigenvalues: eigenvalues of the covariance, ascending, m^2.
+    """
 
     count: Float64[NDArray[np.float64], " N"]
     count_at_any_range: Float64[NDArray[np.float64], " N"]
@@ -55,14 +66,14 @@ class _Neighbourhoods:
 
 
 def remove_weather_noise(points: Points, settings: WeatherFilter = WeatherFilter()) -> Bool[NDArray[np.bool_], " N"]:
-    """Tell structure from rain and snow.
+    """Separate structure from rain and snow in a LiDAR scan.
 
     Args:
-        points: metres, in the LiDAR's frame: the origin is where the beams start.
+        points: metres, LiDAR frame. The beams start at the origin.
         settings: limits of the removal.
 
     Returns:
-        True for the points to keep.
+        True for points to keep. Points at the origin are not kept.
     """
     range_m = np.linalg.norm(points.astype(np.float64), axis=1)
     keep: NDArray[np.bool_] = np.asarray(range_m > settings.max_range_m)
@@ -84,7 +95,10 @@ def remove_weather_noise(points: Points, settings: WeatherFilter = WeatherFilter
 def _cells(
     xyz: Float64[NDArray[np.float64], "N 3"], range_m: Float64[NDArray[np.float64], " N"], cell_rad: float
 ) -> tuple[Int64[NDArray[np.int64], "N 3"], int]:
-    """Cell of every point by azimuth, elevation and logarithm of the range, and the number of cells in a turn."""
+    """Assign every point to a cell of azimuth, elevation and logarithm of the range.
+
+    The second result is the number of cells in 360 degrees of azimuth.
+    """
     turn = max(3, round(2 * np.pi / cell_rad))
     x, y, z = xyz.T
     azimuth = np.floor((np.arctan2(y, x) + np.pi) / (2 * np.pi) * turn).astype(np.int64) % turn
@@ -96,7 +110,7 @@ def _cells(
 def _neighbourhoods(
     xyz: Float64[NDArray[np.float64], "N 3"], cells: Int64[NDArray[np.int64], "N 3"], turn: int
 ) -> _Neighbourhoods:
-    """Describe the cells around every point: covariance (paper, eq. 2) and its principal components, m2 ascending."""
+    """Compute the covariance (paper, eq. 2) and its principal components for the cells around every point."""
     unique, cell_of_point = np.unique(cells, axis=0, return_inverse=True)
     cell_of_point = cell_of_point.reshape(-1)
     moments = np.concatenate([np.ones((len(xyz), 1)), xyz, (xyz[:, :, None] * xyz[:, None, :]).reshape(-1, 9)], axis=1)
@@ -132,7 +146,7 @@ def _sums_around(
     offsets: Int64[NDArray[np.int64], "K D"],
     turn: int,
 ) -> Float64[NDArray[np.float64], "N M"]:
-    """Add up the values of the cells at every offset from each wanted cell; azimuth, the first number, is a circle."""
+    """Sum the values of the cells at every offset from each wanted cell. The first index, azimuth, is periodic."""
     low = cells.min(axis=0) - 2
     size = cells.max(axis=0) + 2 - low + 1
     keys = _keys(cells, low, size)
@@ -153,7 +167,7 @@ def _sums_around(
 def _keys(
     cells: Shaped[NDArray[np.int64], "N D"], low: Int64[NDArray[np.int64], " D"], size: Int64[NDArray[np.int64], " D"]
 ) -> Int64[NDArray[np.int64], " N"]:
-    """One number for each cell."""
+    """Combine the indices of each cell into one unique number."""
     key = np.zeros(len(cells), np.int64)
     for n in range(cells.shape[1]):
         key = key * size[n] + (cells[:, n] - low[n])

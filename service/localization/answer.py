@@ -1,4 +1,4 @@
-"""What is known about where a query was taken."""
+"""The answer to a query: its fields, and the check that all numbers are finite."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,7 +22,16 @@ Status = Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timings:
-    """Milliseconds of each stage; ``decode_ms`` and ``total_ms`` with it are filled in by whoever decoded."""
+    """Duration of each stage, in milliseconds.
+
+    Attributes:
+        decode_ms: decoding of the images. The caller that decoded them sets this field and adds it to ``total_ms``.
+        fuse_ms: levelling, resampling and fusion to query views, summed over the frames.
+        encode_ms: encoding to descriptors, summed over the frames.
+        search_ms: search of the map, ranking of the places, clustering and street vote.
+        register_ms: everything after retrieval; 0 without registration.
+        total_ms: all stages.
+    """
 
     decode_ms: float = 0.0
     fuse_ms: float
@@ -36,29 +45,33 @@ class Timings:
 class Answer:
     """The answer to one query.
 
-    What is named ``_guess``, the street and the covariance are of the best guess, whatever the status. Only evaluation may use them
-    of an answer that is not LOCALIZED: ``service.contract.convert`` leaves them out of what a caller gets.
+    The street, the covariance and the fields named ``_guess`` describe the best guess, whatever the status.
+    If the answer is not LOCALIZED, only evaluation may use them: ``service.contract.convert`` removes them from the response.
 
     Attributes:
-        status: how far the answer can be trusted; LOCALIZED wherever confidence is None.
-        confidence: calibrated probability that the position is within 1 m; None without registration or calibration.
-        evidence: what the confidence rests on, as ``service.maps.calibration.FEATURES``; None without registration.
-        street: number of the best guess' street; -1 for none. With registration the street under the position, else the vote's.
-        vote: the k-nearest vote over streets; None where the map has none.
-        T_map_camera_guess: best guess of the camera's pose: registered, or of the heaviest cluster.
-        covariance: of ``T_map_camera_guess`` if that is right, translation first, then rotation, map axes, about the camera; None
-            without registration.
-        candidates: the registered poses, the best supported first; None where nothing was registered. Where the answer is not
-            LOCALIZED, each of those that exclude each other has its covariance, else only the first.
-        spread: where the camera may be; None for a LOCALIZED answer.
-        reasons: what may be wrong with the question or the map, the likeliest first; empty for a LOCALIZED answer, and where all
-            evidence lies in the range that calibration saw.
-        frames: so many were asked together.
-        T_map_vehicle_guess: best guess of the vehicle's pose, where the query said how the camera sits on it.
-        neighbours: k distinct places, those nearest to the registered poses first, then the most similar.
-        hypotheses: all clusters of the most similar views, the heaviest first; with a prior, what it believes most.
-        measured_share: share of the view grid's cells with a measurement.
-        height_m: of the camera above the ground.
+        status: how far the answer can be trusted; LOCALIZED if ``confidence`` is None.
+        confidence: calibrated probability that the position is within 1 m. None if the query asked for no registration, the map
+            has no cloud or no calibration. 0 if the images have too few points to register.
+        street: number of the street of the best guess, -1 for none. With registration it is the street under the position, else
+            the street of the heaviest cluster.
+        vote: street vote of the k nearest places; None if the map has no streets.
+        T_map_camera_guess: best guess of the camera pose: registered, or that of the heaviest cluster.
+        covariance: of ``T_map_camera_guess``, if this pose is right: translation (m), then rotation (rad), in map axes, about
+            the camera. None without registration.
+        candidates: registered poses, the best supported first; None without registration. In a LOCALIZED answer only the first
+            has a covariance. In any other answer every candidate that excludes the others has one.
+        spread: mean and covariance over all places where the camera may be; None for a LOCALIZED answer.
+        reasons: what may be wrong with the query or the map, the likeliest first. Empty for a LOCALIZED answer, and if all
+            confidence features lie in the range of the calibration data.
+        frames: number of image pairs in the query.
+        evidence: confidence features, in the order of ``service.maps.calibration.FEATURES``; None without registration.
+        T_map_vehicle_guess: best guess of the vehicle pose; None if the query does not give the camera's pose on the vehicle.
+        neighbours: distinct places, as many as the query asked for. First those nearest to the registered poses, then the most
+            similar.
+        hypotheses: all clusters of the most similar views, the heaviest first; a prior, if given, counts in this order.
+        measured_share: share of the view grid's cells with a measurement, 0 to 1.
+        height_m: height of the camera above the ground.
+        timings: duration of each stage.
     """
 
     status: Status
@@ -81,24 +94,28 @@ class Answer:
 
 
 def require_finite(answer: Answer) -> None:
-    """Refuse an answer with a number that is not finite: NaN would reach a robot's controller, or pass as OUT_OF_MAP without a word.
+    """Refuse an answer that contains a number that is not finite.
 
-    Every field is looked at, with all that it holds, so that a new one cannot be left out.
+    A NaN would reach the controller of a robot, or turn the answer into OUT_OF_MAP without an error.
+    The check walks all fields recursively, so it also covers fields that are added later.
+
+    Args:
+        answer: the answer to check.
 
     Raises:
-        NotFiniteError: naming the first such number's path, as ``candidates.0.support``.
+        NotFiniteError: a number is not finite. The error names the path of the first one, for example ``candidates.0.support``.
     """
     numbers: list[float] = []
     _gather(answer, numbers)
     if np.isfinite(numbers).all():
         return
-    for path, value in _paths(answer, ""):  # a sum may overflow without any such number
+    for path, value in _paths(answer, ""):  # the sum of an array may overflow although its numbers are finite
         if not np.isfinite(value).all():
             raise NotFiniteError(path)
 
 
 def _gather(value: object, numbers: list[float]) -> None:
-    """Append every number below a value; of an array its sum, which is not finite if any number in it is not."""
+    """Append every number in a value. An array adds its sum, because one number that is not finite makes the sum not finite."""
     if isinstance(value, float):
         numbers.append(value)
     elif isinstance(value, np.ndarray):
@@ -112,7 +129,7 @@ def _gather(value: object, numbers: list[float]) -> None:
 
 
 def _paths(value: object, path: str) -> Iterator[tuple[str, float | NDArray[np.generic]]]:
-    """Every number and array below a value, with its path."""
+    """Yield every number and array in a value, with its path."""
     if isinstance(value, (float, np.ndarray)):
         yield path, value
     elif isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""The answer, put together from what the stages found."""
+"""Build the answer from the results of the stages."""
 
 from time import perf_counter
 
@@ -22,20 +22,20 @@ def compose(
     bundle: MapBundle, frames: tuple[Frame, ...], retrieved: Retrieved, refined: Refined | None,
     evidence: Float64[NDArray[np.float64], " F"] | None, outcome: Outcome, *, started: float, found: float,
 ) -> Answer:  # fmt: skip
-    """Put an answer together.
+    """Build an answer from the results of all stages.
 
     Args:
         bundle: the map.
-        frames: the reference first.
-        retrieved: places, clusters and vote.
+        frames: image pairs, the reference first.
+        retrieved: places, clusters and street vote of the reference.
         refined: registered candidates; None if nothing was registered.
         evidence: confidence features; None without ``refined``.
-        outcome: status, confidence and the candidates to tell.
-        started: when the answer began, ``time.perf_counter`` (s).
-        found: when retrieval had ended.
+        outcome: status, confidence, candidates, spread and reasons.
+        started: time at which the answer began, from ``time.perf_counter`` (s).
+        found: time at which retrieval ended, from ``time.perf_counter`` (s).
 
     Raises:
-        NotFiniteError: a number of the answer is not finite, by a defect of ours or of the map.
+        NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
     """
     done = perf_counter()
     query, views, heaviest = frames[0].query, frames[0].views, retrieved.hypotheses[0]
@@ -78,9 +78,9 @@ def _timings(frames: tuple[Frame, ...], started: float, found: float, done: floa
 
 
 def _street_of(bundle: MapBundle, T_map_camera: Transform, heaviest: Hypothesis, *, registered: bool) -> int:
-    """The street under a registered position; else that of the heaviest cluster, which never spans two streets.
+    """Return the street under a registered position, else the street of the heaviest cluster; -1 for none.
 
-    The vote of the nearest places crosses the border of a street more often (decision 0084).
+    A cluster never spans two streets. The vote of the nearest places crosses street borders more often (decision 0084).
     """
     if bundle.streets is None:
         return -1
@@ -88,7 +88,7 @@ def _street_of(bundle: MapBundle, T_map_camera: Transform, heaviest: Hypothesis,
 
 
 def _pose_of(bundle: MapBundle, hypothesis: Hypothesis, views: QueryViews) -> Transform:
-    """The camera at the position of a hypothesis, at its own height above the ground under the places' LiDAR."""
+    """Return T_map_camera at a hypothesis. The position of a hypothesis is at LiDAR height, so it is moved to camera height."""
     above_lidar_m = views.height_m - bundle.manifest.lidar_height_m
     position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])
     return transform_from(hypothesis.R_map_level @ views.R_level_camera, position_m)

@@ -1,4 +1,4 @@
-"""From evidence to what the robot is told: a probability of being right, and whether to act on it."""
+"""From the confidence features to the status and the confidence of an answer."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,21 @@ from numpy.typing import NDArray
 from service.localization.answer import Status
 from service.maps.calibration import FEATURES, Calibration, probability
 
-#: An answer that is not accepted is ambiguous if the place is more probably in the map than not.
+#: An answer that is not accepted is AMBIGUOUS if the probability that the query is from the map is at least this; else OUT_OF_MAP.
 KNOWN = 0.5
-#: An accepted answer holds more than half of the support of all places that the query may be at: what keeps strangers out lets
-#: through one of six blocks that are all alike.
+#: The best candidate of an accepted answer must hold more than half of the support of all distinct candidates. The threshold on
+#: confidence rejects out-of-map queries. It does not reject perceptual aliases, such as six blocks that look the same (decision 0086).
 _SHARE, _HALF = FEATURES.index("log_share"), float(np.log(0.5))
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Status, and the probability that the position is within 1 m."""
+    """Status and confidence of an answer.
+
+    Attributes:
+        status: LOCALIZED, AMBIGUOUS or OUT_OF_MAP.
+        confidence: probability that the position is within 1 m, 0 to 1.
+    """
 
     status: Status
     confidence: float
@@ -28,16 +33,20 @@ def decide(
     calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None, false_accept_rate: float, *,
     prior_nats: float = 0.0,
 ) -> Decision:  # fmt: skip
-    """Weigh the evidence.
+    """Compute status and confidence from the confidence features.
 
-    Calibration took every second query from outside the map. Whoever sends a prior says that the robot is in it, so the odds of that
-    change by Bayes' rule; how surely a place of the map is the right one does not.
+    In the calibration data every second query comes from outside the map. A caller who sends a prior claims that the robot is in
+    the map. So the odds of being in the map change by Bayes' rule (decision 0135). The probability that the chosen place is the
+    right place of the map does not change: confidence is P(known) P(right | known).
 
     Args:
-        calibration: the map's.
-        evidence: of the answer; None where the pictures hold too little to register, so nothing speaks for any place.
-        false_accept_rate: share of the queries taken outside the map, and without a prior, that one can live with being accepted.
-        prior_nats: what a prior that agrees with the answer adds to the log odds of being in the map (``Prior.known_nats``).
+        calibration: calibration of the map.
+        evidence: confidence features of the answer; None if the images have too few points to register.
+        false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1. It holds without a prior.
+        prior_nats: increase of the log odds of being in the map by a prior that agrees with the answer (``Prior.known_nats``).
+
+    Returns:
+        The decision; OUT_OF_MAP with confidence 0 without ``evidence``.
     """
     if evidence is None:
         return Decision("OUT_OF_MAP", 0.0)

@@ -1,4 +1,4 @@
-"""From a pair of encoded pictures to a query: the one way of it, for the service and for whoever measures what it serves."""
+"""Decode an encoded image pair to a query. The service and its measurements share this code."""
 
 from dataclasses import dataclass
 
@@ -12,15 +12,15 @@ from service.localization.query import Query
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthFormat:
-    """How a depth picture's numbers become metres; as ``service.imaging.decode.decode_depth`` has them.
+    """Conversion of the stored numbers of a depth image to metres; see ``service.imaging.decode.decode_depth``.
 
     Attributes:
-        encoding: of the file; auto tells by its first bytes.
-        kind: what is stored.
-        scale_m: metres (disparity: pixels) for each stored unit; None lets the format decide.
-        baseline_m: of the stereo rig that measured the depth, metres. Disparity needs it; with the other kinds it says that the
-            rig's disparity offset is to be estimated.
-        max_range_m: what lies beyond is no measurement.
+        encoding: file encoding; None detects it from the first bytes.
+        kind: stored quantity: z, range along the ray, or disparity.
+        scale_m: metres per stored unit (disparity: pixels per stored unit); None takes the default of the format.
+        baseline_m: baseline of the stereo rig that measured the depth. Disparity needs it. With the other kinds, registration then
+            also estimates the disparity offset of the rig.
+        max_range_m: depths beyond this range count as not measured; None sets no limit.
     """
 
     encoding: DepthEncoding | None = None
@@ -33,18 +33,18 @@ class DepthFormat:
 def decoded_query(
     rgb: bytes, depth: bytes, camera: PinholeCamera, depth_format: DepthFormat, *, grid: ViewGrid, limits: ImageLimits = DEFAULT_LIMITS
 ) -> Query:  # fmt: skip
-    """Decode a pair; all options of the query are at their defaults.
+    """Decode an image pair to a query that has the default options.
 
     Args:
-        rgb: encoded colour picture.
-        depth: encoded depth picture.
-        camera: of both, at any uniform scale.
-        depth_format: what the depth picture's numbers mean.
-        grid: of the map that will be asked: colour finer than it needs is decoded at a part of its size.
-        limits: what each picture may cost.
+        rgb: encoded colour image.
+        depth: encoded depth image.
+        camera: intrinsics of both images; each image may be scaled uniformly.
+        depth_format: meaning of the stored depth numbers.
+        grid: view grid of the map. Colour finer than the grid needs is decoded at a fraction of its size.
+        limits: largest size of each image.
 
     Raises:
-        StreetfixError: as ``decode_rgb``, ``decode_depth`` and ``require_sizes``.
+        StreetfixError: as in ``decode_rgb``, ``decode_depth`` and ``require_sizes``.
     """
     colour = decode_rgb(rgb, limits=limits, camera=camera, finest_rad=finest_rad(grid))
     depth_m = decode_depth(

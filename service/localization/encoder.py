@@ -1,4 +1,4 @@
-"""The encoder under ONNX Runtime: planes in, unit descriptors out."""
+"""The encoder under ONNX Runtime: from the planes of a view to a unit descriptor."""
 
 import hashlib
 import os
@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-# Importing ONNX Runtime would else write a device id and an event file into the user's home.
+# Otherwise the import of ONNX Runtime writes a device id and an event file into the home folder of the user.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime
 from jaxtyping import Float32
@@ -19,21 +19,34 @@ from service.imaging.view_grid import PLANES
 Side = Literal["survey", "query"]
 Descriptors = Float32[NDArray[np.float32], "B D"]
 
-#: What runs the network: ONNX Runtime's names of the providers that a setting chooses between.
+#: Execution providers that a setting can choose, and their names in ONNX Runtime.
 Provider = Literal["cpu", "cuda", "openvino"]
 _PROVIDERS: dict[Provider, str] = {
     "cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider",
 }  # fmt: skip
-#: Packages that bring them, in place of ``onnxruntime``.
+#: Package that contains each provider. It replaces ``onnxruntime``.
 _PACKAGES: dict[Provider, str] = {"cpu": "onnxruntime", "cuda": "onnxruntime-gpu", "openvino": "onnxruntime-openvino"}
-#: Of one run: whole requests run side by side, and inner pools only get in their way.
+#: Threads of one run. The service runs whole requests in parallel, and inner thread pools would compete with them.
 THREADS = 1
 
 
 class Encoder:
-    """One encoder for both sides; a session may be used from several threads.
+    """One encoder for survey views and query views; safe to use from several threads.
 
     Build it with ``open``.
+
+    Args:
+        session: session of ONNX Runtime with the network.
+        sha256: hash of the ONNX file.
+
+    Attributes:
+        sha256: hash of the ONNX file.
+        rows: rows of the views that the encoder reads.
+        columns: columns of these views.
+        dimension: length of a descriptor.
+
+    Raises:
+        EncoderError: the inputs, the outputs or the number of planes are not those of a Streetfix encoder.
     """
 
     def __init__(self, session: onnxruntime.InferenceSession, sha256: str) -> None:
@@ -50,25 +63,25 @@ class Encoder:
         if planes != len(PLANES):
             raise EncoderError(f"the encoder wants {planes} planes, a view has {len(PLANES)}: {', '.join(PLANES)}")
         self.dimension = int(outputs["descriptor"][1])
-        #: Cities that the encoder was trained on, as ``KIND-SEED``; empty where the file does not say.
+        #: Cities of the training data, as ``KIND-SEED``; empty if the file does not name them.
         self.trained_on = tuple(session.get_modelmeta().custom_metadata_map.get("trained_on", "").split())
 
     @staticmethod
     def open(source: Path | bytes, *, threads: int = THREADS, provider: Provider = "cpu") -> "Encoder":
-        """Open an ONNX file, or its bytes.
+        """Open an encoder from an ONNX file or from its bytes.
 
         Args:
-            source: where it is.
-            threads: of one run; whole requests run side by side, so one is best for a service.
-            provider: what runs it.
+            source: path of the file, or its content.
+            threads: threads of one run. One is best for a service, because it runs whole requests in parallel.
+            provider: execution provider that runs the network.
 
         Raises:
-            EncoderError: it cannot be read, is no encoder of ours, or the provider is not installed.
+            EncoderError: the file cannot be read, is no Streetfix encoder, or the provider is not installed.
         """
         require_provider(provider)
         try:
             data = source if isinstance(source, bytes) else source.read_bytes()
-        except OSError as error:  # its text names the file
+        except OSError as error:  # the text of the error names the file
             raise EncoderError(f"the encoder cannot be read: {error}", field="encoder") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
@@ -77,16 +90,16 @@ class Encoder:
         options.log_severity_level = 3
         try:
             session = onnxruntime.InferenceSession(data, options, providers=[_PROVIDERS[provider]])
-        except Exception as error:  # ONNX Runtime raises a family of its own that has no common root
+        except Exception as error:  # the exceptions of ONNX Runtime have no common base class
             raise EncoderError(f"the encoder is no ONNX model that runs here: {error}", field="encoder") from error
         return Encoder(session, hashlib.sha256(data).hexdigest())
 
     def encode(self, planes: Float32[NDArray[np.float32], "B 6 rows columns"], side: Side) -> Descriptors:
-        """Unit descriptors of views of one side.
+        """Compute the unit descriptors of views of one side.
 
         Args:
-            planes: as ``service.imaging.view_grid.PLANES`` says, metres, grey levels, spreads.
-            side: LiDAR views of the survey, or fused RGB-D queries.
+            planes: planes of each view, in the order and units of ``service.imaging.view_grid.PLANES``.
+            side: "survey" for LiDAR views, "query" for fused RGB-D views.
         """
         flags = np.full(len(planes), 1.0 if side == "query" else 0.0, np.float32)
         (descriptors,) = self._session.run(["descriptor"], {"planes": planes, "side": flags})
@@ -95,10 +108,15 @@ class Encoder:
 
 
 def require_provider(provider: Provider) -> None:
-    """Refuse a provider that this installation of ONNX Runtime does not have; it would fall back to the processor in silence.
+    """Refuse a provider that is not installed.
+
+    ONNX Runtime itself would use the CPU instead, without an error.
+
+    Args:
+        provider: execution provider.
 
     Raises:
-        EncoderError: naming those there are.
+        EncoderError: the provider is not installed. The error names the installed ones.
     """
     there = onnxruntime.get_available_providers()
     if _PROVIDERS[provider] not in there:

@@ -1,4 +1,4 @@
-"""What an answer's confidence rests on, as one row of numbers with names."""
+"""Confidence features of an answer: the inputs of the calibrated confidence, one number each."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,10 +13,11 @@ from service.localization.rivals import behind, distinct_candidates, log_shares
 from service.localization.search import Neighbour
 from service.maps.calibration import FEATURES
 
-#: Another place, for the margin of similarity; votes within VOTE_M of the answer count for it.
+#: A neighbour further than OTHER_PLACE_M from the answer is another place (feature ``similarity_margin``).
+#: Of the first VOTERS neighbours, those within VOTE_M of the answer vote for it (feature ``votes``).
 OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
-_NEAREST = 5  # neighbours whose poses are to agree
-_MOST_MARGIN = 12.0  # nats; where there is no rival at all, too
+_NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
+_MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
 _MOST_PLACE_M = 10.0
 
 
@@ -28,15 +29,15 @@ def evidence_of(
     places_m: Float64[NDArray[np.float64], "P 2"],
     grid: ViewGrid,
 ) -> Float64[NDArray[np.float64], " F"]:
-    """One number for each of ``service.maps.calibration.FEATURES``.
+    """Compute the confidence features, in the order of ``service.maps.calibration.FEATURES``.
 
     Args:
-        frames: the reference first.
-        refined: its candidates.
-        neighbours: distinct places, the most similar first; those of the reference.
-        hypotheses: clusters of the reference's most similar views.
-        places_m: x, y of all places of the map.
-        grid: the map's view grid.
+        frames: image pairs, the reference first.
+        refined: registered candidates, the best supported first.
+        neighbours: distinct places retrieved for the reference, the most similar first.
+        hypotheses: clusters of the most similar views of the reference.
+        places_m: x and y of all places, map frame, metres.
+        grid: view grid of the map.
     """
     best, reference = refined.best, frames[0]
     ahead = int(np.argmin(np.abs(reference.views.turns_rad)))
@@ -46,7 +47,7 @@ def evidence_of(
     similarities = np.array([place.similarity for place in neighbours])
     elsewhere = similarities[away > OTHER_PLACE_M]
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(refined.covariance[:2, :2])[-1]))
-    # Of the places that are there: a sparse survey has fewer of them, but no less to say.
+    # Normalise by the places that exist near the answer. Otherwise a sparse survey would get fewer votes (decision 0033).
     there = float(np.clip((np.hypot(*(places_m - xy).T) < VOTE_M).sum(), 1, VOTERS))
     several = float(np.sqrt(len(frames)))
     weights = np.array([hypothesis.weight for hypothesis in hypotheses])
@@ -79,6 +80,6 @@ def evidence_of(
 
 
 def _spread(neighbours: tuple[Neighbour, ...]) -> float:
-    """How far the most similar places stand from their middle: logarithm of the root mean square (m), of 0.1 m at least."""
+    """Return the log of the sum of 0.1 m and the RMS distance (m) of the places from their mean."""
     xy = np.array([place.position_m[:2] for place in neighbours])
     return float(np.log(np.sqrt(xy.var(axis=0).sum()) + 0.1))

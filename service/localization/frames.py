@@ -1,4 +1,4 @@
-"""What one picture pair says before the map's cloud is asked: its views, their descriptors, the most similar places."""
+"""One image pair after retrieval and before registration: views, descriptors and the most similar map views."""
 
 from dataclasses import dataclass
 
@@ -14,19 +14,19 @@ from service.localization.search import ViewMatches
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """A picture pair that was looked up.
+    """An image pair with the results of the map search.
 
     Attributes:
-        query: as it was asked.
-        T_reference_camera: where its camera stood against the frame whose pose is wanted; identity for that one.
-        views: of the view grid.
-        descriptors: of the views, a row a turn.
-        matches: the most similar views of the map, the best first.
-        noise: standard deviation of one pixel's inverse depth, 1/m;
-        independent_noise: and that of the part which near pixels do not share.
-        fuse_s: seconds that its views took;
-        encode_s: their descriptors;
-        search_s: and their neighbours.
+        query: image pair, camera and options.
+        T_reference_camera: pose of this camera in the camera frame of the reference; identity for the reference itself.
+        views: query views, one per turn.
+        descriptors: descriptors of the views, one row per turn.
+        matches: most similar map views, the best first.
+        noise: standard deviation of the inverse depth of one pixel, 1/m.
+        independent_noise: the same without the correlated error that adjacent pixels share, 1/m.
+        fuse_s: time to compute the views, seconds.
+        encode_s: time to compute the descriptors, seconds.
+        search_s: time to search the map, seconds.
     """
 
     query: Query
@@ -42,5 +42,5 @@ class Frame:
 
     @property
     def R_level_camera(self) -> Rotation:
-        """From the optical to the frame's level frame."""
+        """Rotation from the camera's optical frame to the level frame."""
         return self.views.R_level_camera

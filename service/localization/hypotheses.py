@@ -13,13 +13,14 @@ from service.localization.search import ViewMatches
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClusterSettings:
-    """How views are gathered into hypotheses. Ours, November 2026.
+    """Settings of the clustering. Our own choice, November 2026.
 
     Attributes:
-        views: how many of the most similar views take part.
-        radius_m: how far a member's place may lie from the best view's.
-        heading_rad: how far a member's heading may differ from the best view's.
-        temperature: a view that is less similar by this much weighs 1/e; near the temperature that training ends at.
+        views: number of the most similar views to cluster.
+        radius_m: largest horizontal distance of a member's place from the place of the best view.
+        heading_rad: largest difference of a member's heading from the heading of the best view.
+        temperature: softmax temperature of the similarity weights. A view that is less similar by this much has 1/e of
+            the weight. The value is near the temperature at the end of training.
     """
 
     views: int = 24
@@ -30,16 +31,16 @@ class ClusterSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """A place where the query may have been taken.
+    """A cluster of similar views: a place where the query may have been taken.
 
     Attributes:
-        weight: share of the similarity weights of all views that took part.
-        position_m: similarity-weighted mean of the members' places (the LiDAR's height), map frame.
+        weight: the cluster's share of the similarity weights of all clustered views, 0 to 1.
+        position_m: similarity-weighted mean of the members' places, map frame, at LiDAR height.
         heading_rad: similarity-weighted circular mean of the members' headings, map frame.
-        normal_map: up, normal to the ground at the best member's place.
-        place: the best member's place.
-        street: the members' street; -1 where none of them lies in one.
-        similarity: of the best member.
+        normal_map: ground normal (up) at the place of the best member, map frame.
+        place: number of the best member's place.
+        street: number of the members' street; -1 if no member lies in a street.
+        similarity: cosine similarity of the best member.
         members: number of views.
     """
 
@@ -54,7 +55,7 @@ class Hypothesis:
 
     @property
     def R_map_level(self) -> Rotation:
-        """The level frame: x along the heading, z along the ground's normal."""
+        """Rotation from the level frame to the map frame: x along the heading, z along the ground normal."""
         x = np.array([np.cos(self.heading_rad), np.sin(self.heading_rad), 0.0])
         x -= self.normal_map * (x @ self.normal_map)
         x /= np.linalg.norm(x)
@@ -64,16 +65,28 @@ class Hypothesis:
 def similarity_weights(
     similarities: Float64[NDArray[np.float64], " n"], temperature: float
 ) -> Float64[NDArray[np.float64], " n"]:
-    """Weights that sum to 1: the softmax that contrastive training shaped the similarities for."""
+    """Compute softmax weights that sum to 1.
+
+    Contrastive training uses the same softmax, so the similarities are scaled for it.
+
+    Args:
+        similarities: cosine similarities, one or more.
+        temperature: softmax temperature, in units of similarity.
+    """
     weights = np.exp((similarities - similarities.max()) / temperature)
     normalised: Float64[NDArray[np.float64], " n"] = weights / weights.sum()
     return normalised
 
 
 def cluster(matches: ViewMatches, settings: ClusterSettings) -> tuple[Hypothesis, ...]:
-    """Gather views around the best one that is left, until none is left; the heaviest cluster comes first.
+    """Cluster the most similar views; return the heaviest cluster first.
 
-    A cluster never spans two streets; views that lie in no street may join either.
+    The best remaining view starts a cluster with all remaining views near it, until no view remains.
+    A cluster never spans two streets. A view outside all streets may join a cluster of any street.
+
+    Args:
+        matches: most similar map views, the best first.
+        settings: number of views and size of a cluster.
     """
     count = min(settings.views, len(matches))
     weights = similarity_weights(matches.similarity[:count], settings.temperature)
@@ -91,7 +104,12 @@ def cluster(matches: ViewMatches, settings: ClusterSettings) -> tuple[Hypothesis
 
 
 def believed(hypotheses: tuple[Hypothesis, ...], prior: Prior | None) -> tuple[Hypothesis, ...]:
-    """The same clusters, those first that their weight and the prior together speak for."""
+    """Sort clusters by the log of their weight plus the log weight of the prior, the largest sum first.
+
+    Args:
+        hypotheses: clusters; the order stays if there is no prior.
+        prior: prior of the camera pose; None if nothing is known.
+    """
     if prior is None:
         return hypotheses
     xy, heading = np.array([each.position_m[:2] for each in hypotheses]), np.array([h.heading_rad for h in hypotheses])
@@ -100,7 +118,7 @@ def believed(hypotheses: tuple[Hypothesis, ...], prior: Prior | None) -> tuple[H
 
 
 def _near(matches: ViewMatches, count: int, settings: ClusterSettings) -> Bool[NDArray[np.bool_], "n n"]:
-    """Which of the first ``count`` matches lie near which, in space and heading."""
+    """Return for every pair of the first ``count`` matches whether they are near in position and in heading."""
     at, heading_rad = matches.T_map_place[:count, :2, 3], matches.heading_rad[:count]
     offset_m = at[:, None] - at
     close = np.hypot(offset_m[..., 0], offset_m[..., 1]) <= settings.radius_m

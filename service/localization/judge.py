@@ -1,4 +1,4 @@
-"""Which of some registered poses is right: what the descriptors, the drawn map's depth and its brightness say of each."""
+"""Score registered poses: inliers, descriptor similarity, likelihood of the rendered depth, and brightness."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,9 +24,16 @@ from service.registration.sight import Sights
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SupportWeights:
-    """What speaks for a candidate against its rivals, in nats: a conditional logit over the candidates of the watch cities' queries.
+    """Weights of the support of a candidate, in nats per unit of each score.
 
-    ``brightness`` is asked only of candidates that are at most ``behind`` behind the best without it: drawing costs time.
+    Fitted by a conditional logit over the candidates of queries in the validation cities (decisions 0028, 0082 and 0100).
+
+    Attributes:
+        inliers: weight of the share of inliers.
+        similarity: weight of the descriptor similarity at the pose.
+        likelihood: weight of the mean log likelihood of the rendered depth.
+        brightness: weight of the agreement with the map's brightness.
+        behind: support gap to the best candidate, in nats, up to which brightness is computed, because rendering takes time.
     """
 
     inliers: float = 20.0
@@ -38,14 +45,15 @@ class SupportWeights:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NearWeights:
-    """What speaks for one of some poses a metre apart: a conditional logit over poses around a watch city's answers.
+    """Weights for the choice among poses about a metre apart, in nats per unit of each score.
 
-    So near each other they resemble the same places, which say nothing then, and brightness says more than between two streets.
+    Fitted by a conditional logit over poses around the answers in a validation city. Such poses resemble the same places, so
+    descriptor similarity does not tell them apart. Brightness tells more here than between two streets.
 
     Attributes:
-        still: share of inliers among the points of what cannot have moved.
-        brightness: agreement of patches.
-        stay: what speaks for the pose that was found first.
+        still: weight of the share of inliers among points of static objects.
+        brightness: weight of the agreement with the map's brightness.
+        stay: bonus of the original pose, nats.
     """
 
     still: float = 45.0
@@ -55,16 +63,18 @@ class NearWeights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A registered pose and what speaks for it.
+    """A registered pose and its scores.
 
     Attributes:
-        T_map_camera: of the reference camera.
-        registered: as the solver left it; the best one adjusted along its rays, by centimetres, after all below was told.
-        similarity: to the places around the pose, mean over the frames.
-        place_m: how far those places are, mean over the frames.
-        agreement: with the map as drawn at the pose, mean over the frames.
-        support: logarithm, against the other candidates.
-        covariance: of ``T_map_camera`` if the candidate is right, translation first, map axes, about the camera; None: not computed.
+        T_map_camera: pose of the reference camera.
+        registered: result of the solver. For the best candidate the ray adjustment then moves the pose by centimetres. Its
+            scores below come from before this adjustment.
+        similarity: descriptor similarity to the places around the pose, mean over the frames.
+        place_m: distance of these places from the pose in metres, mean over the frames.
+        agreement: agreement with the depth rendered from the map at the pose, mean over the frames.
+        support: weighted sum of the scores, in nats; only differences between candidates have a meaning.
+        covariance: of ``T_map_camera``, if the candidate is right: translation (m), then rotation (rad), in map axes, about the
+            camera. None if not computed.
     """
 
     T_map_camera: Transform
@@ -78,19 +88,19 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """One question's pictures, ready to be compared with the map at any pose.
+    """Scorer of one query: compares its frames with the map at any pose.
 
     Attributes:
         bundle: the map.
-        sights: what rays meet of its prepared cloud.
-        frames: the reference first.
-        seen: points of each frame, for drawing.
-        blocks: of each frame's depth.
-        pictures: of each frame's rays.
-        prior: of the reference's pose, if anything is known.
-        weights: of the evidence.
-        near: of that among poses a metre apart.
-        photometry: how brightness is compared.
+        sights: ray casting into the map cloud.
+        frames: image pairs, the reference first.
+        seen: points of each frame, as pixels of the rendered depth image.
+        blocks: depth blocks of each frame.
+        pictures: inverse depth image of each frame.
+        prior: prior of the reference pose; None if nothing is known.
+        weights: weights of the support.
+        near: weights for the choice among poses about a metre apart.
+        photometry: settings of the brightness comparison.
     """
 
     bundle: MapBundle
@@ -105,7 +115,11 @@ class Judge:
     photometry: PhotometrySettings
 
     def candidates(self, found: tuple[Registered, ...]) -> list[Candidate]:
-        """The poses with what speaks for each, brightness apart; the best supported first."""
+        """Score poses without brightness; return them with the best supported first.
+
+        Args:
+            found: registered poses of the reference's level frame.
+        """
         similarities, places_m = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
         for frame in self.frames:
             own = [self._of(frame, pose) for pose in found]
@@ -126,7 +140,11 @@ class Judge:
         return sorted(candidates, key=lambda candidate: -candidate.support)
 
     def agreement(self, pose: Registered) -> Agreement:
-        """With the map's depth as drawn at a pose of the reference's level frame, mean over the frames that show anything."""
+        """Compare the query with the depth rendered from the map at a pose; return the mean over all frames that have points.
+
+        Args:
+            pose: registered pose of the reference's level frame.
+        """
         return Agreement.mean([
             agreement(self.sights.cloud, points, self._of(frame, pose))
             for frame, points in zip(self.frames, self.seen, strict=True)
@@ -134,7 +152,14 @@ class Judge:
         ])  # fmt: skip
 
     def brightness(self, pose: Registered) -> float:
-        """Agreement with the map's brightness at a pose of the reference's level frame, mean over the frames; 0 where it has none."""
+        """Compare the images with the map's brightness at a pose; return the mean squared correlation over all frames.
+
+        Args:
+            pose: registered pose of the reference's level frame.
+
+        Returns:
+            0 to 1; 0 if the map has no brightness.
+        """
         if self.sights.cloud.brightness is None:
             return 0.0
         if id(pose) not in self._agreed:
@@ -146,9 +171,14 @@ class Judge:
         return self._agreed[id(pose)][1]
 
     def with_brightness(self, candidates: list[Candidate]) -> list[Candidate]:
-        """The candidates, the best first, once those in front have been judged by brightness as well.
+        """Add brightness to the support of the leading candidates; return all candidates, the best supported first.
 
-        Those behind get as much for it as the worst judged: they stay behind, by as much as they were at least.
+        Only candidates within ``weights.behind`` of the best are compared. The others get the lowest brightness score of these.
+        So each of them stays at least as far behind the leading ones as before.
+        The candidates stay as they are if the map has no brightness or only one candidate leads.
+
+        Args:
+            candidates: candidates without brightness, the best supported first.
         """
         judged = [k for k in candidates if k.support >= candidates[0].support - self.weights.behind]
         if self.sights.cloud.brightness is None or len(judged) == 1:
@@ -162,9 +192,13 @@ class Judge:
         return sorted(told, key=lambda candidate: -candidate.support)
 
     def best_near(self, best: Candidate, near: list[Near]) -> Candidate:
-        """The best of some poses near a candidate, the candidate's own the first of them.
+        """Choose the best of several poses near a candidate.
 
-        Another takes over what the candidate had against its rivals, since it is in the same place, and what it is better by.
+        Another pose of the same place inherits the support of the candidate, plus its gain over the candidate if positive.
+
+        Args:
+            best: candidate; returned unchanged if its own pose is the best.
+            near: poses near the candidate; the first one is the candidate's own pose.
         """
         told = [self.near.still * each.still + self.near.brightness * self.brightness(each.pose) for each in near]
         told[0] += self.near.stay
@@ -177,7 +211,7 @@ class Judge:
         return replace(moved, support=best.support + max(gained, 0.0))
 
     def _support(self, pose: Registered, similarity: float, agreed: Agreement) -> float:
-        """Brightness apart."""
+        """Compute the support of a pose without brightness: weighted scores plus the log weight of the prior, nats."""
         weights = self.weights
         support = (
             weights.inliers * pose.inliers + weights.similarity * similarity + weights.likelihood * agreed.likelihood
@@ -189,7 +223,7 @@ class Judge:
 
     @cached_property
     def _agreed(self) -> dict[int, tuple[Registered, float]]:
-        """By identity of the pose, which is held so that no other takes its place."""
+        """Return the cache of brightness scores, keyed by id(pose). It holds the pose, so that Python does not reuse the id."""
         return {}
 
     @cached_property
@@ -200,7 +234,7 @@ class Judge:
         ]
 
     def _of(self, frame: Frame, pose: Registered) -> Registered:
-        """The pose of a frame's level frame that follows from the reference's."""
+        """Return the pose of a frame's level frame, given the pose of the reference's level frame."""
         if frame is self.frames[0]:
             return pose
         T = level_from(frame.T_reference_camera, frame.R_level_camera, self.frames[0].R_level_camera)

@@ -1,4 +1,4 @@
-"""One query against one map: retrieve places as the paper does, then register the candidates on the map cloud and decide."""
+"""Localize a query in a map: retrieve places as the paper does, register candidates on the map cloud, and decide."""
 
 from dataclasses import replace
 from time import perf_counter
@@ -21,10 +21,16 @@ from service.maps.reader import MapBundle
 
 
 class Localizer:
-    """A map and the encoder that made it; ``localize`` is safe to call from several threads.
+    """A map and its encoder; ``localize`` is safe to call from several threads.
+
+    Args:
+        bundle: the map.
+        encoder: encoder that computed the map's descriptors.
+        clusters: settings of the clustering; None for the defaults.
+        refining: settings of registration and scoring; None for the defaults.
 
     Raises:
-        BundleError: the encoder is not the one that made the map's descriptors, or reads another view grid.
+        BundleError: the encoder did not compute the map's descriptors, or reads another view grid.
     """
 
     def __init__(
@@ -39,11 +45,11 @@ class Localizer:
 
     @classmethod
     def open(cls, bundle: MapBundle, *, provider: Provider = "cpu") -> "Localizer":
-        """With the encoder of the bundle.
+        """Create a localizer with the encoder that the bundle contains.
 
         Args:
             bundle: the map.
-            provider: what runs the network.
+            provider: execution provider that runs the network.
 
         Raises:
             EncoderError: the provider is not installed.
@@ -58,6 +64,8 @@ class Localizer:
 
         Raises:
             NoDepthError: the depth image holds no measurement within the view grid.
+            RequestError: the calibration does not support such a low false-accept rate.
+            NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         return self.localize_frames((query,), (np.eye(4),))
 
@@ -68,17 +76,22 @@ class Localizer:
         resolve what a single image pair leaves ambiguous.
 
         Args:
-            queries: the reference first; its pose is answered, and its options, its prior and its vehicle count.
-            T_reference_camera: of each; the first is the identity.
+            queries: image pairs, the reference first. The answer gives the pose of the reference. Only the options, the prior
+                and the vehicle of the reference count.
+            T_reference_camera: pose of each camera in the camera frame of the reference; the first is the identity.
 
         Raises:
             NoDepthError: a depth image holds no measurement within the view grid.
+            RequestError: the calibration does not support such a low false-accept rate.
+            NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         pairs = zip(queries, T_reference_camera, strict=True)
         return self.answer(tuple(replace(self.look_up(query), T_reference_camera=T) for query, T in pairs))
 
     def look_up(self, query: Query) -> Frame:
-        """Encode one image pair and search the map, without the map cloud; the result is the reference of an answer.
+        """Encode one image pair and search the map for similar views, without registration.
+
+        The returned frame is a reference. Set its ``T_reference_camera`` to use it as another frame of a query.
 
         Args:
             query: one image pair, its camera and its options.
@@ -89,21 +102,21 @@ class Localizer:
         return look_up(self.bundle, self.encoder, query, self.clusters)
 
     def answer(self, frames: tuple[Frame, ...]) -> Answer:
-        """Answer frames that ``look_up`` returned.
+        """Answer a query from frames that ``look_up`` returned.
 
         Args:
-            frames: the reference first, as in ``localize_frames``.
+            frames: image pairs, the reference first, as in ``localize_frames``.
 
         Raises:
             RequestError: the calibration does not support such a low false-accept rate.
-            NotFiniteError: a number of the answer is not finite, by a defect of ours or of the map.
+            NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
         started = perf_counter()
         bundle, query = self.bundle, frames[0].query
         cloud = bundle.cloud if query.refine else None
         calibration = None if cloud is None else bundle.calibration
         require_promise(bundle.calibration if query.refine else None, query)
-        # 1. Retrieval: the most similar places, clusters of their views, and the paper's K-NN vote over the streets.
+        # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
         retrieved = retrieve(bundle, frames[0], self.clusters)
         found = perf_counter()
         # 2. Registration: refine candidate poses on the map cloud, and rank them.
@@ -113,7 +126,7 @@ class Localizer:
         if refined is not None:
             places_m = bundle.T_map_place[:, :2, 3]
             evidence = evidence_of(frames, refined, retrieved.neighbours, retrieved.hypotheses, places_m, bundle.grid)
-        # 4. Decision: status, calibrated confidence, and what an undecided answer tells.
+        # 4. Decision: status and calibrated confidence; reasons and spread if the answer is not LOCALIZED.
         outcome = outcome_of(calibration, query, refined, evidence, frames=len(frames), extent=self.extent)
-        # 5. The answer, checked to be finite.
+        # 5. Build the answer, and check that all its numbers are finite.
         return compose(bundle, frames, retrieved, refined, evidence, outcome, started=started, found=found)

@@ -24,12 +24,13 @@ class Outcome:
     """How far an answer can be trusted.
 
     Attributes:
-        status: LOCALIZED if nothing was registered on purpose or the map is not calibrated.
-        confidence: calibrated probability that the position is within 1 m; None in these cases.
+        status: LOCALIZED, AMBIGUOUS or OUT_OF_MAP. Always LOCALIZED if the query asked for no registration or the map has no
+            calibration.
+        confidence: calibrated probability that the position is within 1 m; None in these two cases.
         reasons: what to check; empty for a LOCALIZED answer.
-        candidates: registered poses, the best supported first. If the answer is not LOCALIZED, those that exclude each other have
-            their covariances. None if nothing was registered.
-        spread: where the camera may be; None for a LOCALIZED answer.
+        candidates: registered poses, the best supported first; None if nothing was registered. If the answer is not LOCALIZED,
+            candidates that exclude each other have covariances.
+        spread: mean and covariance over all places where the camera may be; None for a LOCALIZED answer.
     """
 
     status: Status
@@ -43,15 +44,15 @@ def outcome_of(
     calibration: Calibration | None, query: Query, refined: Refined | None, evidence: Float64[NDArray[np.float64], " F"] | None, *,
     frames: int, extent: Extent,
 ) -> Outcome:  # fmt: skip
-    """Decide on an answer.
+    """Compute status, confidence, reasons and spread of an answer.
 
     Args:
-        calibration: of the map; None if the map has none, or if the query asked for no registration.
+        calibration: calibration of the map; None if the map has none, or if the query asked for no registration.
         query: the reference; its prior and its false-accept rate count.
-        refined: registered candidates; None if the images hold too little.
-        evidence: confidence features, as ``service.maps.calibration.FEATURES``; None without ``refined``.
+        refined: registered candidates; None if nothing was registered, or if the images have too few points.
+        evidence: confidence features, in the order of ``service.maps.calibration.FEATURES``; None without ``refined``.
         frames: number of image pairs.
-        extent: of the map.
+        extent: extent of the map.
     """
     candidates = None if refined is None else refined.candidates
     if calibration is None:
@@ -72,8 +73,8 @@ def require_promise(calibration: Calibration | None, query: Query) -> None:
     """Refuse a false-accept rate that the calibration data cannot support.
 
     Args:
-        calibration: of the map; None supports every rate.
-        query: with the rate.
+        calibration: calibration of the map; None supports every rate.
+        query: query with its false-accept rate.
 
     Raises:
         RequestError: the rate is lower than the calibration supports.

@@ -1,4 +1,4 @@
-"""What a robot knows beforehand of where it is, and how much it is believed."""
+"""Prior of the camera pose that a robot may send, and its weight."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ class Prior:
     """A position, a heading, or both, each with its standard deviation.
 
     Attributes:
-        position_m: x, y in the map frame; None where only the heading is known.
-        position_std_m: of each coordinate.
-        heading_rad: of the optical axis, counter-clockwise from map x; None where it is not known.
-        heading_std_rad: of the same.
+        position_m: x and y in the map frame; None if only the heading is known.
+        position_std_m: standard deviation of each coordinate.
+        heading_rad: heading of the optical axis, counter-clockwise from map x; None if unknown.
+        heading_std_rad: standard deviation of the heading.
     """
 
     position_m: Float64[NDArray[np.float64], "2"] | None = None
@@ -26,9 +26,14 @@ class Prior:
     def log_weight(
         self, xy: Float64[NDArray[np.float64], "n 2"], heading_rad: Float64[NDArray[np.float64], " n"]
     ) -> Float64[NDArray[np.float64], " n"]:
-        """Logarithm of how well poses fit, 0 at best.
+        """Compute the log weight of poses: 0 at the prior, near ``MOST_DOUBT`` far from it.
 
-        It stays near ``MOST_DOUBT`` however far off a pose is: a prior may be wrong, and then the pictures must be able to say so.
+        The weight is the log of a Gaussian plus a constant exp(``MOST_DOUBT``), normalised to 0 at the prior. The constant limits
+        the influence of a wrong prior, so that the images can overrule it.
+
+        Args:
+            xy: positions of the camera, map frame, metres.
+            heading_rad: headings of the optical axis, counter-clockwise from map x.
         """
         squared = np.zeros(len(xy))
         if self.position_m is not None:
@@ -41,15 +46,19 @@ class Prior:
         return believed
 
     def known_nats(self, xy: Float64[NDArray[np.float64], "2"], heading_rad: float) -> float:
-        """What the prior adds to the log odds that the query was taken in the map, where the answer is a pose.
+        """Compute how much the prior adds to the log odds that the query comes from the map, in nats (decision 0135).
 
-        A position in the map, right in all but one case of some 150, makes a stranger so much rarer. It counts as far as the answer
-        agrees with it; a heading alone says nothing of where the robot is.
+        A prior position claims that the robot is in the map. All but one prior in about 150 are assumed to be right. So the odds
+        rise by up to that factor if the answer agrees with the prior. They stay if it does not, or if only a heading is known.
+
+        Args:
+            xy: position of the answer, map frame, metres.
+            heading_rad: heading of the answer's optical axis, counter-clockwise from map x.
         """
         if self.position_m is None:
             return 0.0
         return max(0.0, float(self.log_weight(xy[None], np.array([heading_rad]))[0]) - MOST_DOUBT)
 
 
-#: One prior in some 150 is taken to be wrong altogether.
+#: Log weight of a pose far from the prior, nats. It assumes that one prior in about 150 is entirely wrong.
 MOST_DOUBT = -5.0

@@ -1,4 +1,4 @@
-"""One question: where was this pair of pictures taken?"""
+"""The query: one RGB image, one depth image, their camera and the options."""
 
 from dataclasses import dataclass
 
@@ -10,30 +10,31 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 from service.localization.prior import Prior
 
+#: Upper limit of the option ``neighbours``.
 MOST_NEIGHBOURS = 50
-#: Of calibration's strangers, every kind weighing alike (decision log).
+#: Default share of the out-of-map queries in calibration that may be accepted. All kinds have equal weight (decisions 0039, 0084).
 FALSE_ACCEPT_RATE = 0.02
-#: Least that may be asked for; no calibration could measure less.
+#: Lower limit of the option ``false_accept_rate``. No calibration could measure a lower rate.
 LEAST_FALSE_ACCEPT_RATE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Query:
-    """Pictures that have been checked, and what is known beside them.
+    """A checked image pair and its options.
 
     Attributes:
-        rgb: sRGB.
-        depth_m: z, metres; 0 where nothing was measured.
-        camera: rectified.
-        down_camera: direction of gravity in the camera frame, if an IMU measured it.
-        T_vehicle_camera: where the camera sits, if the vehicle's pose is wanted too.
-        neighbours: k, the number of distinct places that vote and are answered.
-        refine: register the picture on the map's cloud, where the map has one.
-        ranked: answer at least this many places, beyond the k that vote; evaluation wants R@10.
-        prior: what is known of the pose beforehand.
-        baseline_m: of the stereo rig that measured the depth; its disparity offset is then estimated along with the pose, and its
-            noise is that of matching at least.
-        false_accept_rate: share of the queries taken outside the map that one can live with being accepted.
+        rgb: colour image, sRGB.
+        depth_m: depth image, z in metres; 0 where nothing was measured.
+        camera: intrinsics of the rectified camera.
+        down_camera: direction of gravity in the camera frame, from an IMU; None if unknown.
+        T_vehicle_camera: pose of the camera on the vehicle; None if the vehicle pose is not wanted.
+        neighbours: k, the number of distinct places that vote and that the answer lists.
+        refine: whether to register the images on the map cloud, if the map has one.
+        ranked: smallest number of places in the answer, beyond the k that vote. Evaluation needs more places for R@10.
+        prior: prior of the camera pose; None if nothing is known.
+        baseline_m: baseline of the stereo rig that measured the depth; None if no rig is known. With a baseline, registration also
+            estimates the disparity offset, and the depth noise is at least that of stereo matching.
+        false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1.
     """
 
     rgb: UInt8[NDArray[np.uint8], "H W 3"]
@@ -50,7 +51,7 @@ class Query:
 
     @property
     def focal_baseline_px_m(self) -> float | None:
-        """Horizontal focal length of the depth picture times the baseline; None where no stereo rig is known."""
+        """Horizontal focal length of the depth image (px) times the baseline (m); None if no stereo rig is known."""
         if self.baseline_m is None:
             return None
         return float(self.camera.fx * self.depth_m.shape[1] / self.camera.width * self.baseline_m)

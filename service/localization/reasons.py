@@ -1,4 +1,4 @@
-"""Why an answer is not LOCALIZED: evidence outside the range that calibration saw, and what to check, the likeliest cause first."""
+"""Reasons why an answer is not LOCALIZED: confidence features outside the range of the calibration data, and what to check."""
 
 from dataclasses import dataclass
 
@@ -9,23 +9,25 @@ from numpy.typing import NDArray
 from service.localization.judge import SupportWeights
 from service.maps.calibration import FEATURES, Calibration
 
-#: Evidence so many standard deviations from calibration's mean is out of its range.
+#: A confidence feature is out of range if it is more than this many standard deviations from the mean of the calibration data.
 FAR = 3.0
-#: Focal lengths that are tried: a camera's intrinsics are often those of pictures of half or twice the size.
+#: Factors of the focal length to try. A common error is to send the intrinsics of an image of half or twice the size.
 FOCAL_FACTORS = (0.5, 2.0)
-#: A change of the question is named as the remedy if it raises the support of the best pose by so many nats: the median of several
-#: queries, or a single query. A picture from outside the map may fit it a little better with any focal length (decision log).
+#: Smallest gain of the best pose's support, in nats, for which a changed query is named as the remedy: ``GAIN`` for the median of
+#: several queries (decision 0108), ``GAIN_OF_ONE`` for a single query (decision 0132). The limit is higher for a single query,
+#: because an out-of-map query may fit the map slightly better with any focal length.
 GAIN, GAIN_OF_ONE = 3.0, 6.0
 _WEIGHTS = SupportWeights()
 
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """One thing to check.
+    """One possible cause and what to check.
 
     Attributes:
-        check: what may be wrong, as ``baseline``.
-        evidence: features that are out of range, with their distances from calibration's means in standard deviations, signed.
+        check: what may be wrong, for example ``baseline``.
+        evidence: confidence features out of range, each with its signed distance from the mean of the calibration data, in
+            standard deviations.
         remedy: what to do.
     """
 
@@ -34,7 +36,8 @@ class Reason:
     remedy: str
 
 
-#: What evidence out of range speaks of, the likeliest cause first. What confidence does not weigh is no reason either.
+#: Possible causes, the likeliest first: name, confidence features that indicate it, remedy. Features without a weight in the
+#: confidence (``UNWEIGHED``) are left out.
 GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("intrinsics", ("facings",), "compare fx, fy, cx, cy and the picture's size with the camera's own calibration"),
     ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
@@ -58,11 +61,11 @@ _TOO_LITTLE = Reason(
 
 
 def reasons_of(calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None) -> tuple[Reason, ...]:
-    """What to check; empty where all evidence lies in the range that calibration saw.
+    """List what to check, the likeliest cause first; empty if all confidence features are in range.
 
     Args:
-        calibration: the map's.
-        evidence: of the answer; None where the pictures hold too little to register.
+        calibration: calibration of the map.
+        evidence: confidence features of the answer; None if the images have too few points to register.
     """
     if evidence is None:
         return (_TOO_LITTLE,)
@@ -77,5 +80,12 @@ def reasons_of(calibration: Calibration, evidence: Float64[NDArray[np.float64], 
 
 
 def support_of(inliers: float, similarity: float) -> float:
-    """What speaks for a registered pose whatever its rivals, nats: for comparing answers to a question that was changed."""
+    """Compute the part of a pose's support that does not depend on other candidates, nats.
+
+    It serves to compare the answers to a query and to a changed copy of this query.
+
+    Args:
+        inliers: share of inliers, 0 to 1.
+        similarity: descriptor similarity at the pose.
+    """
     return _WEIGHTS.inliers * inliers + _WEIGHTS.similarity * similarity

@@ -1,4 +1,4 @@
-"""From similar views to a metric pose: register the depth from every distinct start and keep the best supported."""
+"""From similar views to a metric pose: register the depth from every distinct start and keep the best supported pose."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -30,11 +30,19 @@ from service.registration.surfel_map import SurfelMap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefineSettings:
-    """Ours, November 2026.
+    """Settings of registration and scoring. Our own choice, November 2026.
 
     Attributes:
-        fewest_points: pictures with fewer have nothing to register.
-        focal_baseline_px_m: focal length times baseline of a stereo rig; the unit of its disparity offset.
+        fewest_points: smallest number of points, over all frames, to register.
+        focal_baseline_px_m: focal length (px) times baseline (m) of the stereo rig. It converts a disparity offset to inverse depth.
+        support: weights of the support.
+        starts: settings of the starts.
+        points: settings of the thinning of a depth image to points.
+        registration: settings of the solver.
+        around: settings of the local search around the best candidate.
+        near: weights for the choice among poses of the local search.
+        rays: settings of the ray adjustment.
+        photometry: settings of the brightness comparison.
     """
 
     fewest_points: int = 30
@@ -50,7 +58,12 @@ class RefineSettings:
 
 
 def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> RefineSettings:
-    """The settings with the disparity offset of a known stereo rig free, under a prior (``OFFSET_PX``)."""
+    """Return the settings for a known stereo rig: its disparity offset is estimated with a prior (``OFFSET_PX``).
+
+    Args:
+        settings: settings without a rig.
+        focal_baseline_px_m: focal length (px) times baseline (m) of the rig.
+    """
     registration = settings.registration
     return replace(
         settings, focal_baseline_px_m=focal_baseline_px_m,
@@ -61,20 +74,20 @@ def settings_for_rig(settings: RefineSettings, focal_baseline_px_m: float) -> Re
     )  # fmt: skip
 
 
-#: Standard deviation of a rig's disparity offset; SGBM's was 0.1 to 0.46 px on real frames (feasibility.md).
+#: Standard deviation of a rig's disparity offset, px. With SGBM the offset was 0.1 to 0.46 px on real frames (feasibility study).
 OFFSET_PX = 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refined:
-    """What registration found.
+    """Result of registration.
 
     Attributes:
-        candidates: the best supported first.
-        covariance: of the best, translation first, map axes, about the camera.
-        points: that were used.
-        disagreement: how many times more than their noise says the picture's patches disagree about the best pose, as a variance.
-        covariance_at: computes the covariance of a candidate that was not adjusted along its rays, as all but the best.
+        candidates: registered poses, the best supported first.
+        covariance: of the best candidate: translation (m), then rotation (rad), in map axes, about the camera.
+        points: number of registered points, over all frames.
+        disagreement: variance inflation at the best pose: how much the image patches disagree about it, relative to their noise.
+        covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.
     """
 
     candidates: tuple[Candidate, ...]
@@ -85,13 +98,13 @@ class Refined:
 
     @property
     def best(self) -> Candidate:
-        """The best supported."""
+        """The best supported candidate."""
         return self.candidates[0]
 
     def with_covariances(self) -> tuple[Candidate, ...]:
-        """All candidates; those that exclude each other have their covariances.
+        """Return all candidates, with a covariance for each of those that exclude each other.
 
-        It costs about half a millisecond for each of those, so only answers that are not LOCALIZED ask for it.
+        A covariance takes about 0.5 ms. So only answers that are not LOCALIZED need this method.
         """
         distinct = {id(each) for each in distinct_candidates(self.candidates)}
         return tuple(
@@ -105,14 +118,14 @@ class Refined:
 def refine(
     bundle: MapBundle, cloud: SurfelMap, frames: tuple[Frame, ...], prior: Prior | None, settings: RefineSettings
 ) -> Refined | None:
-    """Register picture pairs; None where they have too few points.
+    """Register image pairs on the map cloud; return None if they have too few points.
 
     Args:
         bundle: the map.
-        cloud: its prepared cloud.
-        frames: the reference first.
-        prior: of the reference's pose, if anything is known.
-        settings: how many starts, points and refinements.
+        cloud: surfels of the map.
+        frames: image pairs, the reference first.
+        prior: prior of the reference pose; None if nothing is known.
+        settings: settings of registration and scoring.
     """
     reference = frames[0]
     rig_px_m = reference.query.focal_baseline_px_m
@@ -172,7 +185,7 @@ def _points(frame: Frame, blocks: DepthBlocks, settings: RefineSettings) -> Quer
 
 
 def _pictures(frames: tuple[Frame, ...], blocks: list[DepthBlocks], settings: RefineSettings) -> list[RayPicture]:
-    """What the rays of every frame measured, seen from the reference's level frame."""
+    """Build the inverse depth image of every frame, with its camera pose in the reference's level frame."""
     rig = None if frames[0].query.baseline_m is None else settings.focal_baseline_px_m
     pictures = []
     for frame, own in zip(frames, blocks, strict=True):
@@ -184,7 +197,7 @@ def _pictures(frames: tuple[Frame, ...], blocks: list[DepthBlocks], settings: Re
 
 
 def _merged(frames: tuple[Frame, ...], each: list[QueryPoints]) -> QueryPoints:
-    """All points in the reference's level frame, as if one camera had seen them."""
+    """Transform the points of all frames to the reference's level frame and join them."""
     xyz, ray = [], []
     for frame, points in zip(frames, each, strict=True):
         T = level_from(frame.T_reference_camera, frame.R_level_camera, frames[0].R_level_camera).astype(np.float32)
@@ -195,7 +208,7 @@ def _merged(frames: tuple[Frame, ...], each: list[QueryPoints]) -> QueryPoints:
 
 
 def _likeness(bundle: MapBundle, frames: tuple[Frame, ...]) -> Likeness:
-    """Mean similarity of the frames where each of them stood."""
+    """Return a function from poses of the reference's level frame to the mean similarity over all frames."""
 
     def likeness(T_map_level: NDArray[np.float64]) -> NDArray[np.float64]:
         found = []

@@ -1,7 +1,7 @@
-"""Geometric verification of the retrieved places: those where the cloud fits come first.
+"""Geometric verification of the retrieved places: places at registered poses come first.
 
-Re-ranking the nearest neighbours of a global descriptor by registration is how place recognition reports its final recall (Hausler et
-al., Patch-NetVLAD, CVPR 2021; Vidanapathirana et al., Spectral Geometric Verification, RA-L 2023).
+Place recognition methods re-rank the nearest neighbours of a global descriptor by registration before they report recall. Sources:
+Hausler et al., Patch-NetVLAD, CVPR 2021; Vidanapathirana et al., Spectral Geometric Verification, RA-L 2023. See decision 0128.
 """
 
 import numpy as np
@@ -9,12 +9,12 @@ import numpy as np
 from service.localization.judge import Candidate
 from service.localization.search import Neighbour
 
-#: A place further than this from a registered pose is not verified by it.
+#: Largest distance at which a registered pose verifies a place.
 VERIFIED_M = 5.0
 
 
 def reranked(neighbours: tuple[Neighbour, ...], candidates: tuple[Candidate, ...]) -> tuple[Neighbour, ...]:
-    """The place nearest to each registered pose first, then the others by similarity.
+    """Sort places: first the place nearest to each registered pose, then the others by similarity.
 
     Args:
         neighbours: distinct places, the most similar first.

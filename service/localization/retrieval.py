@@ -17,21 +17,22 @@ from service.localization.street_vote import StreetVote, vote
 from service.maps.reader import MapBundle
 from service.registration.points import inverse_depth_noise
 
-#: A query is searched at three turns, a third of the fan's 15 degrees apart. One of them is within 2.5 degrees of a map view.
+#: A query is searched at three turns, 5 degrees apart. The views of a place are 15 degrees apart, so one of the turns is within
+#: 2.5 degrees of a map view.
 TURN_RAD = float(np.deg2rad(5.0))
 
-#: Distinct places to find at least. Registration starts from several of them.
+#: Smallest number of distinct places to find. Registration starts from several of them.
 RANKED = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Retrieved:
-    """What retrieval says of a query.
+    """Result of retrieval.
 
     Attributes:
         neighbours: distinct places, the most similar first.
-        hypotheses: clusters of the most similar views, the heaviest first; weighted by the prior if there is one.
-        vote: of the nearest places over the streets; None if the map has no streets.
+        hypotheses: clusters of the most similar views, the heaviest first; a prior, if given, counts in this order.
+        vote: street vote of the k nearest places; None if the map has no streets.
     """
 
     neighbours: tuple[Neighbour, ...]
@@ -44,15 +45,15 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
 
     Args:
         bundle: the map.
-        encoder: of the map.
+        encoder: encoder of the map.
         query: image pair, camera and options.
-        clusters: how many views the clusters need.
+        clusters: settings of the clustering; they give the smallest number of views to find.
+
+    Returns:
+        The image pair as a reference frame: its ``T_reference_camera`` is the identity.
 
     Raises:
         NoDepthError: the depth image holds no measurement within the view grid.
-
-    Returns:
-        The frame as the reference of an answer.
     """
     started = perf_counter()
     views = query_views(
@@ -65,7 +66,7 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
     matches = search_views(
         bundle, descriptors, turns_rad=views.turns_rad, places=places_of(query), fewest=clusters.views
     )
-    # A query without registration does not need the noise. But a later frame of a stream may be registered together with this one.
+    # A query without registration does not need the noise. But a later query of a stream may register this frame (decision 0111).
     noise = inverse_depth_noise(query.depth_m, focal_baseline_px_m=query.focal_baseline_px_m)
     return Frame(
         query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent,
@@ -79,7 +80,7 @@ def retrieve(bundle: MapBundle, frame: Frame, clusters: ClusterSettings) -> Retr
     Args:
         bundle: the map.
         frame: the reference, as ``look_up`` returned it.
-        clusters: how views are clustered.
+        clusters: settings of the clustering.
     """
     query = frame.query
     neighbours = distinct_places(frame.matches, places_of(query))
@@ -89,33 +90,33 @@ def retrieve(bundle: MapBundle, frame: Frame, clusters: ClusterSettings) -> Retr
 
 
 def turns_on(grid: ViewGrid) -> tuple[int, ...]:
-    """The turns at which a query is searched, in the nearest whole number of columns.
+    """Return the turns at which a query is searched, in whole columns of the view grid, counter-clockwise.
 
     Args:
-        grid: of the views.
+        grid: view grid of the map.
     """
     columns = max(1, round(TURN_RAD / grid.column_rad))
     return (-columns, 0, columns)
 
 
 def places_of(query: Query) -> int:
-    """How many distinct places a query needs.
+    """Return how many distinct places to search for.
 
     Args:
-        query: its options count.
+        query: query with its options.
     """
     return max(query.neighbours, query.ranked, RANKED)
 
 
 def require_encoder_of(bundle: MapBundle, encoder: Encoder) -> None:
-    """Refuse an encoder that did not make the descriptors of a map.
+    """Refuse an encoder that did not compute the descriptors of a map.
 
     Args:
         bundle: the map.
-        encoder: to search it with.
+        encoder: encoder for the queries.
 
     Raises:
-        BundleError: the encoder is another one, or reads another view grid.
+        BundleError: the encoder did not compute the map's descriptors, or reads another view grid.
     """
     expected, size = bundle.manifest.encoder_sha256, bundle.manifest.counts.descriptor_size
     if encoder.sha256 != expected or encoder.dimension != size:

@@ -1,4 +1,4 @@
-"""Which candidates exclude each other, and how the support is shared among them."""
+"""Find candidates that exclude each other (rivals), and each one's share of the support."""
 
 import math
 
@@ -8,19 +8,29 @@ from numpy.typing import NDArray
 
 from service.localization.judge import Candidate
 
-#: A rival stands further away than this, or looks another way: the next frame of the same street is none.
+#: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
 
 
 def is_rival(one: Candidate, other: Candidate) -> bool:
-    """Whether two candidates are answers that exclude each other."""
+    """Return whether two candidates exclude each other by position or rotation.
+
+    Args:
+        one: candidate.
+        other: another candidate.
+    """
     apart = math.dist(one.T_map_camera[:3, 3], other.T_map_camera[:3, 3])
-    trace = (one.T_map_camera[:3, :3] * other.T_map_camera[:3, :3]).sum()  # of the rotation between both
+    # The trace of the relative rotation is 1 + 2 cos(angle).
+    trace = (one.T_map_camera[:3, :3] * other.T_map_camera[:3, :3]).sum()
     return bool(apart > RIVAL_M or trace < 1 + 2 * np.cos(RIVAL_RAD))
 
 
 def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
-    """Those that exclude each other, the best supported of each place."""
+    """Select candidates that exclude each other, the best supported one of each place.
+
+    Args:
+        candidates: registered poses, the best supported first.
+    """
     kept: list[Candidate] = []
     for candidate in candidates:
         if all(is_rival(other, candidate) for other in kept):
@@ -29,13 +39,13 @@ def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, .
 
 
 def behind(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:
-    """By how much each candidate's support is less than the best one's, nats.
+    """Compute the support gap of each candidate to the best one, nats.
 
-    What several frames agree on is surer than one frame's: the noise of their mean falls with the root of their number.
+    The gap grows with the square root of the number of frames, because the noise of their mean support falls with it.
 
     Args:
         distinct: candidates that exclude each other, the best supported first.
-        frames: that were asked together.
+        frames: number of image pairs in the query.
     """
     support = np.array([candidate.support for candidate in distinct])
     less: Float64[NDArray[np.float64], " C"] = np.sqrt(frames) * (support[0] - support)
@@ -43,21 +53,23 @@ def behind(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.f
 
 
 def log_shares(less: Float64[NDArray[np.float64], " C"]) -> Float64[NDArray[np.float64], " C"]:
-    """Logarithm of each one's share, were support the log odds of a place: a half for two that are alike, a sixth for six.
+    """Compute the log of each candidate's share of the support: a log softmax.
+
+    Two candidates with equal support have a share of 1/2 each, six have 1/6 each.
 
     Args:
-        less: as in ``behind``.
+        less: support gaps, as returned by ``behind``, nats.
     """
     shares: Float64[NDArray[np.float64], " C"] = -less - np.log(np.exp(-less).sum())
     return shares
 
 
 def shares_of(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:
-    """Each one's share of the support of all, 0 to 1.
+    """Compute each candidate's share of the support, 0 to 1; the shares sum to 1.
 
     Args:
         distinct: candidates that exclude each other, the best supported first; may be empty.
-        frames: that were asked together.
+        frames: number of image pairs in the query.
     """
     if not distinct:
         return np.zeros(0)

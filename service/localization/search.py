@@ -1,4 +1,4 @@
-"""From a descriptor to the most similar views, and from views to distinct places."""
+"""Search the map: from descriptors to the most similar views, and from views to distinct places."""
 
 from dataclasses import dataclass
 
@@ -8,13 +8,22 @@ from numpy.typing import NDArray
 
 from service.maps.reader import MapBundle
 
-#: The list is so many times as long as what is wanted from it (decision log: what a shorter one loses).
+#: Length of the shortlist, as a multiple of the number of views wanted. Decision 0046 says what a shorter list loses.
 SHORTLIST = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewMatches:
-    """The most similar views, the best first, with what the map knows of each."""
+    """The most similar map views, the best first, one row per view.
+
+    Attributes:
+        view: number of the view in the map.
+        similarity: cosine similarity of the descriptors.
+        place: number of the view's place.
+        street: number of the place's street; -1 for none.
+        heading_rad: heading of the query by this match, map frame: that of the map view minus the turn of the query view.
+        T_map_place: pose of the place's LiDAR.
+    """
 
     view: Int64[NDArray[np.int64], " n"]
     similarity: Float64[NDArray[np.float64], " n"]
@@ -29,15 +38,15 @@ class ViewMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbour:
-    """A place among the nearest, with its most similar view.
+    """A retrieved place with its most similar view.
 
     Attributes:
         place: number of the place in the map.
-        similarity: cosine of the descriptors.
-        distance: Euclidean distance of the descriptors (the paper's, equation 1).
+        similarity: cosine similarity of the descriptors.
+        distance: Euclidean distance of the descriptors (paper, equation 1).
         street: number of the street's feature; -1 for none.
-        position_m: of the place's LiDAR, map frame.
-        heading_rad: of the view, map frame.
+        position_m: position of the place's LiDAR, map frame.
+        heading_rad: heading of the query by the most similar view, map frame.
     """
 
     place: int
@@ -56,16 +65,18 @@ def search_views(
     places: int,
     fewest: int,
 ) -> ViewMatches:
-    """The views that are most similar to any of a query's turned views.
+    """Find the map views that are most similar to any turn of a query.
 
-    The mean of the turned descriptors picks a list from the whole map, and what is on it is compared with each.
+    The mean descriptor over the turns selects a shortlist from the whole map. Each view of the shortlist is then compared exactly with
+    each turn. The shortlist grows until it contains enough places.
 
     Args:
         bundle: the map.
-        descriptors: of the turned views.
-        turns_rad: of the same; a match's heading is that of the map's view less the turn.
-        places: so many distinct places are wanted, if the map has them.
-        fewest: so many views at least.
+        descriptors: descriptors of the query views, one row per turn.
+        turns_rad: turns of the query views, counter-clockwise against the optical axis. The heading of a match is that of the map
+            view minus the turn.
+        places: number of distinct places to find, if the map has as many.
+        fewest: smallest number of views to find.
     """
     wanted = min(places, bundle.manifest.counts.places)
     count = max(fewest, 4 * wanted)
@@ -84,7 +95,7 @@ def _most_similar(
     turns_rad: Float64[NDArray[np.float64], " T"],
     count: int,
 ) -> ViewMatches:
-    """The best ``count`` of some views, each at the turn where it is most similar; the best first."""
+    """Return the best ``count`` of the given views, the best first, each at its most similar turn."""
     similarities = bundle.view_index.vectors(views) @ descriptors.T
     turn = similarities.argmax(axis=1)
     best = similarities[np.arange(len(views)), turn]
@@ -110,7 +121,12 @@ def _matches(
 
 
 def distinct_places(matches: ViewMatches, count: int) -> tuple[Neighbour, ...]:
-    """The ``count`` most similar places, each by its best view."""
+    """Select the most similar distinct places, each with its best view.
+
+    Args:
+        matches: most similar map views, the best first.
+        count: largest number of places.
+    """
     _, first = np.unique(matches.place, return_index=True)
     rows = np.sort(first)[:count]
     similarity = matches.similarity[rows]

@@ -1,4 +1,4 @@
-"""How similar a query is to the map where it is said to stand: asked of the places around a pose."""
+"""Descriptor similarity of a query to the map at given poses, from the places around each pose."""
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -6,11 +6,11 @@ from numpy.typing import NDArray
 
 from service.maps.reader import MapBundle
 
-#: Places around a pose, and views of each whose headings are nearest: their mean is surer than the one best view's.
+#: Number of the nearest places, and of the views of each with the nearest headings. Their mean is less noisy than the best view.
 PLACES, VIEWS = 8, 2
-#: A place counts the less the further it stands from the pose, by a normal curve of this width; how dense the survey is does not matter.
+#: Standard deviation of the Gaussian weight of a place over its distance. So the density of the survey does not matter (decision 0038).
 WIDTH_M = 2.0
-_PAIRS = 1_000_000  # of a pose and a place, whose distances are taken at once
+_PAIRS = 1_000_000  # pairs of pose and place per batch of distances; limits memory
 
 
 def similarities_at(
@@ -20,16 +20,16 @@ def similarities_at(
     R_map_level: Float64[NDArray[np.float64], "n 3 3"],
     camera_m: Float64[NDArray[np.float64], "n 3"],
 ) -> tuple[Float64[NDArray[np.float64], " n"], Float64[NDArray[np.float64], " n"]]:
-    """Mean similarity of a query to the places nearest to each of some poses, seen at the pose's heading; how far they are, m.
+    """Compute the mean similarity of a query to the places around each pose, at the heading of the pose.
 
     Args:
         bundle: the map.
-        descriptors: of the query's turned views; the most similar turn counts.
-        R_map_level: level frames of the query at the poses.
-        camera_m: of the poses, map frame.
+        descriptors: descriptors of the query views, one row per turn; the most similar turn counts.
+        R_map_level: rotation of the query's level frame to the map frame, per pose.
+        camera_m: position of the camera, map frame, per pose.
 
     Returns:
-        The weighted mean of similarity, and that of the places' distances, which the similarity falls with.
+        Per pose the weighted mean similarity, and the weighted mean distance of the places in metres. Similarity falls with distance.
     """
     fan = bundle.manifest.headings
     heading = np.arctan2(R_map_level[:, 1, 0], R_map_level[:, 0, 0])
@@ -40,7 +40,7 @@ def similarities_at(
     vectors = bundle.view_index.vectors(chosen.reshape(-1))
     similarities = (vectors @ descriptors.T).max(axis=1).reshape(chosen.shape).max(axis=2)
     least = away.min(axis=1, keepdims=True)
-    weight = np.exp((least**2 - away**2) / (2 * WIDTH_M**2))  # of the nearest one 1, however far
+    weight = np.exp((least**2 - away**2) / (2 * WIDTH_M**2))  # the nearest place has weight 1 at any distance
     weight /= weight.sum(axis=1, keepdims=True)
     return (weight * similarities).sum(axis=1), (weight * away).sum(axis=1)
 
@@ -48,7 +48,7 @@ def similarities_at(
 def _nearest(
     places_xy: Float64[NDArray[np.float64], "2 P"], camera_m: Float64[NDArray[np.float64], "n 3"]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """The ``PLACES`` places nearest to each camera on the ground, in no order, and how far they are, m."""
+    """Find the ``PLACES`` places nearest to each camera horizontally; return their numbers, unsorted, and distances (m)."""
     count = min(PLACES, places_xy.shape[1])
     nearest, squares = [], []
     at_once = max(1, _PAIRS // places_xy.shape[1])

@@ -1,4 +1,4 @@
-"""Where a query may have been taken, as mean and covariance, while no single pose is confirmed."""
+"""Mean and covariance over all places where the camera may be, for an answer that is not LOCALIZED."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform, heading_of_camera
 
-#: Maps of single frames say 0.
+#: Lower limit of the spacing of places. Maps of single frames have a spacing of 0.
 LEAST_SPACING_M = 1.0
-#: Standard deviation of a heading of which nothing is known: uniform on the circle.
+#: Standard deviation of an unknown heading: that of a uniform distribution over the circle.
 UNKNOWN_HEADING_RAD = float(np.pi / np.sqrt(3.0))
 
 
@@ -20,8 +20,8 @@ class Extent:
     """The area of a map, as mean and covariance of a position in it.
 
     Attributes:
-        mean_m: middle of the places, map frame, metres.
-        covariance: of a position drawn from the places, m^2.
+        mean_m: mean position of the places, map frame, metres.
+        covariance: covariance of a position drawn from the places, map axes, m^2.
     """
 
     mean_m: Float64[NDArray[np.float64], "3"]
@@ -29,12 +29,12 @@ class Extent:
 
     @classmethod
     def of_places(cls, places_m: Float64[NDArray[np.float64], "P 3"], spacing_m: float) -> "Extent":
-        """The extent of some places.
+        """Compute the extent of a set of places.
 
         Args:
-            places_m: positions, map frame, metres.
-            spacing_m: between places; a place stands for its surroundings, so this much, at least ``LEAST_SPACING_M``, is added
-                as a standard deviation.
+            places_m: positions of the places, map frame, metres.
+            spacing_m: distance between adjacent places, metres. A place stands for its surroundings. So the covariance gets
+                this standard deviation, at least ``LEAST_SPACING_M``, in addition.
         """
         mean_m = places_m.mean(axis=0)
         apart = places_m - mean_m
@@ -45,11 +45,11 @@ class Extent:
 class Spread:
     """Mean and covariance of the position over all places where the camera may be.
 
-    The mean is usually a place where the camera is not: between two streets, for example. It is not a pose.
+    The mean is not a pose. The camera is usually somewhere else, for example if the mean lies between two streets.
 
     Attributes:
-        mean_m: map frame, metres.
-        covariance: of the position, map axes, m^2.
+        mean_m: mean position, map frame, metres.
+        covariance: covariance of the position, map axes, m^2.
         heading_std_rad: circular standard deviation of the heading; at most ``UNKNOWN_HEADING_RAD``.
         hypotheses_weight: probability that one of the hypotheses is right, 0 to 1.
     """
@@ -68,18 +68,19 @@ def spread_of(
     confidence: float,
     extent: Extent,
 ) -> Spread:
-    """Mean and covariance of a mixture: every hypothesis, and the whole map in case none of them is right.
+    """Compute mean and covariance of a mixture of all hypotheses and the whole map.
 
-    The confidence is the probability that the first hypothesis is right. The others are right in proportion to their shares. What is
-    left of the probability is spread over the map. So one wrong hypothesis of 0.1 m gives a covariance of the size of the map.
-    The covariance follows from the law of total covariance: the mean of the parts' covariances plus the covariance of their means.
+    The confidence is the probability that the first hypothesis is right. The others are right in proportion to their shares. The rest
+    of the probability belongs to the map. So a single hypothesis with low confidence gives a covariance as large as the map,
+    even if its own standard deviation is 0.1 m. The covariance follows from the law of total covariance: the mean of the components'
+    covariances plus the covariance of their means.
 
     Args:
-        poses: T_map_camera of each hypothesis, the first is the best supported; may be empty.
-        covariances: of each, translation first, map axes.
-        shares: of each, of the support of all; they sum to 1.
+        poses: T_map_camera of each hypothesis, the best supported first; may be empty.
+        covariances: covariance of each pose: translation (m), then rotation (rad), in map axes.
+        shares: share of each hypothesis in the support; they sum to 1.
         confidence: probability that the first hypothesis is right, 0 to 1.
-        extent: of the map.
+        extent: extent of the map.
     """
     weight = min(1.0, confidence / float(shares[0])) if len(poses) else 0.0
     weights = np.append(weight * shares[: len(poses)], 1.0 - weight)
@@ -90,7 +91,7 @@ def spread_of(
     covariance = np.einsum("k,kij->ij", weights, within) + np.einsum("k,ki,kj->ij", weights, apart, apart)
     headings = np.array([heading_of_camera(T) for T in poses])
     variances = np.array([each[5, 5] for each in covariances])
-    # The map's part has no preferred heading, so it adds nothing to the resultant.
+    # The map component has a uniform heading, so it adds nothing to the resultant.
     resultant = abs(np.sum(weights[:-1] * np.exp(1j * headings - 0.5 * variances)))
     heading_std_rad = UNKNOWN_HEADING_RAD
     if resultant > 0.0:

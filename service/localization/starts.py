@@ -1,4 +1,4 @@
-"""From similar views to the poses that registration starts from: distinct in place and heading."""
+"""From similar views to the starts of registration: poses that are distinct in position and heading."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from service.registration.register import Start
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartSettings:
-    """How many starts, and how far apart. Ours, November 2026.
+    """Number of starts and their distance from each other. Our own choice, November 2026.
 
     Attributes:
-        most: so many at most.
-        less_similar: views that are less similar than the best by more than this start nothing.
-        apart_m: of two starts of one heading.
-        apart_rad: of two starts of one place.
-        temperature: similarity that a prior's logarithm is worth; near the one that training ends at.
-        pooled: of several frames, so many at most are compared by what all frames say there.
+        most: largest number of starts.
+        less_similar: largest loss of similarity against the best view. A view with a larger loss gives no start.
+        apart_m: smallest distance of two starts with the same heading.
+        apart_rad: smallest difference in heading of two starts at the same place.
+        temperature: similarity per nat of a prior's log weight; near the softmax temperature at the end of training.
+        pooled: largest number of starts, in a query of several frames, that are ranked by the mean similarity of all frames.
     """
 
     most: int = 32
@@ -34,7 +34,7 @@ class StartSettings:
     pooled: int = 64
 
 
-#: How similar all frames are, in the mean, to the map where the reference's level frame is said to stand (n, 4, 4).
+#: Function from poses T_map_level of the reference (n, 4, 4) to the mean similarity of all frames to the map there (n,).
 Likeness = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -42,14 +42,15 @@ def starts_from(
     frames: tuple[Frame, ...], prior: Prior | None, *, lidar_height_m: float, settings: StartSettings,
     likeness: Likeness | None = None,
 ) -> list[Start]:  # fmt: skip
-    """Level poses of the reference camera at the most similar views that are distinct.
+    """Select the most similar distinct poses of the reference's level frame.
 
     Args:
-        frames: the reference first; what another frame resembles is carried over to where the reference then stood.
-        prior: moves what fits it forward; half of the starts are taken without it, since it may be wrong.
-        lidar_height_m: of the places above their ground.
-        settings: how many.
-        likeness: ranks the starts of several frames; what a single one resembles can else crowd out what all of them do.
+        frames: image pairs, the reference first. A match of another frame gives the pose of the reference at that time.
+        prior: prior of the reference pose; None if nothing is known. Half of the starts ignore the prior, because it may be wrong.
+        lidar_height_m: height of the places' LiDAR above the ground.
+        settings: number of starts and their distance.
+        likeness: ranks the starts of several frames by their mean similarity; None for one frame. Without it, perceptual aliases of
+            single frames could crowd out the right place (decision 0071).
     """
     poses = np.concatenate([_poses(frame, frames[0], lidar_height_m) for frame in frames])
     similarity = np.concatenate([frame.matches.similarity for frame in frames])
@@ -57,14 +58,14 @@ def starts_from(
     if likeness is not None:
         poses, similarity = poses[kept], likeness(poses[kept])
         kept = _chosen(poses, similarity, prior, settings, settings.most)
-    # Without the prior: it is weighed at the end, when rivals have been registered too.
+    # The similarity of a start excludes the prior. The support includes it later, when the rivals are registered too.
     return [Start(poses[k, :3, :3], poses[k, :3, 3], number, float(similarity[k])) for number, k in enumerate(kept)]
 
 
 def _chosen(
     poses: NDArray[np.float64], similarity: NDArray[np.float64], prior: Prior | None, settings: StartSettings, most: int
 ) -> list[int]:
-    """Rows of the most similar poses that are distinct; with a prior, half of them by it and half without it."""
+    """Return the rows of the most similar distinct poses. A prior ranks the first half of them and does not count in the rest."""
     heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     allowed = similarity >= similarity.max() - settings.less_similar
     rank = similarity
@@ -81,7 +82,7 @@ def _chosen(
 
 
 def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDArray[np.float64], "n 4 4"]:
-    """T_map_level of the reference camera for every match of a frame."""
+    """Compute T_map_level of the reference for every match of a frame."""
     matches = frame.matches
     up = matches.T_map_place[:, :3, 2]
     x = np.stack([np.cos(matches.heading_rad), np.sin(matches.heading_rad), np.zeros(len(matches))], axis=1)
@@ -98,7 +99,15 @@ def _poses(frame: Frame, reference: Frame, lidar_height_m: float) -> Float64[NDA
 
 
 def level_from(T_reference_camera: Transform, R_level_camera: Rotation, R_level_reference: Rotation) -> Transform:
-    """T_level_level: from a frame's level frame, at its camera, to the reference's at its own."""
+    """Compute the transform from a frame's level frame to the level frame of the reference.
+
+    The origin of each level frame is at its camera.
+
+    Args:
+        T_reference_camera: pose of the frame's camera in the camera frame of the reference.
+        R_level_camera: rotation from the frame's camera to its level frame.
+        R_level_reference: rotation from the reference camera to its level frame.
+    """
     R = R_level_reference @ T_reference_camera[:3, :3] @ R_level_camera.T
     return transform_from(R, R_level_reference @ T_reference_camera[:3, 3])
 
@@ -106,7 +115,7 @@ def level_from(T_reference_camera: Transform, R_level_camera: Rotation, R_level_
 def _distinct(
     rows: NDArray[np.intp], xy: NDArray[np.float64], heading: NDArray[np.float64], kept: list[int], most: int, settings: StartSettings
 ) -> list[int]:  # fmt: skip
-    """``kept`` and as many of the rows, in their order, as stand apart from all before them."""
+    """Add rows in their order to ``kept``, up to ``most``, if they are distinct from all rows before them."""
     kept = list(kept)
     for row in rows:
         if len(kept) == most:

@@ -10,12 +10,12 @@ from service.localization.search import Neighbour
 
 @dataclass(frozen=True, slots=True)
 class StreetVote:
-    """How the neighbours voted.
+    """Result of the street vote.
 
     Attributes:
-        street: number of the winning street's feature; -1 where most of the weight lies in no street.
-        share: the winner's share of the similarity weights.
-        shares: street and share of every street that got a vote, the largest first; -1 is "in no street".
+        street: number of the winning street's feature; -1 if "in no street" wins.
+        share: share of the similarity weights of the winner, 0 to 1.
+        shares: number and share of every street with a vote, the largest share first; -1 is "in no street".
     """
 
     street: int
@@ -24,11 +24,11 @@ class StreetVote:
 
 
 def vote(neighbours: tuple[Neighbour, ...], temperature: float) -> StreetVote:
-    """Let distinct places vote, each with the weight of its similarity.
+    """Vote for the street among distinct places, weighted by the softmax of their similarity.
 
     Args:
-        neighbours: the k nearest, one or more.
-        temperature: as in ``ClusterSettings``.
+        neighbours: the k nearest places, one or more.
+        temperature: softmax temperature, as in ``ClusterSettings``.
     """
     weights = similarity_weights(np.array([each.similarity for each in neighbours]), temperature)
     shares: dict[int, float] = {}

@@ -1,4 +1,4 @@
-"""``calibration.json``: from the evidence of an answer to the probability that it is right; what it was measured on."""
+"""``calibration.json``: maps the confidence features of an answer to the probability that its position is right."""
 
 import json
 from functools import cache
@@ -11,18 +11,20 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service.errors import BundleError
 
-#: What an answer's confidence rests on, in this order (``service.localization.evidence``).
+#: The confidence features in this order. ``service.localization.evidence`` computes them.
 FEATURES = (
     "margin", "inliers", "similarity", "similarity_margin", "likelihood", "through", "front", "unmapped", "log_sigma", "scale", "votes",
     "entropy", "log_noise", "points", "measured", "place_m",
     "facings", "far", "edges", "residual", "pose_spread", "log_share",
 )  # fmt: skip
-#: The features that say what rivals there are; whether the place is in the map at all does not depend on them.
+#: The features that measure competing candidates. The probability that a query is in the map does not use them.
 RIVALRY = ("margin", "similarity_margin", "votes", "entropy", "pose_spread")
-#: ``log_share`` decides beside the confidence (``service.localization.decide``). How similar descriptors are in absolute terms says more
-#: of the kind of street than of the place: real ones lie four standard deviations below simulated ones. Both weigh nothing (decision log).
+#: Features with weight 0. ``log_share`` is a separate rule beside the confidence (``service.localization.decide``,
+#: decision 0086). ``similarity`` depends more on the kind of street than on the place. Real streets lie four standard
+#: deviations below simulated streets (decision 0137).
 UNWEIGHED = ("log_share", "similarity")
-_CLIP = 4.0  # standard deviations: no feature may run further away than calibration has seen
+#: Limit of a normalised feature, standard deviations. It stops extrapolation beyond the calibration data.
+_CLIP = 4.0
 
 
 class _Frozen(BaseModel):
@@ -30,13 +32,13 @@ class _Frozen(BaseModel):
 
 
 class Logistic(_Frozen):
-    """Logistic regression over features and all their products by two, squares among them.
+    """Logistic regression over the features, their squares and all products of two features.
 
     Attributes:
-        mean: of each feature; what features are told from.
-        spread: standard deviation of each, the unit they are told in.
-        weights: of the features, then of their products, in the order of ``terms``.
-        bias: log odds where all features are at their means.
+        mean: mean of each feature. Normalisation subtracts it.
+        spread: standard deviation of each feature. Normalisation divides by it.
+        weights: weights of the features, then of the products, in the order of ``terms``.
+        bias: log odds where all normalised features are 0.
     """
 
     mean: tuple[float, ...]
@@ -54,14 +56,24 @@ class Logistic(_Frozen):
         return self
 
     def log_odds(self, evidence: Float64[NDArray[np.float64], "*n F"]) -> Float64[NDArray[np.float64], "*n"]:
-        """Of one row of evidence or of many."""
+        """Return the log odds for one or more rows of features.
+
+        Args:
+            evidence: confidence features in the order of ``FEATURES``.
+        """
         return np.asarray(expanded(evidence, self.mean, self.spread) @ np.array(self.weights) + self.bias)
 
 
 def expanded(
     evidence: Float64[NDArray[np.float64], "*n F"], mean: tuple[float, ...], spread: tuple[float, ...]
 ) -> Float64[NDArray[np.float64], "*n T"]:
-    """Features in their units, and their products by two, in the order of ``terms``."""
+    """Normalise features and append their squares and products of two, in the order of ``terms``.
+
+    Args:
+        evidence: confidence features, a row per answer.
+        mean: mean of each feature.
+        spread: standard deviation of each feature.
+    """
     z = np.clip((evidence - np.array(mean)) / np.array(spread), -_CLIP, _CLIP)
     one, other = np.triu_indices(z.shape[-1])
     wide: Float64[NDArray[np.float64], "*n T"] = np.concatenate([z, z[..., one] * z[..., other]], axis=-1)
@@ -70,23 +82,38 @@ def expanded(
 
 @cache
 def terms(count: int) -> tuple[tuple[int, ...], ...]:
-    """What ``expanded`` makes of so many features: which of them each term is a product of."""
+    """Return for each term of ``expanded`` the indices of the features that it multiplies.
+
+    Args:
+        count: number of features.
+    """
     return (*((k,) for k in range(count)), *((j, k) for j in range(count) for k in range(j, count)))
 
 
 class Threshold(_Frozen):
-    """Answers with at least this confidence are accepted; then so many of the queries that are not in the map are, too."""
+    """The confidence threshold for one false-accept rate.
+
+    Attributes:
+        false_accept_rate: share of out-of-map queries that reach ``confidence``.
+        confidence: least confidence of an accepted answer.
+    """
 
     false_accept_rate: float = Field(gt=0, lt=1)
     confidence: float = Field(ge=0, le=1)
 
 
 class Site(_Frozen):
-    """What queries drawn from this map's own survey say of its confidence.
+    """Correction of the confidence from queries that are rendered from this map's own survey (decision 0030).
 
-    ``offset``, never above 0, is added to the log odds: thresholds, which do not know of it, are then reached by fewer answers,
-    so their false-accept rates hold all the more. ``expected_calibration_error`` is that of a single bin, the mean confidence against the
-    share that was right: more bins would hold too few of so few queries.
+    The offset only lowers the log odds and the thresholds stay as they are. So fewer answers reach a threshold, and its
+    false-accept rate still holds.
+
+    Attributes:
+        offset: added to the log odds, at most 0.
+        queries: number of rendered queries.
+        right: number of queries with a right answer.
+        expected_calibration_error: difference between mean confidence and share of right answers. It uses a single bin,
+            because more bins would hold too few queries each.
     """
 
     offset: float = Field(le=0)
@@ -96,15 +123,16 @@ class Site(_Frozen):
 
 
 class Calibration(_Frozen):
-    """Everything that turns evidence into confidence and status.
+    """All parameters that map confidence features to confidence and status.
 
     Attributes:
-        features: names, as this program knows them.
-        right: that the position is within 1 m.
-        known: that the query was taken in the map, whichever of its places it resembles.
-        thresholds: by rising false-accept rate.
-        site: the map's own correction; None where it was not measured.
-        measured_on: for people.
+        calibrated: always true. An uncalibrated map has ``false`` in its file.
+        features: names of the features. They must equal ``FEATURES``.
+        right: regression of the event that the position is within 1 m.
+        known: regression of the event that the query was taken in the map, at any of its places.
+        thresholds: sorted by rising false-accept rate.
+        site: the map's own correction. None if it was not measured.
+        measured_on: description of the calibration data for readers.
     """
 
     calibrated: Literal[True] = True
@@ -125,7 +153,11 @@ class Calibration(_Frozen):
         return self
 
     def confidence(self, evidence: Float64[NDArray[np.float64], "*n F"]) -> Float64[NDArray[np.float64], "*n"]:
-        """Probability that the position is within 1 m."""
+        """Return the probability that the position is within 1 m.
+
+        Args:
+            evidence: confidence features in the order of ``FEATURES``.
+        """
         odds = self.right.log_odds(evidence)
         if self.site is not None:
             odds = np.asarray(odds + self.site.offset)
@@ -133,28 +165,38 @@ class Calibration(_Frozen):
 
     @property
     def least_false_accept_rate(self) -> float:
-        """The least that was measured: nothing less can be promised."""
+        """The lowest false-accept rate that calibration measured."""
         return self.thresholds[0].false_accept_rate
 
     def threshold(self, false_accept_rate: float) -> float:
-        """The confidence from which on answers are accepted, for a rate of false accepts that one can live with.
+        """Return the least confidence of an accepted answer for a given false-accept rate.
 
-        Below ``least_false_accept_rate`` it is that one's.
+        Args:
+            false_accept_rate: tolerated share of accepted out-of-map queries. Below ``least_false_accept_rate`` the threshold
+                of that rate applies.
         """
         fitting = [each.confidence for each in self.thresholds if each.false_accept_rate <= false_accept_rate]
         return fitting[-1] if fitting else self.thresholds[0].confidence
 
 
 def probability(log_odds: Float64[NDArray[np.float64], "*n"]) -> Float64[NDArray[np.float64], "*n"]:
-    """The logistic function."""
+    """Return the probability for log odds (logistic function).
+
+    Args:
+        log_odds: natural logarithm of the odds.
+    """
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_odds, -30, 30))))
 
 
 def read_calibration(document: bytes, *, path: str) -> Calibration | None:
-    """Read ``calibration.json``; None where it says that the map is not calibrated.
+    """Read ``calibration.json``, or return None if it says that the map is not calibrated.
+
+    Args:
+        document: content of the file.
+        path: path of the file, for the error message.
 
     Raises:
-        BundleError: it is neither; names the file.
+        BundleError: the document is neither a calibration nor a statement that there is none. The message names the file.
     """
     try:
         content = json.loads(document)

@@ -1,4 +1,4 @@
-"""What a map bundle is made of, before it is written and after it is opened."""
+"""The parts of a map bundle: file names, array types and the content in memory."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,42 +15,47 @@ PLACES_FILE, VIEWS_FILE = "places.npy", "views.npy"
 ENCODER_FILE = "encoder.onnx"
 CALIBRATION_FILE, PREVIEW_FILE = "calibration.json", "preview.webp"
 CLOUD_FOLDER = "cloud"
-#: What maps are merged by; a service only checks its hash.
+#: Voxel statistics for merging and updating maps. The service only checks the hash of this file.
 STATISTICS_FILE = "voxels.npy"
 
-#: What no map reaches, metres from its origin; and how far a rotation may be off by what its numbers were rounded to.
+#: Largest coordinate of a pose (m). Largest error of an entry of R R^T, which allows for rounded numbers.
 MOST_AWAY_M, _SKEW = 1e7, 1e-3
 NO_POSE = f"a pose is not finite, stretches, mirrors, or lies more than {MOST_AWAY_M:g} m from the origin"
 
+#: Content of ``calibration.json`` for a map without calibration.
 UNCALIBRATED = {"calibrated": False, "why": "nobody calibrated it; answers carry confidence null"}
 
-#: A place: pose of the levelled LiDAR (x forward, z up) and the number of its street's feature, -1 for none.
+#: A place: pose of the levelled LiDAR (x forward, z up), and the index of its street's feature (-1: none).
 PLACE = np.dtype([("T_map_place", "<f8", (4, 4)), ("street", "<i4")])
-#: A view: the number of its place and its heading, counter-clockwise from map x.
+#: A map view: the index of its place, and its heading (rad), counter-clockwise from map x.
 VIEW = np.dtype([("place", "<i4"), ("heading_rad", "<f8")])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BundleContent:
-    """All that a map is, in memory; ``write_bundle`` makes files of it.
+    """The complete content of a map in memory. ``write_bundle`` writes it to files.
 
     Attributes:
-        name: how requests address the map.
-        headings: views of each place's fan.
-        spacing_m: travelled distance between places.
-        rows_seen: rows of the view grid that the survey's sensor covers.
+        name: name of the map in requests.
+        grid: the view grid of the map views.
+        headings: number of map views per place.
+        spacing_m: travelled distance between places, metres.
+        rows_seen: True for the rows of the view grid that the survey's sensor covers.
         T_map_place: levelled pose of each place: x forward, z up, the LiDAR at the origin.
-        place_street: number of the feature in ``streets`` that each place lies in; -1 for none.
-        view_place: place of each view.
-        view_heading_rad: heading of each view in the map frame.
-        descriptors: unit vectors, a row a view.
-        encoder: the ONNX file that made them.
-        streets: GeoJSON, or None where the map knows no streets.
-        cloud: the prepared cloud, or None where there is nothing to register on.
-        statistics: sums of the points of every voxel of the cloud, for whoever adds to the map; None keeps none.
-        calibration: confidence calibration; by default there is none.
-        preview_webp: the map from above; may be empty.
-        parameters: further numbers the map was built with; ``lidar_height_m`` must be there.
+        place_street: index of the feature in ``streets`` that each place lies in; -1 for none.
+        view_place: index of the place of each view.
+        view_heading_rad: heading of each view, radians, counter-clockwise from map x.
+        descriptors: unit vectors, a row per view.
+        encoder: content of the ONNX file that computed the descriptors.
+        parameters: further numbers that the map was built with. ``lidar_height_m`` is required.
+        streets: GeoJSON FeatureCollection. None if the map has no streets.
+        cloud: the prepared cloud. None if the map has nothing to register against.
+        statistics: sums over the points of each voxel of the cloud, for merging and updating. None stores none.
+        calibration: content of ``calibration.json``. The default states that there is no calibration.
+        preview_webp: image of the map from above. May be empty.
+        georeference: arguments of ``Georeference`` for the map's origin. None if the position on the Earth is unknown.
+        licence: text of the licence. May be empty.
+        tool_versions: version of each tool that built the map, by name.
     """
 
     name: str
@@ -76,7 +81,14 @@ class BundleContent:
 
 
 def are_poses(T: Float64[NDArray[np.float64], "n 4 4"]) -> bool:
-    """Whether each turns and moves, no more: one that does not spoils all that is reckoned with it."""
+    """Check that all matrices are rigid transforms with coordinates up to ``MOST_AWAY_M``.
+
+    Args:
+        T: candidate poses, translation in metres.
+
+    Returns:
+        False if any matrix is not finite, stretches, shears, mirrors or lies too far from the origin.
+    """
     R = T[:, :3, :3]
     if not (np.abs(T[:, :3, 3]) <= MOST_AWAY_M).all() or not (np.abs(R) <= 1 + _SKEW).all():
         return False

@@ -1,4 +1,4 @@
-"""The manifest of a map bundle: what was built, how, from what, and the hash of every file."""
+"""The manifest of a map bundle: content, build parameters, tool versions and the hash of every file."""
 
 import hashlib
 import json
@@ -12,12 +12,14 @@ from service.errors import BundleError
 from service.geometry.earth import Georeference
 from service.imaging.view_grid import ViewGrid
 
+#: Version of the bundle format that this program reads and writes.
 FORMAT = 3
 FILE = "manifest.json"
-#: Parts of the manifest that say when and with what a bundle was made, not what is in it.
+#: Fields that describe when and with which tools the bundle was built. They do not affect the version.
 _CIRCUMSTANCES = {"version", "made_at", "tool_versions"}
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+#: Pattern of a map's name.
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME)]
 
@@ -27,7 +29,17 @@ class _Frozen(BaseModel):
 
 
 class GridParameters(_Frozen):
-    """The view grid of the descriptors; a query is resampled to the same."""
+    """Parameters of the view grid. Map views and query views use the same grid.
+
+    Attributes:
+        rows: number of elevations.
+        columns: number of azimuths.
+        azimuth_span_deg: horizontal field of view, degrees.
+        elevation_top_deg: elevation of the top row, degrees.
+        elevation_bottom_deg: elevation of the bottom row, degrees.
+        min_range_m: shortest range that a view keeps, metres.
+        max_range_m: longest range that a view keeps, metres.
+    """
 
     rows: int = Field(ge=2, le=1024)
     columns: int = Field(ge=2, le=4096)
@@ -39,7 +51,15 @@ class GridParameters(_Frozen):
 
 
 class Counts(_Frozen):
-    """How much is in the bundle."""
+    """Sizes of the bundle's parts.
+
+    Attributes:
+        places: number of places.
+        views: number of map views.
+        descriptor_size: number of components of a descriptor.
+        cloud_points: number of surfels; 0 without a cloud.
+        streets: number of street features; 0 without streets.
+    """
 
     places: int = Field(ge=1)
     views: int = Field(ge=1)
@@ -49,14 +69,37 @@ class Counts(_Frozen):
 
 
 class FileEntry(_Frozen):
-    """What a file must be."""
+    """Expected hash and size of a file.
+
+    Attributes:
+        sha256: SHA-256 of the content, hexadecimal.
+        size: size, bytes.
+    """
 
     sha256: Sha256
     size: int = Field(ge=0)
 
 
 class Manifest(_Frozen):
-    """The first file that is read and the last that is written."""
+    """Content of ``manifest.json``. The writer writes this file last and the reader reads it first.
+
+    Attributes:
+        format: version of the bundle format.
+        name: name of the map in requests.
+        version: hash of the content (``expected_version``).
+        made_at: time of the build, with time zone.
+        grid: parameters of the view grid.
+        headings: number of map views per place.
+        spacing_m: travelled distance between places, metres.
+        rows_seen: True for the rows of the view grid that the survey's sensor covers.
+        parameters: further numbers that the map was built with. ``lidar_height_m`` is required.
+        encoder_sha256: SHA-256 of the encoder that computed the descriptors.
+        counts: sizes of the bundle's parts.
+        georeference: arguments of ``Georeference`` for the map's origin. None if the position on the Earth is unknown.
+        licence: text of the licence. May be empty.
+        files: every other file of the bundle, by its path relative to the bundle's folder.
+        tool_versions: version of each tool that built the map, by name.
+    """
 
     format: Literal[3]
     name: Name
@@ -76,33 +119,39 @@ class Manifest(_Frozen):
 
     @property
     def view_grid(self) -> ViewGrid:
-        """The grid as the imaging code takes it."""
+        """The view grid as the imaging code uses it."""
         return ViewGrid(**self.grid.model_dump())
 
     @property
     def lidar_height_m(self) -> float:
-        """Nominal height of the survey's LiDAR, the origin of a place, above the ground."""
+        """Nominal height of the survey's LiDAR above the ground, metres. The LiDAR is the origin of a place."""
         return self.parameters["lidar_height_m"]
 
     def expected_version(self) -> str:
-        """Hash of the content: the same places, views and files give the same version, whenever they were made."""
+        """Return the version: the first 16 hexadecimal digits of the SHA-256 of the content.
+
+        The build time and the tool versions do not count. So the same content gives the same version.
+        """
         content = self.model_dump(mode="json", exclude=_CIRCUMSTANCES)
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def stamped(self) -> "Manifest":
-        """The same manifest with its version filled in."""
+        """Return a copy with the version set to ``expected_version``."""
         return Manifest.model_validate({**self.model_dump(), "version": self.expected_version()})
 
     def to_bytes(self) -> bytes:
-        """The file's text."""
+        """Return the content of ``manifest.json``."""
         return (json.dumps(self.model_dump(mode="json"), indent=1, sort_keys=True) + "\n").encode()
 
 
 def read_manifest(directory: Path) -> Manifest:
     """Read and check a bundle's manifest.
 
+    Args:
+        directory: the bundle's folder.
+
     Raises:
-        BundleError: it is missing, not a manifest, of another format version, or contradicts itself.
+        BundleError: the manifest is missing, malformed, of another format version, or inconsistent.
     """
     path = directory / FILE
     try:
@@ -157,7 +206,11 @@ def _require_consistent(path: Path, manifest: Manifest) -> None:
 
 
 def not_on_earth(georeference: Mapping[str, Any] | None) -> str | None:
-    """What is wrong with a georeference, if anything."""
+    """Return what is wrong with a georeference, or None if it is valid.
+
+    Args:
+        georeference: arguments of ``Georeference``. None is valid.
+    """
     try:
         if georeference is not None:
             Georeference(**georeference)
@@ -167,7 +220,11 @@ def not_on_earth(georeference: Mapping[str, Any] | None) -> str | None:
 
 
 def is_confined(name: str) -> bool:
-    """Whether a file's name is a plain relative path that stays inside the bundle."""
+    """Check that a file name is a plain relative path inside the bundle.
+
+    Args:
+        name: path with ``/`` between folders. The name of the manifest itself is not allowed.
+    """
     parts = name.split("/")
     plain = all(part and part not in (".", "..") and not set(part) & set("\\:\0") for part in parts)
     return plain and name != FILE

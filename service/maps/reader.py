@@ -1,4 +1,4 @@
-"""Open a map bundle: check everything, then map it into memory."""
+"""Open a map bundle: check its files, then map them into memory."""
 
 import json
 from dataclasses import dataclass, field
@@ -28,7 +28,23 @@ _REMEDY = "copy or build the bundle again"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapBundle:
-    """An open map; all arrays are read-only and memory-mapped, safe to share between threads."""
+    """An open map bundle. Threads may share it: the arrays of its files are read-only and memory-mapped.
+
+    Attributes:
+        path: the bundle's folder.
+        manifest: the checked manifest.
+        grid: the view grid of the map views.
+        rows_seen: True for the rows of the view grid that the survey's sensor covers.
+        places: (P,) of dtype ``PLACE``.
+        views: (V,) of dtype ``VIEW``, sorted by place.
+        view_index: index of the descriptors.
+        streets: street polygons. None if the map has none.
+        streets_document: GeoJSON of the streets. It stays in memory, because the bundle's folder may be removed while the
+            service still uses the map.
+        calibration: confidence calibration. None if the map is not calibrated.
+        cloud: the prepared cloud. None if the map has nothing to register against.
+        places_xy: x of all places, then y of all places, map frame, metres. In memory.
+    """
 
     path: Path
     manifest: Manifest
@@ -38,11 +54,9 @@ class MapBundle:
     views: NDArray[Any]
     view_index: ViewIndex
     streets: Streets | None
-    #: The streets' GeoJSON, in memory: the bundle's folder may go while the map still serves.
     streets_document: bytes | None
     calibration: Calibration | None
     cloud: SurfelMap | None
-    #: Where the places lie on the ground, in memory: x of all, y of all.
     places_xy: Float64[NDArray[np.float64], "2 P"] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -54,10 +68,12 @@ class MapBundle:
 
         Args:
             path: the bundle's folder.
-            verify: compare every file's hash with the manifest; sizes and shapes are compared always.
+            verify: compare the hash of every file with the manifest, and check every index of the cloud. Sizes and shapes are
+                always checked.
 
         Raises:
-            BundleError: missing, damaged, of another format, or contradicting itself; names the file and the remedy.
+            BundleError: the bundle is missing, damaged, of another format, or inconsistent. The message names the file and
+                the remedy.
         """
         manifest = read_manifest(path)
         _require_files(path, manifest, verify=verify)
@@ -80,49 +96,49 @@ class MapBundle:
 
     @property
     def name(self) -> str:
-        """How requests address the map."""
+        """Name of the map in requests."""
         return self.manifest.name
 
     @property
     def T_map_place(self) -> Float64[NDArray[np.float64], "P 4 4"]:
-        """Levelled pose of each place."""
+        """Levelled pose of each place: x forward, z up, the LiDAR at the origin."""
         poses: Float64[NDArray[np.float64], "P 4 4"] = self.places["T_map_place"]
         return poses
 
     @property
     def place_street(self) -> Int32[NDArray[np.int32], " P"]:
-        """Number of each place's street; -1 for none."""
+        """Index of each place's street feature; -1 for none."""
         numbers: Int32[NDArray[np.int32], " P"] = self.places["street"]
         return numbers
 
     @property
     def view_place(self) -> Int32[NDArray[np.int32], " V"]:
-        """Place of each view."""
+        """Index of the place of each view."""
         numbers: Int32[NDArray[np.int32], " V"] = self.views["place"]
         return numbers
 
     @property
     def view_heading_rad(self) -> Float64[NDArray[np.float64], " V"]:
-        """Heading of each view in the map frame."""
+        """Heading of each view, radians, counter-clockwise from map x."""
         headings: Float64[NDArray[np.float64], " V"] = self.views["heading_rad"]
         return headings
 
     @property
     def earth(self) -> Georeference | None:
-        """Where the map lies on the Earth, where that is known."""
+        """WGS-84 position of the map's origin. None if the manifest has no georeference."""
         georeference = self.manifest.georeference
         return None if georeference is None else Georeference(**georeference)
 
     def encoder_bytes(self) -> bytes:
-        """The encoder that made the descriptors.
+        """Return the content of the encoder's ONNX file.
 
         Raises:
-            BundleError: the file has gone since the bundle was opened.
+            BundleError: the file cannot be read, for example because the bundle was removed after opening.
         """
         return _read(self.path / parts.ENCODER_FILE)
 
     def streets_geojson(self) -> bytes:
-        """The streets as they were given; an empty collection where the map has none."""
+        """Return the streets' GeoJSON as in the file, or an empty collection if the map has none."""
         if self.streets_document is None:
             return b'{"type": "FeatureCollection", "features": []}\n'
         return self.streets_document
@@ -139,7 +155,7 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
         try:
             size = file.stat().st_size
             found = sha256_of(file) if verify and size == entry.size else entry.sha256
-        except OSError as error:  # as when the bundle is being removed
+        except OSError as error:  # for example, somebody removes the bundle meanwhile
             raise _defect(file, f"it cannot be read ({error.strerror})") from error
         if size != entry.size:
             raise _defect(file, f"it has {size} bytes instead of {entry.size}")
@@ -152,7 +168,7 @@ def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
 def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
-    except OSError as error:  # as when the bundle is being removed
+    except OSError as error:  # for example, somebody removes the bundle meanwhile
         raise _defect(path, f"it cannot be read ({error.strerror})") from error
 
 

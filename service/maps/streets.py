@@ -1,4 +1,4 @@
-"""Street polygons of a map: which street, which section, which class of the paper's Table I."""
+"""Street polygons of a map. A polygon has a street, a section and a class of the paper's Table I."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -10,12 +10,22 @@ from numpy.typing import NDArray
 from service.errors import BundleError
 
 FILE = "streets.geojson"
-Ring = Float64[NDArray[np.float64], "_ 2"]  # rings of one street differ in length
+#: A ring of a polygon. ``_`` because the rings of one street differ in length.
+Ring = Float64[NDArray[np.float64], "_ 2"]
 
 
 @dataclass(frozen=True, slots=True)
 class Street:
-    """One feature of ``streets.geojson``: a street or a section of one."""
+    """One feature of ``streets.geojson``: a street or a section of a street.
+
+    Attributes:
+        id: id of the feature.
+        street: id of the street that the feature belongs to.
+        section: section of the street. None for a whole street.
+        name: name for people.
+        class_index: class of the paper's Table I. The default is the feature's index in the file.
+        polygons: rings of each polygon, x and y in the coordinates of the file.
+    """
 
     id: str
     street: str
@@ -25,12 +35,23 @@ class Street:
     polygons: tuple[tuple[Ring, ...], ...]
 
     def contains(self, position: Float64[NDArray[np.float64], "2"]) -> bool:
-        """Whether a point (in the polygons' own coordinates) lies inside; holes are outside."""
+        """Check whether a point lies inside a polygon. Holes are outside.
+
+        Args:
+            position: x, y in the coordinates of the polygons (map metres in a bundle).
+        """
         return any(sum(_inside(ring, position) for ring in rings) % 2 == 1 for rings in self.polygons)
 
 
 class Streets:
-    """The streets of a map, in the order of the file; other files refer to them by that index."""
+    """The streets of a map in the order of the file. Other files refer to a street by its index.
+
+    Args:
+        features: the streets.
+
+    Attributes:
+        features: the streets.
+    """
 
     def __init__(self, features: tuple[Street, ...]) -> None:
         self.features = features
@@ -45,8 +66,11 @@ class Streets:
     def from_geojson(cls, document: object) -> "Streets":
         """Read a FeatureCollection of Polygon and MultiPolygon features.
 
+        Args:
+            document: the parsed GeoJSON.
+
         Raises:
-            BundleError: a feature lacks a property or has another geometry; its number is named.
+            BundleError: the document is no FeatureCollection, or a feature is invalid. The message names the feature's index.
         """
         if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
             raise _defect("it is not a GeoJSON FeatureCollection")
@@ -56,12 +80,16 @@ class Streets:
         return cls(tuple(_street_from(feature, number) for number, feature in enumerate(features)))
 
     def index_at(self, position: Float64[NDArray[np.float64], "2"]) -> int:
-        """Index of the first street that contains a point; -1 where there is none."""
+        """Return the index of the first street that contains a point, or -1 if there is none.
+
+        Args:
+            position: x, y in the coordinates of the polygons (map metres in a bundle).
+        """
         return next((index for index, street in enumerate(self.features) if street.contains(position)), -1)
 
 
 def _inside(ring: Ring, position: Float64[NDArray[np.float64], "2"]) -> bool:
-    """Even-odd rule: a ray towards growing x crosses the ring an odd number of times."""
+    """Check whether a point lies inside a ring by the even-odd rule, with a ray towards positive x."""
     start, end = ring, np.roll(ring, -1, axis=0)
     spans = (start[:, 1] > position[1]) != (end[:, 1] > position[1])
     rise = np.where(spans, end[:, 1] - start[:, 1], 1.0)

@@ -1,4 +1,4 @@
-"""Write a map bundle whole or not at all."""
+"""Write a map bundle atomically."""
 
 import hashlib
 import json
@@ -23,18 +23,19 @@ from service.maps.manifest import FORMAT, Counts, FileEntry, GridParameters, Man
 
 
 def write_bundle(out: Path, content: BundleContent, *, overwrite: bool = False) -> Manifest:
-    """Write a bundle beside its final name, bring it to the disk, and rename it when it is whole.
+    """Write a bundle atomically and return its manifest.
 
-    A killed or failed writer leaves nothing under the final name (a kill leaves a folder ``.NAME.*.partial``, safe to
-    delete). With ``overwrite`` the old bundle is moved aside first and comes back if the last step fails.
+    The function writes to a temporary folder beside ``out``, flushes it to the disk and renames it. A failure leaves nothing
+    under the final name. A killed process leaves a folder ``.NAME.*.partial``, which is safe to delete. With ``overwrite``,
+    the old bundle is moved aside before the last rename. It is restored if the rename fails.
 
     Args:
         out: the bundle's folder.
         content: the map.
-        overwrite: replace a bundle of that name.
+        overwrite: replace an existing bundle.
 
     Raises:
-        BundleError: the path is taken, the content contradicts itself, or the disk refuses.
+        BundleError: the path exists, the content is inconsistent, or the file system reports an error.
     """
     if out.exists() and not overwrite:
         raise BundleError(f"{out}: there is something of that name already; choose another, or overwrite it")
@@ -133,7 +134,11 @@ def _counts_of(content: BundleContent) -> Counts:
 
 
 def _require_valid(content: BundleContent) -> None:
-    """Refuse what would be refused again on opening, before hours of work are on the disk."""
+    """Check the content before anything is written, because ``MapBundle.open`` would refuse the same errors.
+
+    Raises:
+        BundleError: the content is inconsistent.
+    """
     named = 0 if content.streets is None else len(streets.Streets.from_geojson(content.streets))
     if content.rows_seen.shape != (content.grid.rows,):
         what = f"rows_seen has {len(content.rows_seen)} entries for {content.grid.rows} rows"
@@ -159,13 +164,17 @@ def _require_valid(content: BundleContent) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """Hash of a file, read in pieces."""
+    """Return the hexadecimal SHA-256 of a file, without loading the whole file.
+
+    Args:
+        path: the file.
+    """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _sync(path: Path) -> None:
-    """Bring a file's or folder's content to the disk, so that no rename can overtake it."""
+    """Flush a file or folder to the disk, so that the content is there before a later rename."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
