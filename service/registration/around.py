@@ -1,7 +1,7 @@
-"""Other poses near a registered one that the points fit as well: noise makes a hollow of its own wherever it happens to agree.
+"""Search densely around a registered pose for other local minima.
 
-A search that starts metres apart ends in whichever hollow it meets first. So the answer's surroundings are searched once more, densely,
-and what cannot have moved says which of the poses found there are worth a closer look.
+Noisy depth creates local minima beside the right pose. A search from starts that are metres apart ends in the first one it meets.
+So the neighbourhood of the best pose is searched once more. Static points then rank the poses that this search finds.
 """
 
 from dataclasses import dataclass, replace
@@ -19,16 +19,17 @@ from service.registration.surfel_map import SurfelMap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AroundSettings:
-    """Ours, November 2026; chosen on a watch city.
+    """Settings of the local search, chosen on a validation city in November 2026.
 
     Attributes:
-        from_noise: of an inverse depth, 1/m, independent from pixel to pixel; of less noisy pictures 2 % move, so it is not worth the
-            time. What near pixels share, as in stereo matching, makes no such hollows: of KITTI's pairs it would move right poses away.
-        offsets: of the starts from the pose: along and across its heading, m, and turned, rad.
-        points: so many take part.
-        kept: poses that are worth a closer look, at most.
-        apart_m: two of them, or one and the pose itself, differ by this at least, turns counting by
-        arm_m: what a turn moves.
+        from_noise: least noise at which the search pays: standard deviation of an inverse depth, 1/m, independent from pixel to
+            pixel. With less noise only 2 % of the poses move. Errors that adjacent pixels share, as in stereo matching, create no
+            local minima. On KITTI the search would move right poses away (decision 0129).
+        offsets: of the starts from the pose: along its heading (m), across it (m), rotation about the vertical axis (rad).
+        points: largest number of points in the search.
+        kept: largest number of poses to return besides the given one.
+        apart_m: least distance between any two returned poses, m. Rotation is converted to metres by ``arm_m``.
+        arm_m: lever arm of a rotation, m.
     """
 
     from_noise: float = 1.2e-3
@@ -44,7 +45,12 @@ class AroundSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Near:
-    """A pose, and the share of inliers among the points of what cannot have moved."""
+    """A pose that the local search found.
+
+    Attributes:
+        pose: registered, map frame.
+        still: share of inliers among the static points, from 0 to 1.
+    """
 
     pose: Registered
     still: float
@@ -53,15 +59,18 @@ class Near:
 def poses_around(
     cloud: SurfelMap, points: QueryPoints, found: Registered, height_m: float, settings: RegistrationSettings, around: AroundSettings
 ) -> list[Near]:  # fmt: skip
-    """The pose itself, and the best of those around it that are another.
+    """Return the given pose and the best other poses around it.
 
     Args:
-        cloud: the map's.
-        points: of the query, its level frame.
-        found: the pose.
-        height_m: of the camera above the ground.
-        settings: as it was registered with.
-        around: where to search.
+        cloud: surfel map.
+        points: of the query, in its level frame. Static points have the largest weight.
+        found: the registered pose to search around, map frame.
+        height_m: height of the camera above the ground, m.
+        settings: the settings that registered ``found``.
+        around: settings of the local search.
+
+    Returns:
+        The given pose first, then at most ``around.kept`` others, those with the largest share of static inliers first.
     """
     states = np.zeros(1 + len(around.offsets), STATE)
     states["R"], states["t"] = found.R_map_level, found.camera_m - cloud.origin_m
@@ -81,7 +90,7 @@ def poses_around(
 
 
 def _distinct(states: NDArray[Any], still: Float64[NDArray[np.float64], " n"], around: AroundSettings) -> list[int]:
-    """The first state, and as many others as are kept, those with the largest share first."""
+    """Row of the first state, then rows of the others to keep, those with the largest share of static inliers first."""
     heading = np.unwrap(np.arctan2(states["R"][:, 1, 0], states["R"][:, 0, 0]))
     at = np.c_[states["t"], around.arm_m * heading]
     kept = [0]

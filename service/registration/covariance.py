@@ -1,4 +1,4 @@
-"""How well a registered pose is known: from the points' information and from how much the picture's patches disagree."""
+"""Covariance of a registered pose: from the information of its points and from the disagreement of the image's patches."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,27 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import rotation_z
 
-#: Of a precise camera, 1/m.
+#: Reference noise of the models: standard deviation of an inverse depth of a precise camera, 1/m.
 AT_NOISE = 0.00095
-#: The noises that the models were fitted for; beyond them the factors stay.
+#: Range of noise that the models were fitted for, 1/m. Noise outside this range is clipped.
 LEAST, MOST = 0.0006, 0.009
-#: What is known beside the measurements, weakly: position, height, tilt, heading, scale (log), disparity offset.
+#: Standard deviations of weak priors: x and y (m), z (m), roll and pitch (rad), heading (rad), log scale, disparity offset (px).
 _PRIOR_SIGMA = np.array([30.0, 30.0, 0.3, *np.deg2rad([2.0, 2.0, 10.0]), 0.01, 0.3])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CovarianceModel:
-    """How many times more than it says each part of a pose's doubt is.
+    """Inflation factors of the covariance.
+
+    Each factor multiplies standard deviations. Decision 0037 explains the two parts of the covariance.
 
     Attributes:
-        independent: standard deviations of what measures on its own, at ``AT_NOISE``;
-        independent_power: of the noise over ``AT_NOISE`` that this goes by.
-        shared: standard deviations of what patches err on their own.
-        axes: factors along the view, across it, of height, of turns about these (roll, pitch, heading), at ``AT_NOISE``;
-        axes_power: of the noise, likewise.
-        floor: no deviation is less: x, y, z (m), roll, pitch, heading (degrees).
+        independent: factor of the part with independent errors, at ``AT_NOISE``.
+        independent_power: exponent of (noise / ``AT_NOISE``) in that factor.
+        shared: factor of the part with errors that the pixels of a patch share.
+        axes: six factors at ``AT_NOISE``: along the view, across it, height, and rotations about these axes (roll, pitch, heading).
+        axes_power: exponents of (noise / ``AT_NOISE``) in the factors ``axes``.
+        floor: least standard deviations: x, y, z (m), roll, pitch, heading (degrees).
     """
 
     independent: float
@@ -37,12 +39,12 @@ class CovarianceModel:
     floor: tuple[float, ...]
 
 
-#: Fitted on calibration cities (decision log): of registered points,
+#: Model for poses that ``register`` found from points. Fitted on calibration cities (decisions 0042 and 0081).
 OF_POINTS = CovarianceModel(
     independent=2.25, independent_power=0.52, shared=2.4, axes=(1.0, 1.0, 1.12, 0.8, 0.8, 1.0),
     axes_power=(0.0, 0.0, -0.3, -0.22, -0.22, 0.03), floor=(0.025, 0.025, 0.017, 0.03, 0.03, 0.05),
 )  # fmt: skip
-#: and of rays.
+#: Model for poses that ``adjust`` refined along the rays. Fitted on calibration cities (decisions 0098 and 0100).
 OF_RAYS = CovarianceModel(
     independent=1.17, independent_power=0.52, shared=2.97, axes=(1.42, 0.91, 0.73, 0.8, 0.8, 1.05),
     axes_power=(0.05, 0.0, -0.18, -0.22, -0.22, -0.04), floor=(0.022, 0.022, 0.0175, 0.028, 0.028, 0.01),
@@ -53,16 +55,18 @@ def covariance_of(
     information: Float64[NDArray[np.float64], "8 8"], scatter: Float64[NDArray[np.float64], "8 8"], noise: float, heading_rad: float,
     model: CovarianceModel,
 ) -> Float64[NDArray[np.float64], "6 6"]:  # fmt: skip
-    """Covariance of translation (m) and rotation (rad), map axes, about the camera's centre; translation first.
+    """Compute the covariance of a pose: translation (m), then rotation (rad), in map axes about the camera's centre.
 
-    Scale and disparity offset are unknowns like the others: what they cost the pose in certainty is in it.
+    The first part is a sandwich estimate (White, Econometrica 48, 1980): inverse information, scatter, inverse information.
+    The second part is the inverse of the information after division by the squared factor ``independent``.
+    Scale and disparity offset are marginalised.
 
     Args:
-        information: of the measurements, without priors: translation, rotation, log scale, disparity offset.
-        scatter: of the patches' pulls, as in ``scatter_of``.
+        information: of the measurements, without priors. Order: translation (m), rotation (rad), log scale, disparity offset (px).
+        scatter: scatter of the patches' gradients in the same order, as ``scatter_of`` or ``adjust`` returns it.
         noise: standard deviation of one pixel's inverse depth, 1/m.
-        heading_rad: of the view, map frame.
-        model: of what was minimised.
+        heading_rad: heading of the view in the map frame, rad.
+        model: ``OF_POINTS`` or ``OF_RAYS``, as the pose was found.
     """
     ratio = float(np.clip(noise, LEAST, MOST)) / AT_NOISE
     prior = np.diag(_PRIOR_SIGMA**-2.0)

@@ -1,8 +1,8 @@
-/* Weighted, robust point-to-plane registration of a depth picture against a prepared surfel map; see kernel.py.
+/* Weighted, robust point-to-plane registration of a depth image on a prepared surfel map; see kernel.py.
  *
- * Unknowns, in this order: translation (3), rotation (3, left increment), log scale, disparity offset. A point p of the
- * query (level frame, origin at the camera) stands at  y = s p / (1 + o q)  where q is its depth over focal length times
- * baseline; the world point is R y + t. Plain C without global state: callable from several threads at once.
+ * Unknowns, in this order: translation (3), rotation (3, left increment), log scale, disparity offset. A point p of the query is in
+ * its level frame, with the camera at the origin. The corrected point is  y = s p / (1 + o q),  q = depth / (focal length x baseline).
+ * Its position in the surfels' frame is R y + t. Plain C without global state, so several threads may call it at once.
  */
 #include <math.h>
 #include <stdint.h>
@@ -16,44 +16,44 @@
 #define BLOCK_CELLS (BLOCK * BLOCK * BLOCK)
 
 typedef struct {
-    double ox, oy, oz, cell;     /* corner of the grid, metres; edge of a cell */
-    int64_t bx, by, bz;          /* blocks along each axis */
-    const int32_t *block;        /* (bx, by, bz): number of a block, -1 for none */
-    const int32_t *nearest;      /* (blocks, 512): surfel nearest to the cell's centre, -1 for none */
+    double ox, oy, oz, cell;     /* corner of the grid and edge of a cell, m */
+    int64_t bx, by, bz;          /* number of blocks along each axis */
+    const int32_t *block;        /* (bx, by, bz): row of each block in nearest, -1 for none */
+    const int32_t *nearest;      /* (blocks, 512): index of the surfel nearest to the cell's centre, -1 for none */
 } Grid;
 
-/* Each array has room for a whole number of batches (AHEAD); what is beyond count is zero. */
+/* Each array is padded with zeros to whole batches (AHEAD). */
 typedef struct {
     int64_t count;
-    const float *xyz[3]; /* level frame */
-    const float *ray[3]; /* unit */
-    const float *sigma;  /* standard deviation along the ray, metres */
-    const float *weight; /* share of the information that a point brings */
-    const float *q;      /* depth / (focal x baseline); 0: no disparity offset */
+    const float *xyz[3]; /* level frame, m */
+    const float *ray[3]; /* unit vectors from the camera, level frame */
+    const float *sigma;  /* standard deviation along the ray, m */
+    const float *weight; /* factor of a point's information */
+    const float *q;      /* depth / (focal length x baseline), 1/px; 0: no disparity offset */
 } Query;
 
 typedef struct {
     int64_t iterations;
-    double reach;             /* m */
-    double robust_first, robust_last; /* m, width of the robust kernel: from wide to narrow */
-    double surface;           /* m, roughness of any surface */
-    double prior_weight;      /* information of the priors, in points */
-    double tilt, height, position, scale, offset; /* standard deviations of the priors: rad, m, m, log, px m / (f b) */
+    double reach;             /* largest distance between a point and its surfel, m */
+    double robust_first, robust_last; /* width of the robust kernel in the first and in the last iteration, m */
+    double surface;           /* roughness of all surfaces, m */
+    double prior_weight;      /* information of the priors, as a share of the summed weight of all points */
+    double tilt, height, position, scale, offset; /* standard deviations of the priors: rad, m, m, log scale, px */
     double free_scale, free_offset; /* 0 or 1 */
 } Options;
 
 typedef struct {
     double R[9], t[3], log_scale, offset;
-    double anchor[3], up[3]; /* where the priors expect the camera, and the normal of the ground there */
+    double anchor[3], up[3]; /* mean of the priors of position and height (surfels' frame, m); normal of the ground there */
     double information[UNKNOWNS * UNKNOWNS];
     double inliers, seen, weight;
 } State;
 
-#define HEIGHT 60.0 /* m */
-#define AHEAD 32 /* points whose memory is fetched together: one by one, most of the time would go into waiting for it */
-#define LANES 8  /* sums that run side by side; the same on every machine, so that all get the same answer */
+#define HEIGHT 60.0 /* m: how far surfaces may rise above or fall below the camera (streetfix_render) */
+#define AHEAD 32 /* points per batch; their memory is prefetched together, or the kernel would mostly wait for memory (decision 0025) */
+#define LANES 8  /* partial sums side by side; the same number on every machine, so all machines give the same answer */
 
-/* Cholesky solution of A x = b in place; 0 where A is not positive definite. */
+/* Solves A x = b in place by Cholesky decomposition; returns 0 if A is not positive definite. */
 static int solve(double A[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])
 {
     for (int j = 0; j < UNKNOWNS; j++) {
@@ -74,6 +74,7 @@ static int solve(double A[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])
     return 1;
 }
 
+/* R <- exp(w) R by Rodrigues' formula. One step rotates by at most 0.1 rad. */
 static void turn_left(double R[9], const double w_in[3])
 {
     double w[3] = {w_in[0], w_in[1], w_in[2]};
@@ -98,14 +99,14 @@ static void turn_left(double R[9], const double w_in[3])
     memcpy(R, out, sizeof out);
 }
 
-/* Points of a query side by side, from where they stand to what they tell. */
+/* A batch of points: their positions, surfels, gradients, residuals and weights. */
 typedef struct {
-    double y[3][AHEAD], at[3][AHEAD], stretch[AHEAD]; /* turned into the map's axes; in the map */
-    const Surfel *found[AHEAD];
-    double gr[UNKNOWNS][AHEAD], r[AHEAD], w[AHEAD], known[AHEAD]; /* gradient of the residual, residual, weight; 1 on a surface */
+    double y[3][AHEAD], at[3][AHEAD], stretch[AHEAD]; /* R y, and R y + t (surfels' frame, m); s / (1 + o q) */
+    const Surfel *found[AHEAD];                       /* 0 for none */
+    double gr[UNKNOWNS][AHEAD], r[AHEAD], w[AHEAD], known[AHEAD]; /* gradient of the residual, residual, weight; 1: surfel in reach */
 } Batch;
 
-/* Points first .. first + count - 1 as they stand in the map, and their nearest surfels. */
+/* Positions of the points first .. first + count - 1 in the surfels' frame, and their nearest surfels. */
 static inline void look_up(const Grid *g, const Surfel *surfels, const Query *q, const State *s, double e_scale, int64_t first,
                            int64_t count, Batch *b)
 {
@@ -120,7 +121,8 @@ static inline void look_up(const Grid *g, const Surfel *surfels, const Query *q,
             b->at[a][k] = b->y[a][k] + s->t[a];
         }
     }
-    /* What is not negative may be cut off instead of rounded down; what lies beyond the grid, or is no number, is none of its cells. */
+    /* For values >= 0 truncation equals floor(), which is a slow call on plain x86-64 (decision 0025). Values outside the grid and NaN
+     * become -2, which is no cell. */
     const double origin[3] = {g->ox, g->oy, g->oz}, scale = 1.0 / g->cell;
     for (int a = 0; a < 3; a++)
         for (int k = 0; k < AHEAD; k++) {
@@ -146,14 +148,15 @@ static inline void look_up(const Grid *g, const Surfel *surfels, const Query *q,
     for (int64_t k = count; k < AHEAD; k++) b->found[k] = 0;
 }
 
-/* The camera stands at its height above the anchor's ground, upright on it; scale and offset are small. */
+/* Adds the priors: position and height near the anchor, upright on the ground, log scale and disparity offset near 0. ``n`` is the summed
+ * weight of all points. A fixed scale or offset gets a unit equation with the solution 0. */
 static void add_priors(const Options *o, const State *s, double n, double H[UNKNOWNS][UNKNOWNS], double b[UNKNOWNS])
 {
     double p = o->prior_weight * n;
     double position = p / (o->position * o->position), height = p / (o->height * o->height);
     double tilt = p / (o->tilt * o->tilt), scale = p / (o->scale * o->scale), offset = p / (o->offset * o->offset);
     double leans[3] = {s->R[2], s->R[5], s->R[8]}, away[3], above = 0;
-    /* The turn that takes the query's up onto the ground's normal is their cross product. */
+    /* To first order, this cross product is the rotation from the query's up axis to the ground's normal. */
     double turn[3] = {leans[1] * s->up[2] - leans[2] * s->up[1], leans[2] * s->up[0] - leans[0] * s->up[2],
                       leans[0] * s->up[1] - leans[1] * s->up[0]};
     for (int k = 0; k < 3; k++) {
@@ -181,7 +184,7 @@ static void add_priors(const Options *o, const State *s, double n, double H[UNKN
         }
 }
 
-/* What points tell: their residuals' gradients, the residuals, their weights; 0 where no surface is within reach. */
+/* Computes gradients, residuals and weights of a batch. The weight is 0 if no surfel is in reach. */
 static inline void tell(const Query *q, const Options *o, const State *s, double robust, double e_scale, int64_t first, Batch *b)
 {
     double n[3][AHEAD], off[3][AHEAD], thickness[AHEAD];
@@ -190,7 +193,7 @@ static inline void tell(const Query *q, const Options *o, const State *s, double
         b->known[k] = m != 0;
         if (!m) {
             n[0][k] = n[1][k] = off[0][k] = off[1][k] = off[2][k] = 0;
-            n[2][k] = thickness[k] = 1; /* so that no variance is 0 */
+            n[2][k] = thickness[k] = 1; /* avoids a variance of 0 */
             continue;
         }
         n[0][k] = m->normal[0], n[1][k] = m->normal[1], n[2][k] = m->normal[2];
@@ -215,15 +218,16 @@ static inline void tell(const Query *q, const Options *o, const State *s, double
         b->gr[5][k] = y0 * ny - y1 * nx;
         b->gr[6][k] = along_y;
         b->gr[7][k] = -along_y * depth[k] * b->stretch[k] / e_scale;
-        /* A triangulating camera errs evenly in 1 / range. Its noise must be told from the range where the ray meets the surface:
-         * by the measured one, what is seen too near counts as well measured and pulls everything its way. */
+        /* The error of a triangulating camera is uniform in 1 / range. So the variance is taken at the range where the ray intersects the
+         * surface. At the measured range, points measured too near would count as well measured and bias the pose (decision 0036). */
         double ratio = 1 - r / (along_y != 0 ? along_y : 1);
         ratio = along_y != 0 ? ratio : 1;
         ratio = ratio < 0.5 ? 0.5 : ratio;
         ratio = ratio > 2 ? 2 : ratio;
         const double along = sigma[k] * c;
         const double variance = along * along * ratio * ratio * ratio + surface2 + thickness[k] * thickness[k];
-        /* The weight is odd in the error of 1 / range by the third power, the robust kernel even in it by the second. */
+        /* The weight needs ratio^3, like the gradient in 1 / range. The robust width needs ratio^2, which is even in the error of
+         * 1 / range. With ratio^3 the kernel is too slow to reject points that are measured too near (decision 0081). */
         const double even = along * along * ratio * ratio + surface2 + thickness[k] * thickness[k];
         const double k2 = 4 * even + robust2, damp = k2 / (k2 + r * r);
         b->r[k] = r;
@@ -284,7 +288,8 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
     }
 }
 
-/* Share of the query's weight that lies on the map: weighted by how well each point is measured, softly cut. */
+/* Share of the points on the map. Precise points weigh more. A point counts by exp(-r^2 / (2 variance)) of its distance r to the surface,
+ * not by a hard threshold. */
 static inline void score_one(const Grid *g, const Surfel *surfels, const Query *q, double tolerance, double height_min, State *s)
 {
     Batch batch;
@@ -322,7 +327,7 @@ WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, 
     }
 }
 
-/* The pull (weight times residual times gradient) of each patch of the picture at a pose, summed: (patches, 8), zero at first. */
+/* Adds weight x residual x gradient of all points of each patch to ``pulls`` (patches, 8), which the caller sets to 0. */
 void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch, double *pulls)
 {
     Batch batch;
@@ -337,7 +342,7 @@ void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const
     }
 }
 
-/* Blocks that any surfel's reach touches get marked 1 in ``mark`` (bx, by, bz). */
+/* Sets ``mark`` (bx, by, bz) to 1 for all blocks that the cube of +-``reach`` around a surfel touches. */
 void streetfix_mark(const Grid *g, const Surfel *surfels, int64_t count, double reach, uint8_t *mark)
 {
     double edge = g->cell * BLOCK;
@@ -355,7 +360,8 @@ void streetfix_mark(const Grid *g, const Surfel *surfels, int64_t count, double 
     }
 }
 
-/* Fill ``nearest`` (all -1) and ``distance2`` (all large): for every cell within reach the surfel nearest to its centre. */
+/* Writes to ``nearest`` the index of the surfel nearest to each cell's centre within reach, and to ``distance2`` its squared distance. The
+ * caller sets ``nearest`` to -1 and ``distance2`` to a large value. */
 void streetfix_fill(const Grid *g, const Surfel *surfels, int64_t count, double reach, int32_t *nearest, float *distance2)
 {
     const double o[3] = {g->ox, g->oy, g->oz};
@@ -383,8 +389,8 @@ void streetfix_fill(const Grid *g, const Surfel *surfels, int64_t count, double 
     }
 }
 
-/* Depth (z, metres) that a camera would see of the surfels, each a small square facing the camera; 1e9 where nothing is.
- * ``tiles`` (n, 4): centre x, y, first surfel, count; tiles beyond reach are not looked at. R and t are T_map_camera. */
+/* Renders the depth (z, m) of the surfels, each a small square that faces the camera; 1e9 where nothing is mapped. ``tiles`` (n, 4):
+ * centre x, y, first surfel, number of surfels. Tiles beyond ``tile_reach`` are skipped. R and t are T_map_camera. */
 void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_count, double tile_reach, const double *R,
                       const double *t, double fx, double fy, double cx, double cy, int64_t width, int64_t height,
                       double half_size, double reach, float *depth)
@@ -399,7 +405,7 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
         const double *tile = tiles + 4 * n;
         double ex = tile[0] - t[0], ey = tile[1] - t[1];
         if (hypot(ex, ey) > tile_reach) continue;
-        /* Tiles beside and behind the field of view; HEIGHT is how far surfaces may rise above or fall below the camera. */
+        /* Skip tiles beside and behind the field of view. */
         double ahead = R[2] * ex + R[5] * ey, beside = R[0] * ex + R[3] * ey;
         double half = tile_reach - reach + HEIGHT * fabs(R[8]), wide = tile_reach - reach + HEIGHT * fabs(R[6]);
         if (ahead < -half || beside - right * ahead > hypot(1, right) * fmax(half, wide) ||
@@ -428,15 +434,16 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
 }
 
 typedef struct {
-    double hit, new, gone, any;  /* shares of the beam model */
-    double rough_m, span_m;
-    double certain, margin_m;    /* standard deviations, m */
-    double nothing_m;            /* how far an empty pixel is taken to be */
-    double scale, offset;        /* of the pose */
+    double hit, new, gone, any;  /* weights of the beam model's components */
+    double rough_m, span_m;      /* roughness of surfaces; length over which gone and any are uniform */
+    double certain, margin_m;    /* a point is off the surface beyond certain x sigma + margin_m */
+    double nothing_m;            /* depth assumed for an empty pixel */
+    double scale, offset;        /* registered with the pose */
 } Beam;
 
-/* How points of a query agree with a picture of the map: at: pixel of each; z, sigma: depth along the axis and its deviation; q: as in
- * Query. found: sum of the logarithms of the density, and numbers of points seen through, in front of, and off the map. */
+/* Compares measured depths with a rendered depth image. at: index of each point's pixel; z, sigma: depth along the optical axis and its
+ * standard deviation; q: as in Query. found: sum of the logarithms of the density, then the numbers of points behind the map's surfaces,
+ * in front of them, and where nothing is mapped. Surfaces are those of the 3 x 3 pixels around a point's own. */
 void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t count, const int32_t *at, const double *z,
                      const double *sigma, const float *q, const Beam *o, double *found)
 {
@@ -468,7 +475,7 @@ void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t 
     found[3] = unmapped;
 }
 
-/* Compared with Python's structures when the library is loaded. */
+/* service/compiled.py compares this table with Python's structures when it loads the library. */
 const LayoutEntry streetfix_layout[] = {
     SURFEL_LAYOUT,
     LAYOUT_STRUCT(Grid), LAYOUT_FIELD(Grid, ox), LAYOUT_FIELD(Grid, oy), LAYOUT_FIELD(Grid, oz),

@@ -1,4 +1,7 @@
-"""The compiled kernel, called through ctypes: no Python API, so one build serves every Python, and no lock is held while it runs."""
+"""Call the compiled registration kernel (``kernel.c``) through ctypes.
+
+The library uses no Python API, so one build serves every Python version. The global interpreter lock is released while it runs.
+"""
 
 import ctypes
 from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
@@ -14,14 +17,17 @@ from numpy.typing import NDArray
 from service.compiled import load
 from service.geometry.camera import PinholeCamera
 
-UNKNOWNS = 8  # translation, rotation, log scale, disparity offset
+#: Unknowns of the solver: translation (3), rotation (3), log scale, disparity offset.
+UNKNOWNS = 8
+#: Cells along the edge of a grid block.
 BLOCK = 8
-AHEAD = 32  # points that the kernel works on side by side
+#: Points in a batch of the kernel. Arrays of points are padded to whole batches.
+AHEAD = 32
 LIBRARY = Path(__file__).with_name("_kernel.so")
 
-#: A surface element: position relative to the grid's origin, unit normal, thickness across the surface (m), points.
+#: A surfel: position (m, surfels' frame), unit normal, thickness across the surface (m), number of survey points.
 SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
-#: What the kernel keeps of one start: pose of the level frame, scale, offset, information, score.
+#: State of one start: pose of the level frame, scale, offset, centre and up axis of the priors, information, score.
 STATE = np.dtype(
     [("R", "<f8", (3, 3)), ("t", "<f8", (3,)), ("log_scale", "<f8"), ("offset", "<f8"), ("anchor", "<f8", (3,)), ("up", "<f8", (3,)),
      ("information", "<f8", (UNKNOWNS, UNKNOWNS)),
@@ -47,18 +53,20 @@ class _Options(Structure):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamModel:
-    """What a camera sees of a mapped scene that may have changed.
+    """Mixture model of a measured depth, given the mapped depth of its pixel.
+
+    Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 6.3.
 
     Attributes:
-        hit: share of the rays that meet the mapped surface.
-        new: share that something new stops before it.
-        gone: share that goes on behind it.
-        any: share that says nothing.
-        rough_m: roughness of surfaces.
-        span_m: over which what is gone, or says nothing, is spread.
-        certain: standard deviations, and
-        margin_m: metres beyond which a point lies off the surface.
-        nothing_m: how far a surface is taken to be where the map shows none.
+        hit: weight of rays that end on the mapped surface (normal distribution).
+        new: weight of rays that end before it, on a new object (uniform from the camera to the surface).
+        gone: weight of rays that end behind it, because an object is gone (uniform over ``span_m``).
+        any: weight of outliers at any depth (uniform over ``span_m``).
+        rough_m: standard deviation of the surfaces' roughness, m.
+        span_m: length over which ``gone`` and ``any`` are uniform, m.
+        certain: a point is off the surface beyond ``certain`` x its standard deviation + ``margin_m``.
+        margin_m: constant part of that threshold, m.
+        nothing_m: depth assumed for pixels where the map shows no surface, m.
     """
 
     hit: float
@@ -74,7 +82,23 @@ class BeamModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolverOptions:
-    """One run of the solver; metres and radians. Names as in ``kernel.c``."""
+    """Options of one run of the solver. Names as in ``kernel.c``.
+
+    Attributes:
+        iterations: Gauss-Newton steps; 0 only scores.
+        reach: largest distance between a point and its surfel, m.
+        robust_first: width of the robust kernel in the first iteration, m.
+        robust_last: width in the last iteration, m. The width falls geometrically in between.
+        surface: roughness of all surfaces, m.
+        prior_weight: information of the priors, as a share of the summed weight of all points.
+        tilt: standard deviation of the prior of roll and pitch, rad.
+        height: standard deviation of the prior of height, m.
+        position: standard deviation of the prior of position along the ground, m.
+        scale: standard deviation of the prior of the log scale.
+        offset: standard deviation of the prior of the disparity offset, px.
+        free_scale: estimate the scale; otherwise it stays at its start.
+        free_offset: estimate the disparity offset; otherwise it stays at its start.
+    """
 
     iterations: int
     reach: float
@@ -124,13 +148,13 @@ def _library() -> ctypes.CDLL:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestGrid:
-    """For every cell near a surface the surfel nearest to its centre, in blocks of 8 x 8 x 8 cells; may be memory-mapped.
+    """Lookup grid of the surfel nearest to each cell's centre, in blocks of 8 x 8 x 8 cells; may be memory-mapped.
 
     Attributes:
-        origin_m: corner of the grid in the surfels' frame.
-        cell_m: edge of a cell.
-        block: number of each block, -1 where no surface is near.
-        nearest: of each cell of each block, -1 where no surface is near.
+        origin_m: corner of the grid in the surfels' frame, m.
+        cell_m: edge of a cell, m.
+        block: row of each block in ``nearest``; -1 where no surface is near.
+        nearest: index of the surfel nearest to each cell of each block; -1 where no surface is near.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
@@ -147,11 +171,11 @@ class QueryPoints:
     """Points of a query in its level frame, the camera at the origin.
 
     Attributes:
-        xyz: metres.
-        ray: unit vectors from the camera.
-        sigma: standard deviation along the ray, metres.
-        weight: share of the information that each brings.
-        q: depth / (focal length x baseline); 0 where the camera knows no disparity offset.
+        xyz: position, m.
+        ray: unit vectors from the camera to the points.
+        sigma: standard deviation along the ray, m.
+        weight: factor of each point's information.
+        q: depth / (focal length x baseline), 1/px; 0 for a camera without a disparity offset.
     """
 
     xyz: Float32[NDArray[np.float32], "n 3"]
@@ -164,15 +188,27 @@ class QueryPoints:
         return len(self.sigma)
 
     def weighing_at_least(self, weight: float) -> "QueryPoints":
-        """The same points, none of less weight."""
+        """Raise smaller weights to a lower limit; all else stays.
+
+        Args:
+            weight: least weight of a point.
+        """
         return QueryPoints(self.xyz, self.ray, self.sigma, np.maximum(self.weight, np.float32(weight)), self.q)
 
     def thinned(self, count: int) -> "QueryPoints":
-        """At most so many of the points, evenly spread over their order."""
+        """Select points that are evenly spread over their order.
+
+        Args:
+            count: largest number of points.
+        """
         return self.subset(np.linspace(0, len(self) - 1, min(count, len(self))).astype(np.intp))
 
     def subset(self, rows: NDArray[np.intp]) -> "QueryPoints":
-        """Some of the points."""
+        """Select points by their indices.
+
+        Args:
+            rows: indices of the points, of shape (m,).
+        """
         return QueryPoints(*(np.ascontiguousarray(getattr(self, name)[rows]) for name in self.__slots__))
 
 
@@ -180,7 +216,19 @@ def align(
     grid: NearestGrid, surfels: NDArray[Any], query: QueryPoints, states: NDArray[Any], options: SolverOptions, *,
     tolerance_m: float = 0.1, height_min_m: float = -1e9,
 ) -> None:  # fmt: skip
-    """Move every start (``STATE``, in place) onto the map and score it; ``iterations`` 0 scores alone."""
+    """Register every start on the map in place, then score it.
+
+    The solver minimises weighted, robust point-to-plane distances (Gauss-Newton, Geman-McClure kernel).
+
+    Args:
+        grid: lookup grid of the map.
+        surfels: of the map, (S,) of ``SURFEL``.
+        query: points of the query.
+        states: the starts, (n,) of ``STATE``; overwritten with the results.
+        options: of the solver; with 0 ``iterations`` the states are only scored.
+        tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise.
+        height_min_m: points lower than this do not count in the score, m. Heights are relative to the camera, along the map's z axis.
+    """
     points, given = _as_c(query, options)
     _library().streetfix_align(
         byref(grid._as_c()), surfels.ctypes.data, byref(points), byref(given), tolerance_m, height_min_m, len(states), states.ctypes.data
@@ -191,15 +239,15 @@ def pulls(
     grid: NearestGrid, surfels: NDArray[Any], query: QueryPoints, state: NDArray[Any], options: SolverOptions,
     patch: Int32[NDArray[np.int32], " n"],
 ) -> Float64[NDArray[np.float64], "B 8"]:  # fmt: skip
-    """Which way each patch of a picture would move a pose: gradients of its points, each by its residual and weight, summed.
+    """Sum the gradients of each patch's points at a pose: weight x residual x derivative by the eight unknowns.
 
     Args:
-        grid: of the map.
-        surfels: of the map.
-        query: its points.
-        state: one ``STATE``.
-        options: as in the last iteration.
-        patch: of each point, from 0 without gaps.
+        grid: lookup grid of the map.
+        surfels: of the map, (S,) of ``SURFEL``.
+        query: points of the query.
+        state: the pose, (1,) of ``STATE``.
+        options: of the solver. The robust kernel has the width of the last iteration.
+        patch: number of each point's patch, counted from 0 without gaps.
     """
     found = np.zeros((int(patch.max(initial=-1)) + 1, UNKNOWNS))
     points, given = _as_c(query, options)
@@ -222,12 +270,18 @@ def _as_c(query: QueryPoints, options: SolverOptions) -> tuple[_Query, _Options]
         planes[rows, : len(query)] = values
     at = [planes.ctypes.data + number * planes.strides[0] for number in range(len(planes))]
     points = _Query(len(query), (c_void_p * 3)(*at[:3]), (c_void_p * 3)(*at[3:6]), *at[6:])
-    points.planes = planes  # lives as long as what points there
+    points.planes = planes  # keeps the memory alive as long as the pointers to it
     return points, given
 
 
 def nearest_grid(surfels: NDArray[Any], *, cell_m: float, reach_m: float) -> NearestGrid:
-    """Prepare the grid of a map; done once, when the map is built."""
+    """Build the lookup grid of a map, once per map build.
+
+    Args:
+        surfels: of the map, (S,) of ``SURFEL``.
+        cell_m: edge of a cell, m.
+        reach_m: largest distance from a surfel to the centre of a cell that refers to it, m.
+    """
     low, high = surfels["xyz"].min(axis=0).astype(np.float64), surfels["xyz"].max(axis=0).astype(np.float64)
     origin = low - reach_m - 2 * cell_m
     shape = np.ceil((high + reach_m + 2 * cell_m - origin) / (BLOCK * cell_m)).astype(int) + 1
@@ -248,16 +302,16 @@ def render(
     surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"], *, tile_m: float, T_map_camera: Float64[NDArray[np.float64], "4 4"],
     camera: PinholeCamera, size_m: float, reach_m: float,
 ) -> Float32[NDArray[np.float32], "H W"]:  # fmt: skip
-    """Depth (z, metres; 0 where nothing is mapped) that a camera would see of the surfels.
+    """Render the depth image that a camera would see of the surfels: z in metres, 0 where nothing is mapped.
 
     Args:
-        surfels: sorted by tile.
-        tiles: centre x, y (the surfels' frame, m), first surfel, count.
-        tile_m: edge of a tile.
-        T_map_camera: in the surfels' frame.
-        camera: of the picture wanted; a small one.
-        size_m: edge of the square that stands for a surfel.
-        reach_m: nothing further is drawn.
+        surfels: of the map, (S,) of ``SURFEL``, sorted by tile.
+        tiles: centre x, y (surfels' frame, m), first surfel, number of surfels.
+        tile_m: edge of a tile, m.
+        T_map_camera: pose of the camera in the surfels' frame.
+        camera: intrinsics of the rendered image, a small one.
+        size_m: edge of the square that represents a surfel, m.
+        reach_m: surfels beyond this depth are not rendered, m.
     """
     depth = np.empty((camera.height, camera.width), np.float32)
     R, t = np.ascontiguousarray(T_map_camera[:3, :3]), np.ascontiguousarray(T_map_camera[:3, 3])
@@ -273,21 +327,24 @@ def agree(
     drawn: Float32[NDArray[np.float32], "H W"], pixel: Int32[NDArray[np.int32], " n"], z: Float64[NDArray[np.float64], " n"],
     sigma: Float64[NDArray[np.float64], " n"], q: Float32[NDArray[np.float32], " n"], model: BeamModel, *, scale: float, offset: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """How at least one point agrees with a picture of the map (``render``).
+    """Compare measured depths with a depth image of the map (``render``).
 
     Args:
-        drawn: depth, metres; 0 where nothing is mapped.
-        pixel: of each point, row by row.
-        z: depth of each along the optical axis, metres.
-        sigma: its standard deviation, metres.
-        q: as in ``QueryPoints``.
-        model: of what is seen.
-        scale: of the depth, as registered.
-        offset: of the disparity, as registered.
+        drawn: rendered depth, m; 0 where nothing is mapped.
+        pixel: index of each point's pixel, counted row by row.
+        z: measured depth of each point along the optical axis, m.
+        sigma: standard deviation of ``z``, m.
+        q: as in ``QueryPoints``, 1/px.
+        model: mixture model of the measured depth.
+        scale: registered scale of the measured depth.
+        offset: registered disparity offset, px.
 
     Returns:
-        Mean logarithm of the density (1/m); shares of the points behind the surfaces around their pixels, before them, and where
-        nothing is mapped.
+        Mean logarithm of the density (1/m), then three shares of the points: behind the map's surfaces, in front of them, and where
+        nothing is mapped. The surfaces of a point are those of the 3 x 3 pixels around its own.
+
+    Raises:
+        ValueError: there is no point, the arrays differ in length, or a pixel lies outside the image.
     """
     count = len(pixel)
     if (

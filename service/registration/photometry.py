@@ -1,10 +1,12 @@
-"""Do the map's brightness, as a pose shows it, and the picture's vary together?
+"""Score a pose by the patch-wise squared correlation of LiDAR intensity and image grey level.
 
-A LiDAR's returns and a picture do not share a scale, nor even a sign: leaves are bright in the infrared, a wall that is darker than its
-neighbour to the eye may be brighter to the laser. But where one changes, the other mostly does: panes, frames, kerbs, doors, posters. So
-what counts is how well either can be told from the other within a patch, whatever the sign: the squared correlation, patch by patch.
-It knows nothing of depth, which is why it tells poses apart that depth cannot. (Mutual information does so for whole pictures: Pandey
-et al., "Automatic Targetless Extrinsic Calibration", AAAI 2012; patches were better here, see the decision log.)
+LiDAR intensity and grey level share neither scale nor sign. Leaves are bright in the infrared. A wall that looks darker than its
+neighbour may be brighter to the laser. But both mostly change at the same edges: panes, frames, kerbs, doors, posters. The squared
+correlation within a patch measures this and ignores the sign. The score does not use depth. So it distinguishes poses that depth
+cannot distinguish.
+
+Pandey et al., "Automatic Targetless Extrinsic Calibration", AAAI 2012, use mutual information of whole images. Patches were better
+here (decision 0100).
 """
 
 from dataclasses import dataclass
@@ -19,14 +21,14 @@ from service.geometry.camera import PinholeCamera
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotometrySettings:
-    """Ours, November 2026; chosen on a watch city.
+    """Settings of the brightness score, chosen on a validation city in November 2026 (decision 0100).
 
     Attributes:
-        patch: pixels of the small picture along the edge of a patch.
-        known: share of a patch's pixels that must show a surfel with a brightness.
-        flat: deviation of the logarithm of a brightness within a patch that is taken for its noise.
-        dark_grey: grey levels (of 255) below which the logarithm of the picture levels off;
-        dark_share: and of the map, in means of what is in view.
+        patch: edge of a patch, pixels of the small image.
+        known: least share of a patch's pixels that show a surfel with a brightness.
+        flat: standard deviation of the noise of a logarithmic brightness within a patch.
+        dark_grey: added to grey levels (0 to 255) before the logarithm, which levels off below this value.
+        dark_share: the same for the map's brightness, as a share of its mean over the pixels in view.
     """
 
     patch: int = 8
@@ -39,13 +41,13 @@ class PhotometrySettings:
 def grey_of(
     rgb: UInt8[NDArray[np.uint8], "h w 3"], camera: PinholeCamera, covered: tuple[float, float], settings: PhotometrySettings
 ) -> Float32[NDArray[np.float32], "H W"]:  # fmt: skip
-    """Logarithm of a picture's grey levels, each pixel of the small camera the mean of what it covers.
+    """Compute the logarithm of an image's grey levels at the resolution of a small camera (area means).
 
     Args:
-        rgb: of the camera's aspect, of any size.
-        camera: of the small picture.
-        covered: share of the picture's width and height that the small one covers, from the left and the top.
-        settings: where it levels off.
+        rgb: image of any size.
+        camera: intrinsics of the small image.
+        covered: shares of the image's width and height that the small image covers, from the left and from the top.
+        settings: of the score.
     """
     height, width = (max(1, round(side * share)) for side, share in zip(rgb.shape[:2], covered[::-1], strict=True))
     grey = cv2.cvtColor(rgb[:height, :width], cv2.COLOR_RGB2GRAY)
@@ -58,13 +60,15 @@ def agreement_of_brightness(
     brightness: Float32[NDArray[np.float32], " n"], met: Int32[NDArray[np.int32], "H W"], grey: Float32[NDArray[np.float32], "H W"],
     settings: PhotometrySettings,
 ) -> float:  # fmt: skip
-    """Mean squared correlation of patches, from 0 (also where the map knows no brightness) to 1.
+    """Correlate the map's brightness with an image: mean squared correlation of all patches, from 0 to 1.
+
+    The score is 0 where no visible surfel has a brightness.
 
     Args:
-        brightness: of the map's surfels.
-        met: the surfel that each pixel of the small picture shows, as ``meet`` gave it.
-        grey: of the picture, as ``grey_of`` gave it.
-        settings: of the patches.
+        brightness: LiDAR intensity of each surfel, NaN where unknown.
+        met: index of the surfel in each pixel of the small image, -1 for none, as ``Sights.meet`` returns it.
+        grey: logarithmic grey levels, as ``grey_of`` returns them.
+        settings: of the score.
     """
     return squared_correlation(_drawn(brightness, met, settings), grey, settings)
 
@@ -72,7 +76,7 @@ def agreement_of_brightness(
 def _drawn(
     brightness: Float32[NDArray[np.float32], " n"], met: Int32[NDArray[np.int32], "H W"], settings: PhotometrySettings
 ) -> Float32[NDArray[np.float32], "H W"]:
-    """Logarithm of the brightness that each pixel shows, NaN where none is known."""
+    """Logarithm of the brightness of each pixel's surfel, relative to the mean; NaN where unknown."""
     values = np.where(met >= 0, brightness[np.maximum(met, 0)], np.float32(np.nan))
     known = values[~np.isnan(values)]
     mean = float(known.mean()) if known.size else 0.0
@@ -85,12 +89,12 @@ def _drawn(
 def squared_correlation(
     one: Float32[NDArray[np.float32], "H W"], other: Float32[NDArray[np.float32], "H W"], settings: PhotometrySettings
 ) -> float:
-    """Mean over patches of the squared correlation of two pictures, 0 where no patch has enough pixels.
+    """Average the squared correlation of two images over all patches; 0 if no patch has enough known pixels.
 
     Args:
-        one: NaN where it is not known.
-        other: known everywhere.
-        settings: of the patches; what remains beside whole ones is left out.
+        one: first image, NaN where unknown.
+        other: second image, known everywhere.
+        settings: of the score. Rows and columns that fill no whole patch are left out.
     """
     size = settings.patch
     known = ~np.isnan(one)
@@ -109,7 +113,7 @@ def squared_correlation(
 
 
 def _patches(picture: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Whole patches, a row each."""
+    """Whole patches of an image, one per row: (patches, size x size)."""
     down, across = picture.shape[0] // size, picture.shape[1] // size
     whole = picture[: down * size, : across * size].reshape(down, size, across, size)
     return np.ascontiguousarray(whole.transpose(0, 2, 1, 3)).reshape(down * across, size * size)

@@ -1,6 +1,6 @@
-/* Thins a depth picture to blocks, each with the median of its inverse depths, and reads the picture's noise off its rows.
+/* Thins a depth image to blocks with the median inverse depth, and estimates the noise of the image from its rows.
  *
- * Sizes and pointers are checked in Python. */
+ * Python checks sizes and pointers. */
 
 #include <math.h>
 #include <stdint.h>
@@ -10,8 +10,8 @@
 
 enum { LANES = 64, MOST_SAMPLES = 64, MOST_STEPS = 1024 };
 
-/* Sorts any number of values by the same exchanges (merge exchange: Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M),
- * so that many blocks are sorted side by side. */
+/* Writes the compare-exchange steps that sort n values; returns their number. The steps do not depend on the values, so many blocks are
+ * sorted side by side. Merge exchange: Knuth, The Art of Computer Programming 3, 5.2.2, algorithm M. */
 static int64_t network(int n, uint8_t steps[MOST_STEPS][2])
 {
     int64_t count = 0;
@@ -36,13 +36,13 @@ static int64_t network(int n, uint8_t steps[MOST_STEPS][2])
 }
 
 typedef struct {
-    int64_t width;        /* of the picture */
-    int64_t size, skip;   /* of a block, and from one pixel that is read of it to the next; at most MOST_SAMPLES are read */
-    int64_t rows, columns; /* of blocks */
-    double edge, noise, reach;
+    int64_t width;        /* of the depth image, px */
+    int64_t size, skip;   /* edge of a block, and distance between the pixels read, px; a block has at most MOST_SAMPLES of them */
+    int64_t rows, columns; /* number of blocks */
+    double edge, noise, reach; /* largest relative spread of a block, noise of an inverse depth (1/m), largest depth (m) */
 } Blocks;
 
-/* Compared with Python's structures when the library is loaded. */
+/* service/compiled.py compares this table with Python's structures when it loads the library. */
 const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Blocks), LAYOUT_FIELD(Blocks, width), LAYOUT_FIELD(Blocks, size), LAYOUT_FIELD(Blocks, skip),
     LAYOUT_FIELD(Blocks, rows), LAYOUT_FIELD(Blocks, columns), LAYOUT_FIELD(Blocks, edge), LAYOUT_FIELD(Blocks, noise),
@@ -50,7 +50,8 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_END,
 };
 
-/* z: of each block the depth whose inverse is the median; 0 where too few pixels are measured, on an edge, or beyond the reach. */
+/* z (rows, columns): depth of each block from its median inverse depth, m; 0 if fewer than half of the pixels read are measured, on an
+ * edge, or beyond the reach. */
 void streetfix_blocks(const float *depth, const Blocks *b, float *z)
 {
     uint8_t steps[MOST_STEPS][2];
@@ -91,7 +92,7 @@ void streetfix_blocks(const float *depth, const Blocks *b, float *z)
                 *out = 0;
                 if (n < enough) continue;
                 const float low = value[(int)(0.1 * (n - 1))][k], high = value[(int)(0.9 * (n - 1))][k];
-                /* The median of an even number lies between the two middle ones: the lower alone would push every surface away. */
+                /* For an even number of values take the mean of the middle two. The lower one alone would bias all depths upwards. */
                 const float middle = 0.5f * (value[(int)(0.5 * (n - 1))][k] + value[n / 2][k]);
                 const float far = 1.0f / middle;
                 if ((double)(high - low) - 2.56 * b->noise < b->edge * (double)middle && far < (float)b->reach) *out = far;
@@ -99,7 +100,8 @@ void streetfix_blocks(const float *depth, const Blocks *b, float *z)
         }
 }
 
-/* Absolute second differences of the inverse depth along every `every`-th row, of pixels `step` apart; how many there are. */
+/* Writes the absolute second differences of the inverse depth (1/m) along every `every`-th row, of pixels `step` apart. Returns their
+ * number. */
 int64_t streetfix_second_differences(const float *depth, int64_t height, int64_t width, int64_t every, int64_t step, float *out)
 {
     int64_t count = 0;

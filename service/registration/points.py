@@ -1,7 +1,7 @@
-"""From a depth picture to the points that are registered, each with its uncertainty.
+"""Convert a depth image to points for registration, each with its uncertainty.
 
-A triangulating camera errs by a share of its disparity, so by the square of the distance; how much is read off the picture
-itself: on a plane the inverse depth is linear in the pixel, so what its second difference leaves is noise.
+The disparity error of a triangulating camera does not depend on range. So its range error grows with the square of the range.
+The image itself shows how large the error is. On a plane the inverse depth is linear in the pixel, so its second difference is noise.
 """
 
 import ctypes
@@ -21,15 +21,17 @@ from service.geometry.rigid import Rotation
 from service.registration.kernel import QueryPoints
 
 LIBRARY = Path(__file__).with_name("_points.so")
-#: Noise is read off every eighth row, between pixels at each of these distances; the larger estimate counts. Errors of stereo matching
-#: are correlated over the matcher's window, so near pixels hide them: on KITTI pairs matched by SGBM, pixels 2 apart show 0.08 px of
-#: disparity noise, pixels 8 apart 0.30 px. Noise that is independent from pixel to pixel looks the same at both.
+#: Noise estimation: every eighth row, distances between pixels (px), least number of second differences. The larger estimate counts.
+#: Errors of stereo matching are correlated over the matcher's window, so differences of adjacent pixels hide them. On KITTI pairs matched
+#: by SGBM, pixels 2 apart show 0.08 px of disparity noise and pixels 8 apart show 0.30 px (decision 0131). Independent noise looks the
+#: same at both distances.
 NOISE_ROWS, NOISE_STEPS, FEWEST_DIFFERENCES = 8, (2, 8), 100
 #: Least standard deviation of an inverse depth, 1/m. Depth in whole millimetres, or of one constant wall, has second differences of
-#: zero, although no sensor measures without error: this is 0.1 mm at 10 m and 1.6 mm at 40 m, less than any depth camera or survey LiDAR.
+#: zero, although no sensor measures without error. The limit is 0.1 mm at 10 m and 1.6 mm at 40 m. Every depth camera and survey LiDAR
+#: has larger errors.
 LEAST_NOISE = 1e-6
-#: Least standard deviation of a stereo rig's disparity, px. A picture cannot show errors that are alike all over a surface: those of
-#: rectification and of matching between whole pixels. SGBM on KITTI against the scans: 0.45 to 0.85 px (decision log).
+#: Least standard deviation of a stereo rig's disparity, px. Errors of rectification and of whole-pixel matching are equal over a whole
+#: surface, so no image shows them. SGBM on KITTI against the scans: 0.45 to 0.85 px (decision 0131).
 MATCHING_PX = 0.5
 
 
@@ -50,18 +52,18 @@ def _library() -> ctypes.CDLL:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointSettings:
-    """How a picture is thinned to points. Ours, November 2026.
+    """Settings that thin a depth image to points, of November 2026.
 
     Attributes:
-        columns: blocks across the picture; a block gives one point, its median.
-        points: at most this many.
-        ground_share: largest share of points of the ground, which says nothing about where along it one stands.
-        ground_m: points lower than this above the ground are of the ground.
-        edge: a block whose inverse depths spread by more than this share lies on an edge.
-        floor_m: no range is known better.
-        reach_m: points further away are left out.
-        movable_m: lower than this above the ground stand vehicles and people, which may have come or gone since the survey;
-        movable_weight: so points there count for less, the ground's apart.
+        columns: blocks across the image. A block gives one point, its median.
+        points: largest number of points.
+        ground_share: largest share of ground points. The ground does not constrain the horizontal position.
+        ground_m: points lower than this above the ground are ground points, m.
+        edge: a block lies on an edge if its inverse depths spread by more than this share of their median, apart from noise.
+        floor_m: least standard deviation of a range, m.
+        reach_m: points beyond this depth are left out, m.
+        movable_m: points between ``ground_m`` and this height may be vehicles or people that have moved since the survey, m.
+        movable_weight: weight of these points; all others have weight 1.
     """
 
     columns: int = 128
@@ -75,7 +77,11 @@ class PointSettings:
     movable_weight: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse a share that would leave no point above the ground."""
+        """Refuse a share that would leave no point above the ground.
+
+        Raises:
+            ValueError: ``ground_share`` is out of range.
+        """
         if not 0 <= self.ground_share < 1:
             raise ValueError(f"ground_share: {self.ground_share:g} is not at least 0 and less than 1")
 
@@ -84,8 +90,8 @@ class DepthNoise(NamedTuple):
     """Standard deviations of one pixel's inverse depth, 1/m.
 
     Attributes:
-        independent: what near pixels do not share.
-        total: with what they share.
+        independent: of the errors that adjacent pixels do not share.
+        total: of all errors, with those that adjacent pixels share.
     """
 
     independent: float
@@ -95,15 +101,15 @@ class DepthNoise(NamedTuple):
 def inverse_depth_noise(
     depth_m: Float32[NDArray[np.float32], "H W"], *, focal_baseline_px_m: float | None = None
 ) -> DepthNoise:
-    """Noise of a depth picture, from second differences along rows: on a plane the inverse depth is linear in the pixel.
+    """Estimate the noise of a depth image from second differences of the inverse depth along rows.
 
     Args:
-        depth_m: z, metres, 0 where nothing was measured.
-        focal_baseline_px_m: focal length times baseline, of a stereo rig; None where the depth has no disparity. The total is then
-            combined with ``MATCHING_PX``.
+        depth_m: depth z, m; 0 where nothing was measured.
+        focal_baseline_px_m: focal length times baseline of a stereo rig, px m. With it ``MATCHING_PX`` is added in quadrature to the
+            total. None if the depth has no disparity.
 
     Returns:
-        ``LEAST_NOISE`` at least; that of a quarter of a pixel at 80 px m where the picture has too few measurements.
+        The noise, at least ``LEAST_NOISE``. An image with too few measurements gets a quarter of a pixel at 80 px m.
     """
     near, far = (_noise_between(depth_m, step) for step in NOISE_STEPS)
     near = near or far or 0.25 / 80.0
@@ -114,7 +120,10 @@ def inverse_depth_noise(
 
 
 def _noise_between(depth_m: Float32[NDArray[np.float32], "H W"], step: int) -> float:
-    """The same from pixels so far apart; 0 where there are too few."""
+    """Noise from pixels that are ``step`` apart; 0 if there are too few differences.
+
+    The factor 1.4826 turns a median absolute value into a standard deviation. A second difference has six times the variance of a pixel.
+    """
     depth_m = np.ascontiguousarray(depth_m, np.float32)
     height, width = depth_m.shape
     room = np.empty(-(-height // NOISE_ROWS) * width, np.float32)
@@ -128,12 +137,12 @@ def _noise_between(depth_m: Float32[NDArray[np.float32], "H W"], step: int) -> f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthBlocks:
-    """A depth picture thinned to blocks.
+    """A depth image thinned to blocks.
 
     Attributes:
-        z_m: of each block the depth whose inverse is the median; 0 where too little was measured, on an edge, or beyond the reach.
-        camera: of which every block is a pixel.
-        covered: share of the picture's width and height that the blocks take, from the left and the top; a rest makes no block.
+        z_m: depth of each block from its median inverse depth, m; 0 if too few pixels are measured, on an edge, or beyond the reach.
+        camera: intrinsics of the small image that has one pixel per block.
+        covered: shares of the image's width and height that the blocks cover, from the left and from the top. A rest makes no block.
     """
 
     z_m: Float32[NDArray[np.float32], "H W"]
@@ -144,25 +153,25 @@ class DepthBlocks:
 def blocks_of(
     depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, settings: PointSettings, *, noise: float
 ) -> DepthBlocks:
-    """Thin a depth picture to blocks.
+    """Thin a depth image to blocks.
 
     Args:
-        depth_m: z, metres, 0 where nothing was measured.
-        camera: of the same aspect.
-        settings: how many blocks, and what makes an edge.
+        depth_m: depth z, m; 0 where nothing was measured.
+        camera: intrinsics, scaled to the size of the depth image if they are of another size.
+        settings: of the blocks and their edges.
         noise: standard deviation of one pixel's inverse depth, 1/m.
     """
     height, width = depth_m.shape
     own = camera if (camera.height, camera.width) == (height, width) else camera.scaled_to(width, height)
     size = max(1, width // settings.columns)
     rows, columns = height // size, width // size
-    skip = max(1, size // 4)  # so at most 49 pixels of a block are read
+    skip = max(1, size // 4)  # at most 49 pixels of a block are read
     depth_m, z = np.ascontiguousarray(depth_m, np.float32), np.empty((rows, columns), np.float32)
     _library().streetfix_blocks(
         depth_m.ctypes.data, byref(_Blocks(width, size, skip, rows, columns, settings.edge, noise, settings.reach_m)),
         z.ctypes.data,
     )  # fmt: skip
-    centre_px = float(np.arange(0, size, skip).mean())  # of the pixels that were read, not of the block
+    centre_px = float(np.arange(0, size, skip).mean())  # the centre of the pixels read, which is not the block's
     small = PinholeCamera(
         columns, rows, own.fx / size, own.fy / size, (own.cx - centre_px) / size, (own.cy - centre_px) / size
     )
@@ -173,16 +182,16 @@ def points_of(
     depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R_level_camera: Rotation, height_m: float,
     settings: PointSettings, *, noise: float | None = None, focal_baseline_px_m: float = 80.0,
 ) -> QueryPoints:  # fmt: skip
-    """Thin a depth picture to points of its level frame.
+    """Thin a depth image to points in its level frame.
 
     Args:
-        depth_m: z, metres, 0 where nothing was measured.
-        camera: of the same aspect.
-        R_level_camera: from the optical to the level frame.
-        height_m: of the camera above the ground.
-        settings: how many, and which.
-        noise: standard deviation of one pixel's inverse depth, 1/m; read off the picture where it is not given.
-        focal_baseline_px_m: of the camera; only scales the unit of the disparity offset.
+        depth_m: depth z, m; 0 where nothing was measured.
+        camera: intrinsics, scaled to the size of the depth image if they are of another size.
+        R_level_camera: rotation from the camera's optical frame to the level frame.
+        height_m: height of the camera above the ground, m.
+        settings: of the blocks and points.
+        noise: standard deviation of one pixel's inverse depth, 1/m; None estimates the total from the image.
+        focal_baseline_px_m: focal length times baseline, px m. It only scales the unit of the disparity offset.
     """
     noise = inverse_depth_noise(depth_m).total if noise is None else noise
     blocks = blocks_of(depth_m, camera, settings, noise=noise)
@@ -193,7 +202,16 @@ def points_from(
     blocks: DepthBlocks, R_level_camera: Rotation, height_m: float, settings: PointSettings, *, noise: float,
     focal_baseline_px_m: float,
 ) -> QueryPoints:  # fmt: skip
-    """Points of a level frame from a picture's blocks; arguments as in ``points_of``."""
+    """Convert the blocks of a depth image to points in its level frame.
+
+    Args:
+        blocks: of the depth image, as ``blocks_of`` returns them.
+        R_level_camera: rotation from the camera's optical frame to the level frame.
+        height_m: height of the camera above the ground, m.
+        settings: of the blocks and points.
+        noise: standard deviation of one pixel's inverse depth, 1/m.
+        focal_baseline_px_m: focal length times baseline, px m. It only scales the unit of the disparity offset.
+    """
     own, z = blocks.camera, blocks.z_m.ravel()
     kept = np.flatnonzero(z)
     z, (v, u) = z[kept], np.divmod(kept, own.width)
@@ -214,7 +232,14 @@ def points_from(
 def movable_of(
     blocks: DepthBlocks, R_level_camera: Rotation, height_m: float, settings: PointSettings
 ) -> Bool[NDArray[np.bool_], "H W"]:
-    """Which blocks show what may have come or gone since the survey (``movable_m``); arguments as in ``points_of``."""
+    """Mark the blocks that may show dynamic objects: measured points between ``ground_m`` and ``movable_m`` above the ground.
+
+    Args:
+        blocks: of the depth image, as ``blocks_of`` returns them.
+        R_level_camera: rotation from the camera's optical frame to the level frame.
+        height_m: height of the camera above the ground, m.
+        settings: of the blocks and points.
+    """
     own = blocks.camera
     v, u = (np.arange(side)[of] for side, of in ((own.height, np.s_[:, None]), (own.width, np.s_[None])))
     x, y, z = R_level_camera[2]
@@ -230,7 +255,7 @@ def _may_move(
 
 
 def _chosen(ground: Bool[NDArray[np.bool_], " n"], settings: PointSettings) -> NDArray[np.intp]:
-    """Evenly spread points, the ground's at most their share."""
+    """Rows of evenly spread points, with at most ``ground_share`` of them on the ground."""
     above, below = np.flatnonzero(~ground), np.flatnonzero(ground)
     most_below = int(settings.ground_share * settings.points)
     above = _thinned(above, settings.points - min(len(below), most_below))

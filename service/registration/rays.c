@@ -1,6 +1,6 @@
-/* Where the rays of a small picture meet the map's surfels, and what its depths then say about its pose; see rays.py.
+/* Casts the rays of a small image on the map's surfels, and sums the normal equations of its inverse depths; see sight.py and rays.py.
  *
- * Plain C without global state: callable from several threads at once. Sizes and pointers are checked in Python. */
+ * Plain C without global state, so several threads may call it at once. Python checks sizes and pointers. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -12,32 +12,32 @@
 
 typedef struct {
     double R[9], t[3];     /* T_map_camera */
-    double fx, fy, cx, cy; /* of the small picture */
+    double fx, fy, cx, cy; /* of the small image, px */
     int64_t width, height;
 } View;
 
 typedef struct {
-    double radius;       /* m: of the disc that a surfel is */
-    double nearest, reach; /* m: of depths that count */
-    double behind;       /* m: discs so far behind the first one may be the same surface */
-    double grazing;      /* cosine: discs seen flatter than this are not met */
+    double radius;       /* radius of a surfel's disc, m */
+    double nearest, reach; /* least and largest depth that counts, m */
+    double behind;       /* discs up to this depth behind the first one may be the same surface, m */
+    double grazing;      /* least cosine between normal and line of sight; discs seen flatter are ignored */
 } Discs;
 
-/* A surfel in the camera's axes, and the pixels that it may cover; room for as many as may be in view is given by whoever calls. */
+/* A surfel in the camera's axes, and the range of pixels that it may cover. The caller provides the memory. */
 typedef struct {
     float xyz[3], normal[3];
     int32_t number;
     int32_t left, right, top, bottom; /* pixels, both ends included */
 } Disc;
 
-/* From the least whole number that is not below a number, and not below 0. */
+/* Ceiling of ``edge``, but at least 0. */
 static inline int32_t from(float edge)
 {
     const int32_t whole = edge > 0 ? (edge < 1e9f ? (int32_t)edge : 1000000000) : 0;
     return whole + ((float)whole < edge);
 }
 
-/* The largest whole number that is not above a number from 0 on, and not above the last one. */
+/* Floor of ``edge``, but at least 0 and at most ``last``. */
 static inline int32_t up_to(float edge, float last)
 {
     return (int32_t)(edge < last ? (edge > 0 ? edge : 0) : last);
@@ -48,7 +48,7 @@ static inline float at_least(float number, float least)
     return number > least ? number : least;
 }
 
-/* The sides of a small picture as planes of the camera's axes: x between left and right of z, y between top and bottom, all in z. */
+/* A camera in single precision, with the sides of its field of view: left z <= x <= right z and top z <= y <= bottom z. */
 typedef struct {
     float r[9], t[3], fx, fy, cx, cy, ifx, ify, left, right, top, bottom;
 } Sides;
@@ -65,12 +65,12 @@ static inline Sides sides_of(const View *v)
     return s;
 }
 
-/* As many surfels are worked on at once as a register holds, in chunks that stay near the processor. */
+/* Surfels per chunk. A chunk stays in the processor's cache, and its loops are vectorised. */
 enum { CHUNK = 512 };
 
-/* Which of at most CHUNK surfels a disc's radius, and ``near_m`` and ``near_rad`` besides, bring into sight: their places among these, in
- * order; returns how many. A camera that is moved and turned by these sees a point p moved by near_m + near_rad |p| at most, so each
- * plane of the view's sides is moved out by as much. */
+/* Selects, of at most CHUNK surfels, those whose discs may be visible from a camera within ``near_m`` and ``near_rad`` of the view. Writes
+ * their places in order and returns their number. Such a motion moves a point p by at most near_m + near_rad |p| in the camera's axes. So
+ * each plane of the field of view is moved outwards by this and by the disc's radius. */
 static inline int in_sight(const Surfel *surfels, int count, const Sides *s, const Discs *o, float near_m, float near_rad, int32_t *places)
 {
     const float *r = s->r, radius = (float)o->radius, nearest = (float)o->nearest, reach = (float)o->reach;
@@ -98,8 +98,9 @@ static inline int chunk_of(int64_t left)
     return left < CHUNK ? (int)left : CHUNK;
 }
 
-/* What any camera within ``near_m`` and ``near_rad`` of a view may meet, in the order in which it lies: copies to ``kept``, their numbers
- * to ``numbers``, which have room for all of ``parts`` (n, 2), first surfel and count. Returns how many. */
+/* Collects the surfels that may be visible from any camera within ``near_m`` and ``near_rad`` of a view, in the map's order. Copies go to
+ * ``kept``, their indices to ``numbers``. Both have room for all surfels of ``parts`` (n, 2): first surfel, number of surfels. Returns
+ * how many were collected. */
 WIDE int64_t streetfix_gather(const Surfel *surfels, const int64_t *parts, int64_t part_count, const View *v, const Discs *o, double near_m,
                               double near_rad, Surfel *kept, int32_t *numbers)
 {
@@ -117,14 +118,14 @@ WIDE int64_t streetfix_gather(const Surfel *surfels, const int64_t *parts, int64
     return count;
 }
 
-/* Surfels in the camera's axes side by side; normals still the map's. */
+/* A chunk of surfels: positions in the camera's axes, normals still in the map's axes. */
 typedef struct {
     int count;
     float x[CHUNK], y[CHUNK], z[CHUNK], nx[CHUNK], ny[CHUNK], nz[CHUNK];
     int32_t number[CHUNK];
 } Ahead;
 
-/* Adds those of them that cover a pixel's middle to ``seen``; returns how many these are. */
+/* Adds to ``seen`` the discs that may cover the centre of a pixel; returns their number. */
 static inline int64_t discs_of(const Ahead *m, const Sides *s, const View *v, const Discs *o, Disc *seen)
 {
     float nx[CHUNK], ny[CHUNK], nz[CHUNK];
@@ -136,13 +137,13 @@ static inline int64_t discs_of(const Ahead *m, const Sides *s, const View *v, co
         nx[i] = r[0] * m->nx[i] + r[3] * m->ny[i] + r[6] * m->nz[i], ny[i] = r[1] * m->nx[i] + r[4] * m->ny[i] + r[7] * m->nz[i];
         nz[i] = r[2] * m->nx[i] + r[5] * m->ny[i] + r[8] * m->nz[i];
         const float off = nx[i] * x + ny[i] * y + nz[i] * z;
-        /* How far the disc reaches along each axis; its picture lies between those of the corners of that box. */
+        /* Half extent of the disc along each axis. The projection of this box bounds the disc's pixels. */
         const float wide = radius * sqrtf(at_least(1.0f - nx[i] * nx[i], 0)), tall = radius * sqrtf(at_least(1.0f - ny[i] * ny[i], 0));
         const float deep = radius * sqrtf(at_least(1.0f - nz[i] * nz[i], 0)), close = 1.0f / at_least(z - deep, half), away = 1.0f / (z + deep);
         const float u0 = (x - wide) * (x > wide ? away : close) * s->fx + s->cx, u1 = (x + wide) * (x > -wide ? close : away) * s->fx + s->cx;
         const float v0 = (y - tall) * (y > tall ? away : close) * s->fy + s->cy, v1 = (y + tall) * (y > -tall ? close : away) * s->fy + s->cy;
         left[i] = from(u0), right[i] = up_to(u1, width), top[i] = from(v0), bottom[i] = up_to(v1, height);
-        /* Far ones may lie between the pixels' middles. */
+        /* The discs of far surfels may lie between the centres of pixels. */
         shown[i] = (off * off >= grazing2 * (x * x + y * y + z * z)) & (u1 >= 0) & (v1 >= 0) & (left[i] <= right[i]) & (top[i] <= bottom[i]);
     }
     int64_t count = 0;
@@ -154,9 +155,9 @@ static inline int64_t discs_of(const Ahead *m, const Sides *s, const View *v, co
     return count;
 }
 
-/* met (height, width): number of the surfel on each pixel's ray, -1 for none; of discs that overlap near the first one met, that whose
- * middle is nearest to the ray. ``surfels`` and ``numbers`` (count) are of what may be in view (streetfix_gather); ``seen`` has room for all
- * of them, ``first`` and ``middle`` for a number a pixel. */
+/* Writes to ``met`` (height, width) the index of the surfel on each pixel's ray, -1 for none. Several discs may lie within ``behind`` of
+ * the first one on a ray. Of these, the disc with the least distance between its centre and its point on the ray counts. ``surfels`` and
+ * ``numbers`` (count) come from streetfix_gather. ``seen`` has room for all of them, ``first`` and ``middle`` for one value per pixel. */
 WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t surfel_count, const View *v, const Discs *o, Disc *seen,
                     float *first, float *middle, int32_t *met)
 {
@@ -165,7 +166,7 @@ WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t 
         first[i] = middle[i] = INFINITY;
         met[i] = -1;
     }
-    /* What is beside the picture is left out before anything is divided; a disc reaches its radius over its middle, across and ahead. */
+    /* Drop discs outside the field of view first, because this test needs no division. */
     const Sides s = sides_of(v);
     const float *r = s.r, cx = s.cx, cy = s.cy, ifx = s.ifx, ify = s.ify, radius = (float)o->radius;
     int64_t count = 0;
@@ -184,8 +185,8 @@ WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t 
         count += discs_of(&ahead, &s, v, o, seen + count);
     }
     const float radius2 = radius * radius, behind = (float)o->behind;
-    /* Neither pass branches on what it finds: most discs cover a pixel or two, so a processor could only guess. A ray along a disc gives
-     * no number or an infinite one, which nothing is nearer than. */
+    /* Neither pass branches on its results: most discs cover one or two pixels, so branch prediction would fail. A ray parallel to a disc
+     * gives an infinite depth or NaN. Both fail the comparisons. */
     for (int64_t i = 0; i < count; i++) {
         const Disc *d = seen + i;
         const float off = d->normal[0] * d->xyz[0] + d->normal[1] * d->xyz[1] + d->normal[2] * d->xyz[2];
@@ -218,24 +219,23 @@ WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t 
 }
 
 typedef struct {
-    double about[3];        /* what rotations turn about, in the map */
-    double scale, offset;   /* of the depths: 1 / z = scale / true z - offset */
-    double unit;            /* of the offset, 1/m */
+    double about[3];        /* centre of rotation, surfels' frame, m */
+    double scale, offset;   /* of the measured depth: 1 / z = scale / true z - offset x unit */
+    double unit;            /* inverse depth per unit of the offset, 1/(px m): 1 / (focal length x baseline) */
     double noise;           /* standard deviation of an inverse depth, 1/m */
-    double surface;         /* m: how far the map's surfaces may be off along a ray */
-    double robust;          /* standard deviations at which a residual weighs a quarter */
-    double shared;          /* standard deviation of the error that a patch has in common, 1/m */
-    double moved;           /* m: standard deviation of how far what may move stands from where it was mapped */
-    double nearest, reach;  /* m */
-    double grazing;         /* cosine, as in Discs */
-    int64_t patch;          /* pixels along its edge */
+    double surface;         /* standard deviation of the map's surfaces along a ray, m */
+    double robust;          /* width of the robust kernel, in standard deviations: there a pixel keeps a quarter of its weight */
+    double shared;          /* standard deviation of the error that the pixels of a patch share, 1/m */
+    double moved;           /* standard deviation of the distance that a dynamic object may have moved, m */
+    double nearest, reach;  /* least and largest depth that counts, m */
+    double grazing;         /* least |normal . ray| of a ray with z = 1 */
+    int64_t patch;          /* edge of a patch, px */
 } Asked;
 
-/* One pixel: what its residual does with the unknowns (0 .. 7), the residual (8), by how much its patch's own error, of
- * deviation 1, is felt in it (9). */
+/* Rows of a pixel: derivatives of the model by the unknowns (0 .. 7), residual (8), derivative by the patch's shared error (9). */
 enum { RESIDUAL = UNKNOWNS, OWN, ROWS, LANES = 8, MOST_PIXELS = 256 };
 
-/* Compared with Python's structures when the library is loaded. */
+/* service/compiled.py compares this table with Python's structures when it loads the library. */
 const LayoutEntry streetfix_layout[] = {
     SURFEL_LAYOUT,
     LAYOUT_STRUCT(View), LAYOUT_FIELD(View, R), LAYOUT_FIELD(View, t), LAYOUT_FIELD(View, fx), LAYOUT_FIELD(View, fy),
@@ -252,7 +252,7 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_END,
 };
 
-/* A patch's pixels side by side, as many as there are and zeros up to whole lanes. */
+/* The pixels of a patch, padded with zeros to a multiple of LANES. */
 typedef struct {
     double rows[ROWS][MOST_PIXELS], weighted[ROWS][MOST_PIXELS];
 } Batch;
@@ -288,9 +288,9 @@ static inline double product(const double *one, const double *other, int count)
     return sum;
 }
 
-/* H (8, 8) and b (8) of the normal equations of one picture, added to what is there, and the pull of each patch (patches, 8): sums of
- * gradients by residuals. Each patch's own common error is taken out, as one unknown a patch under a prior, by Schur's complement.
- * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST_PIXELS pixels. Returns how many pixels took part. */
+/* Adds the normal equations of one image to H (8, 8) and b (8). Writes the gradient of each patch to ``pulls`` (patches, 8): the sum of
+ * weight x residual x derivative. The shared error of each patch is one unknown with a prior, marginalised by the Schur complement.
+ * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST_PIXELS pixels. Returns the number of pixels used. */
 WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t *met, const float *inverse, const uint8_t *movable, const Asked *q,
                             double *H, double *b, double *pulls)
 {

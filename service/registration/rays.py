@@ -1,8 +1,10 @@
-"""The last stage of registration: the map's surface on each pixel's own ray, residuals in inverse depth.
+"""Adjust a registered pose along the pixels' rays, with residuals in inverse depth: the last stage of registration.
 
-Looked up where it was measured, a noisy point finds whatever surface happens to be near: by a stereo rig metres off. Where its ray
-meets the map does not depend on its noise, and the residual is in the unit that a triangulating camera errs evenly in. What neighbouring
-pixels err alike (of block matching, or a car that has moved) is one more unknown for each patch of the picture.
+A noisy point matches any surface near its measured position. With a stereo rig that surface may be metres off. The intersection of
+its ray with the map does not depend on its noise. The error of a triangulating camera is uniform in inverse depth. Neighbouring pixels
+share errors, because of block matching or a car that has moved. Each patch of the image has one unknown for this correlated error.
+
+Decision 0098 measures the method. docs/how_it_works.md gives the equation ("rays").
 """
 
 import ctypes
@@ -23,29 +25,32 @@ from service.registration.register import Registered
 from service.registration.sight import LIBRARY, DiscSettings, Sights, View
 from service.registration.surfel_map import SurfelMap
 
-MOST_PATCH = 16  # pixels along its edge; as in ``rays.c``
+#: Largest edge of a patch, px. ``rays.c`` has room for this many pixels squared.
+MOST_PATCH = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RaySettings(DiscSettings):
-    """Ours, November 2026; chosen on watch cities. The depths that count for discs count here.
+    """Settings of the adjustment, chosen on validation cities in November 2026 (decision 0098).
+
+    The limits of depth are those of the discs.
 
     Attributes:
-        rounds: of looking up what the rays meet, at most, and
-        steps: of the solver in each.
-        still_m: a round that moves the pose by less, and
-        still_rad: turns it by less, is the last.
-        surface_m: how far the map's surfaces may be off along a ray.
-        robust: standard deviations at which the robust kernel (Geman and McClure) takes three quarters off a pixel's weight.
-        patch: pixels of the small picture along the edge of a patch.
-        shared: standard deviation of what a patch's pixels err alike, in units of one pixel's noise.
-        moved_m: standard deviation of how far what may move stands from where it was mapped; a patch's pixels err alike in that.
-        alike: so many pixels tell as much as one; against the priors.
-        position_m: standard deviations of the priors about the pose that is adjusted,
-        turn_rad: likewise;
-        scale: and of the depth's scale, which is 1;
-        offset_px: and of a rig's disparity offset, which is 0.
-        fewest: pictures of which fewer pixels meet the map adjust nothing.
+        rounds: largest number of rounds. Each round casts the rays once.
+        steps: solver steps per round.
+        still_m: the adjustment ends after a round that moves the pose by less than this, m, and
+        still_rad: rotates it by less than this, rad.
+        surface_m: standard deviation of the map's surfaces along a ray, m.
+        robust: width of the robust kernel (Geman and McClure), in standard deviations. There a pixel keeps a quarter of its weight.
+        patch: edge of a patch, pixels of the small image.
+        shared: standard deviation of the error that a patch's pixels share, as a multiple of one pixel's noise.
+        moved_m: standard deviation of the distance that an object may have moved since the survey, m. Pixels of a patch share it.
+        alike: effective-sample-size divisor: correlated pixels per independent measurement. It scales the pixels against the priors.
+        position_m: standard deviation of the prior of position, m. Its mean is the pose to adjust.
+        turn_rad: standard deviation of the prior of rotation, rad. Its mean is the pose to adjust.
+        scale: standard deviation of the prior of the log scale of depth. Its mean is 0.
+        offset_px: standard deviation of the prior of a stereo rig's disparity offset, px. Its mean is 0.
+        fewest: least number of pixels that intersect the map. With fewer the pose is not adjusted.
     """
 
     rounds: int = 5
@@ -65,22 +70,26 @@ class RaySettings(DiscSettings):
     fewest: int = 300
 
     def __post_init__(self) -> None:
-        """Refuse patches that the kernel has no room for."""
+        """Check that the kernel has room for a patch.
+
+        Raises:
+            ValueError: ``patch`` is out of range.
+        """
         if not 1 <= self.patch <= MOST_PATCH:
             raise ValueError(f"patch: {self.patch} is not from 1 to {MOST_PATCH}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayPicture:
-    """A small picture of inverse depths.
+    """A small image of inverse depths.
 
     Attributes:
-        inverse: 1/m, 0 where nothing was measured.
-        camera: of the small picture.
-        T_level_camera: of the camera against the reference's level frame.
+        inverse: inverse depth, 1/m; 0 where nothing was measured.
+        camera: intrinsics of the small image.
+        T_level_camera: pose of the camera in the reference's level frame.
         noise: standard deviation of an inverse depth, 1/m.
-        focal_baseline_px_m: of a stereo rig; None where the depth has no disparity.
-        movable: where vehicles and people stand, which may have moved since the survey.
+        focal_baseline_px_m: focal length times baseline of a stereo rig, px m; None if the depth has no disparity.
+        movable: pixels that may show dynamic objects.
     """
 
     inverse: Float32[NDArray[np.float32], "H W"]
@@ -99,7 +108,15 @@ def picture_of(
     focal_baseline_px_m: float | None,
     movable: Bool[NDArray[np.bool_], "H W"],
 ) -> RayPicture:
-    """What the rays of a thinned depth picture measured; arguments as in ``RayPicture``."""
+    """Convert the blocks of a depth image to an image of inverse depths.
+
+    Args:
+        blocks: of the depth image, as ``blocks_of`` returns them.
+        T_level_camera: pose of the camera in the reference's level frame.
+        noise: standard deviation of an inverse depth, 1/m.
+        focal_baseline_px_m: focal length times baseline of a stereo rig, px m; None if the depth has no disparity.
+        movable: blocks that may show dynamic objects, as ``movable_of`` returns them.
+    """
     inverse = np.divide(1.0, blocks.z_m, out=np.zeros_like(blocks.z_m), where=blocks.z_m > 0)
     return RayPicture(inverse, blocks.camera, T_level_camera, noise, focal_baseline_px_m, movable)
 
@@ -126,7 +143,7 @@ def _library() -> ctypes.CDLL:
 
 @dataclass(slots=True)
 class _State:
-    """What is adjusted: pose of the reference's level frame in the surfels' frame, log scale, disparity offset (px)."""
+    """The unknowns: pose of the reference's level frame in the surfels' frame, log scale, disparity offset (px)."""
 
     R: Rotation
     t: Float64[NDArray[np.float64], "3"]
@@ -145,7 +162,7 @@ class _State:
 
 @dataclass(frozen=True, slots=True)
 class _Pull:
-    """Normal equations of all pixels, the scatter of their patches' pulls (where asked for), and how many pixels took part."""
+    """Normal equations of all pixels, scatter of the patches' gradients (0 if not requested), and number of pixels used."""
 
     H: Float64[NDArray[np.float64], "8 8"]
     b: Float64[NDArray[np.float64], "8"]
@@ -154,7 +171,16 @@ class _Pull:
 
 
 def met_by(sights: Sights, pictures: list[RayPicture], found: Registered) -> list[Int32[NDArray[np.int32], "H W"]]:
-    """What the rays of all pictures meet (``Sights.meet``) from a registered pose; arguments as in ``adjust``."""
+    """Cast the rays of all images from a registered pose (``Sights.meet``).
+
+    Args:
+        sights: ray casting on the map.
+        pictures: images of the query, the reference's first.
+        found: registered pose of the reference's level frame, map frame.
+
+    Returns:
+        For each image the index of the surfel in each pixel, -1 for none.
+    """
     state = _state_of(sights.cloud, found)
     return [sights.meet(state.camera_of(picture), picture.camera) for picture in pictures]
 
@@ -166,24 +192,24 @@ def _state_of(cloud: SurfelMap, found: Registered) -> _State:
 def adjust(
     sights: Sights, pictures: list[RayPicture], found: Registered, settings: RaySettings
 ) -> tuple[Registered, Float64[NDArray[np.float64], "8 8"]] | None:
-    """Move a registered pose to where the rays of all pictures agree best with the map; None where too little is met.
+    """Adjust a registered pose so that the measured inverse depths of all images agree best with the map along their rays.
 
     Args:
-        sights: what the rays meet of the map, by the same settings.
-        pictures: the reference's first.
-        found: of the reference's level frame.
-        settings: of the solver.
+        sights: ray casting on the map, with the same settings.
+        pictures: images of the query, the reference's first.
+        found: registered pose of the reference's level frame, map frame.
+        settings: of the adjustment.
 
     Returns:
-        The pose, its ``information`` that of the pixels alone, and the sum over patches of the outer products of their pulls
-        (as in ``scatter_of``).
+        The adjusted pose and the scatter of the patches' gradients, as in ``scatter_of``. The pose's ``information`` excludes the priors.
+        None if fewer than ``settings.fewest`` pixels intersect the map.
     """
     cloud, state = sights.cloud, _state_of(sights.cloud, found)
     free = np.ones(UNKNOWNS, bool)
     free[7] = pictures[0].focal_baseline_px_m is not None
     sigma = np.r_[np.full(3, settings.position_m), np.full(3, settings.turn_rad), settings.scale, settings.offset_px]
     prior, moved = np.diag(sigma**-2.0), np.zeros(UNKNOWNS)
-    moved[6:] = state.log_scale, state.offset  # these priors are about none, the pose's about what was registered
+    moved[6:] = state.log_scale, state.offset  # priors of scale and offset: mean 0; of the pose: the start
     for _ in range(settings.rounds):
         before = moved
         met = [sights.meet(state.camera_of(picture), picture.camera) for picture in pictures]
@@ -231,7 +257,10 @@ def _pull(
 
 
 def _scattered(pulls: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum of the outer products of what 2 x 2 patches pull together: a car that has moved is as wide."""
+    """Sum of the outer products of the gradients, joined over 2 x 2 patches because a car that has moved is as wide.
+
+    The factor for few patches is as in ``scatter_of``.
+    """
     padded = np.pad(pulls, [(0, pulls.shape[0] % 2), (0, pulls.shape[1] % 2), (0, 0)])
     joint = (padded[0::2, 0::2] + padded[1::2, 0::2] + padded[0::2, 1::2] + padded[1::2, 1::2]).reshape(-1, UNKNOWNS)
     told = int((joint != 0).any(axis=1).sum())
@@ -239,11 +268,11 @@ def _scattered(pulls: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _turned_by(vector_rad: Float64[NDArray[np.float64], "3"]) -> Rotation:
-    """Right-handed rotation about a vector, by its length in radians (Rodrigues)."""
+    """Right-handed rotation about a vector by its length in radians (Rodrigues' formula)."""
     angle = float(np.linalg.norm(vector_rad))
     x, y, z = vector_rad
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    # Near zero both quotients by their series: neither loses digits nor divides by nothing.
+    # Near 0 the series replace both quotients: they avoid cancellation and a division by 0.
     small = angle < 1e-4
     first = 1 - angle**2 / 6 if small else np.sin(angle) / angle
     second = 0.5 - angle**2 / 24 if small else (1 - np.cos(angle)) / angle**2

@@ -1,4 +1,7 @@
-"""Several starts for every hypothesis, coarse first; the best of each hypothesis goes on, the best few of those to the end."""
+"""Register a query from several starts per hypothesis, in a coarse, a middle and a fine stage.
+
+The best states of each hypothesis go on to the middle stage. The most promising of those go on to the fine stage.
+"""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,9 +17,13 @@ from service.registration.surfel_map import SurfelMap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """Where a query may have been taken: level frame in the map; ``hypothesis`` says whose start it is.
+    """A pose that registration starts from.
 
-    ``similarity`` is what spoke for it before any registration.
+    Attributes:
+        R_map_level: rotation from the query's level frame to the map frame.
+        camera_m: position of the camera, map frame, m.
+        hypothesis: number of the hypothesis that the start belongs to.
+        similarity: similarity of the descriptors, known before registration.
     """
 
     R_map_level: Rotation
@@ -27,21 +34,29 @@ class Start:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationSettings:
-    """Ours, November 2026, after feasibility.md.
+    """Settings of registration, of November 2026, after the feasibility study.
 
     Attributes:
-        offsets_m: of the starts from each hypothesis, along and across its heading.
-        turns_rad: of further starts at every offset, where hypotheses are few enough;
-        most_starts: that is, if no more than this come of it.
-        coarse_points: so many of the points take part in the coarse stage, from every start;
-        kept: states that go on, as many of each hypothesis, ``kept_of_each`` at the least and at the most; the few points of
-            the coarse stage do not tell which hypothesis is right, and hardly which start.
-        middle_points: so many of the points take part in the middle stage.
-        refined: of those that are carried to the end, over all hypotheses;
-        similarity_weight: of the starts' similarity against the share of inliers, when these are chosen.
-        apart_m: two of them stand at least this far apart.
-        fine_weight: no point weighs less at the end. What may have moved misleads the search, but near the right pose the
-            robust kernel knows what did move, and vehicles that stayed are the best measured surfaces there are.
+        offsets_m: offsets of the starts from each hypothesis, along and across its heading, m.
+        turns_rad: extra yaw offsets at each position, rad. They are used only if the number of starts stays within ``most_starts``.
+        most_starts: largest number of starts with extra yaw offsets.
+        coarse_points: largest number of points in the coarse stage.
+        kept: states that go on after the coarse stage, divided equally among the hypotheses. The few points of the coarse stage
+            do not show which hypothesis is right, and hardly which start.
+        kept_of_each: least and largest number of states to keep per hypothesis. These limits override ``kept``.
+        middle_points: largest number of points in the middle stage.
+        refined: largest number of states in the fine stage, over all hypotheses.
+        similarity_weight: weight of the starts' similarity against the share of inliers, when the states for the fine stage are chosen.
+        apart_m: least distance between two states that go on, m.
+        fine_weight: least weight of a point in the fine stage. Dynamic objects mislead the search, so their points have less weight
+            before. Near the right pose the robust kernel rejects objects that moved. Vehicles that stayed are the best measured
+            surfaces (decision 0026).
+        coarse: solver options of the coarse stage.
+        middle: solver options of the middle stage.
+        fine: solver options of the fine stage.
+        tolerance_m: standard deviation of a point's distance to its surface in the score, m, apart from its noise. The coarse stage
+            has 0.3 m instead.
+        ground_m: points lower than this above the ground do not count in the score, m.
     """
 
     offsets_m: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1.8, 0.0), (-1.8, 0.0), (0.0, 1.2), (0.0, -1.2))
@@ -55,7 +70,7 @@ class RegistrationSettings:
     similarity_weight: float = 4.0
     apart_m: float = 0.5
     fine_weight: float = 1.0
-    #: Surfaces count as rough at first, or what is near and well measured, mostly vehicles, would pull everything its way.
+    #: The coarse stage assumes rough surfaces. Otherwise near, well measured points, mostly on vehicles, would dominate the gradient.
     coarse: SolverOptions = field(
         default_factory=lambda: SolverOptions(
             iterations=6, reach=1.2, robust_first=0.8, robust_last=0.3, surface=0.1, prior_weight=0.02
@@ -73,16 +88,16 @@ class RegistrationSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """One refined start.
+    """A registered pose.
 
     Attributes:
-        R_map_level: level frame of the query in the map.
-        camera_m: of the camera, map frame.
-        scale: the depth's own scale error, estimated.
-        offset: of the disparity, px, estimated; 0 where no rig is known.
-        inliers: share of the query's weight that lies on the map.
-        information: 8 x 8 of translation, rotation, log scale, disparity offset; without the priors.
-        hypothesis: whose start it was.
+        R_map_level: rotation from the query's level frame to the map frame.
+        camera_m: position of the camera, map frame, m.
+        scale: estimated factor from measured to true depth.
+        offset: estimated disparity offset, px; 0 if no stereo rig is known.
+        inliers: weighted share of the query's points that lie on the map, from 0 to 1.
+        information: information matrix without the priors. Order: translation (m), rotation (rad), log scale, disparity offset (px).
+        hypothesis: number of the hypothesis that the start belonged to.
     """
 
     R_map_level: Rotation
@@ -97,7 +112,15 @@ class Registered:
 def register(
     cloud: SurfelMap, points: QueryPoints, starts: list[Start], height_m: float, settings: RegistrationSettings
 ) -> tuple[Registered, ...]:
-    """Register a query from every start; the best supported comes first."""
+    """Register a query from every start and return the refined poses, the largest share of inliers first.
+
+    Args:
+        cloud: surfel map.
+        points: of the query, in its level frame.
+        starts: at least one. If a hypothesis has several, the similarity of its last one counts.
+        height_m: height of the camera above the ground, m.
+        settings: of registration.
+    """
     states, owner = _states(cloud, starts, settings)
     ground = settings.ground_m - height_m
     align(
@@ -124,7 +147,15 @@ def register(
 def score(
     cloud: SurfelMap, points: QueryPoints, states: NDArray[Any], height_m: float, settings: RegistrationSettings
 ) -> None:
-    """Tell every state (``STATE``, in place) its share of inliers where it stands."""
+    """Compute the share of inliers of every state at its present pose, in place.
+
+    Args:
+        cloud: surfel map.
+        points: of the query, in its level frame.
+        states: poses in the surfels' frame, (n,) of ``STATE``. Their field ``inliers`` is overwritten.
+        height_m: height of the camera above the ground, m.
+        settings: of registration.
+    """
     score_only = replace(settings.fine, iterations=0)
     align(
         cloud.grid, cloud.surfels, points, states, score_only, tolerance_m=settings.tolerance_m,
@@ -133,7 +164,13 @@ def score(
 
 
 def registered_of(state: Any, hypothesis: int, origin_m: Float64[NDArray[np.float64], "3"]) -> Registered:
-    """A state of the kernel (``STATE``) as a pose in the map frame."""
+    """Convert a state of the kernel to a pose in the map frame.
+
+    Args:
+        state: one ``STATE``, in the surfels' frame.
+        hypothesis: number of the hypothesis that its start belonged to.
+        origin_m: origin of the surfels' frame, map frame, m.
+    """
     return Registered(
         state["R"].copy(), state["t"] + origin_m, float(np.exp(state["log_scale"])), float(state["offset"]), float(state["inliers"]),
         state["information"].copy(), hypothesis,
@@ -158,7 +195,7 @@ def _states(
 
 
 def _best_of_each(states: NDArray[Any], owner: NDArray[np.intp], settings: RegistrationSettings) -> list[int]:
-    """The best supported states of each hypothesis that stand apart."""
+    """Rows of the states with most inliers of each hypothesis, at least ``apart_m`` apart."""
     groups = [np.flatnonzero(owner == number) for number in np.unique(owner)]
     least, most = settings.kept_of_each
     each = min(max(settings.kept // len(groups), least), most)
@@ -170,7 +207,7 @@ def _best_of_each(states: NDArray[Any], owner: NDArray[np.intp], settings: Regis
 
 
 def _distinct(states: NDArray[Any], promise: NDArray[np.float64], most: int, apart_m: float) -> list[int]:
-    """The most promising states that stand apart."""
+    """Rows of the most promising states that are at least ``apart_m`` apart."""
     kept: list[int] = []
     for k in np.argsort(-promise, kind="stable"):
         if all(np.linalg.norm(states["t"][k] - states["t"][other]) >= apart_m for other in kept):

@@ -1,7 +1,7 @@
-"""Does the map, drawn as the camera would see it from a pose, agree with what the camera saw?
+"""Compare the measured depth with the depth that the map shows from a pose.
 
-Points in front of the mapped surface are natural: something stands there now. Points behind it are not: the camera would have
-looked through a wall. The share of inliers knows neither, since it asks only for the nearest surface.
+Points in front of the mapped surface are plausible: an object stands there now. Points behind it are not: the camera would have
+looked through a wall. The share of inliers detects neither, because it uses only the nearest surface.
 """
 
 from dataclasses import dataclass
@@ -16,10 +16,13 @@ from service.registration.kernel import BeamModel, QueryPoints, agree, render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
 
-WIDTH = 80  # of the picture drawn, pixels
+#: Width of the rendered image, px.
+WIDTH = 80
+#: Edge of the square that represents a surfel, m.
 SURFEL_M = 0.4
+#: Largest rendered depth, m.
 REACH_M = 45.0
-#: Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 6.3. Chosen on the watch cities.
+#: Thrun, Burgard and Fox, Probabilistic Robotics, 2005, section 6.3. Chosen on the validation cities.
 _BEAM = BeamModel(
     hit=0.6, new=0.25, gone=0.02, any=0.05, rough_m=0.15, span_m=40.0, certain=3.0, margin_m=0.25, nothing_m=60.0
 )
@@ -27,13 +30,13 @@ _BEAM = BeamModel(
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Of a query with the map as drawn at a pose.
+    """Agreement of a query's depth with the map rendered at a pose.
 
     Attributes:
-        likelihood: mean logarithm of the beam model's density, 1/m.
-        through: share of the points seen behind mapped surfaces.
-        front: share in front of them.
-        unmapped: share where the map shows nothing.
+        likelihood: mean logarithm of the beam model's density (1/m).
+        through: share of the points behind the mapped surfaces.
+        front: share of the points in front of the mapped surfaces.
+        unmapped: share of the points where the map shows no surface.
     """
 
     likelihood: float
@@ -43,21 +46,25 @@ class Agreement:
 
     @staticmethod
     def mean(of: list["Agreement"]) -> "Agreement":
-        """Of several pictures of one pose, at least one."""
+        """Average the agreement of several images of one pose.
+
+        Args:
+            of: agreement of each image, at least one.
+        """
         return Agreement(*(float(np.mean([getattr(each, name) for each in of])) for name in Agreement.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """Points of a query as pixels of the small picture that the map is drawn on; the same for every pose.
+    """Points of a query, projected into the small image that the map is rendered to; the same for every pose.
 
     Attributes:
-        camera: of the small picture.
-        R_level_camera: of the query's level.
-        pixel: of each point, row by row.
-        z: depth of each, metres, as measured.
-        sigma: its standard deviation, metres.
-        q: as in ``QueryPoints``.
+        camera: intrinsics of the small image.
+        R_level_camera: rotation from the camera's optical frame to the query's level frame.
+        pixel: index of each point's pixel, counted row by row.
+        z: measured depth of each point along the optical axis, m.
+        sigma: standard deviation of ``z``, m.
+        q: as in ``QueryPoints``, 1/px.
     """
 
     camera: PinholeCamera
@@ -72,12 +79,12 @@ class Seen:
 
 
 def seen_by(points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation) -> Seen:
-    """Prepare a query for ``agreement``.
+    """Project the points of a query for ``agreement``.
 
     Args:
-        points: of the query, its level frame.
-        camera: of the query.
-        R_level_camera: of the query's level.
+        points: of the query, in its level frame.
+        camera: intrinsics of the query.
+        R_level_camera: rotation from the camera's optical frame to the query's level frame.
     """
     small = camera.scaled_to(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
     optical: Float64[NDArray[np.float64], "n 3"] = points.xyz @ R_level_camera
@@ -90,12 +97,12 @@ def seen_by(points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation
 
 
 def agreement(cloud: SurfelMap, seen: Seen, candidate: Registered) -> Agreement:
-    """Draw the map at a candidate's pose and compare.
+    """Render the map at a candidate's pose and compare the query's depth with it.
 
     Args:
-        cloud: the map's.
-        seen: the query.
-        candidate: the pose.
+        cloud: surfel map.
+        seen: projected points of the query.
+        candidate: the registered pose, map frame.
     """
     T = transform_from(candidate.R_map_level @ seen.R_level_camera, candidate.camera_m - cloud.origin_m)
     drawn = render(

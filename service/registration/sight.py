@@ -1,7 +1,7 @@
-"""What the rays of a small picture meet of the map: its surfels as discs, each in its own plane.
+"""Cast the rays of a small image on the map: each surfel is a disc in its own plane.
 
-A question asks that from several poses that are metres apart, and of the tiles around them a camera sees a tenth. So what can be
-seen from anywhere near a pose is gathered once.
+One request casts rays from several poses that are metres apart. A camera sees a tenth of the tiles around these poses. So the
+surfels that are visible from anywhere near a pose are collected once and reused.
 """
 
 import ctypes
@@ -23,24 +23,24 @@ from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M, SurfelMap
 
 LIBRARY = Path(__file__).with_name("_rays.so")
-#: Poses that differ by no more than this see what has been gathered at one of them.
+#: Largest distance (m) and rotation (rad) of a pose from the one whose collected surfels it reuses.
 NEAR_M, NEAR_RAD = 2.0, 0.1
-#: So many gatherings are kept, the last that were asked: a megabyte or two each, and a question has as many frames.
+#: Number of collections to keep, the last used ones. Each takes one or two megabytes, and a request has at most 16 frames.
 KEPT = 16
-#: Gathered is this much more, so that rounding leaves nothing out.
+#: Margin added to both limits (m, rad), so that rounding loses no surfel.
 ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscSettings:
-    """Ours, November 2026; chosen on watch cities.
+    """Settings of the discs, chosen on validation cities in November 2026.
 
     Attributes:
-        radius_m: of the disc that a surfel is taken for.
-        behind_m: discs so far behind the first one on a ray may be the same surface.
-        grazing: cosine; discs seen flatter are not met.
-        nearest_m: of depths that count, and
-        reach_m: the furthest.
+        radius_m: radius of a surfel's disc, m.
+        behind_m: discs up to this depth behind the first one on a ray may be the same surface, m.
+        grazing: least cosine between a disc's normal and the line of sight; rays ignore discs seen flatter.
+        nearest_m: least depth that counts, m.
+        reach_m: largest depth that counts, m.
     """
 
     radius_m: float = 0.2
@@ -50,21 +50,26 @@ class DiscSettings:
     reach_m: float = 40.0
 
 
-#: Room for one surfel in the camera's axes: position, normal, number, the pixels that it may cover.
+#: Work memory for one surfel in the camera's axes: position, normal, index, and the range of pixels that it may cover.
 _DISC = np.dtype(
     [("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), *((name, "<i4") for name in ("number", "left", "right", "top", "bottom"))]
 )  # fmt: skip
 
 
 class View(Structure):
-    """A small picture's camera and where it stands, as ``rays.c`` takes them."""
+    """Intrinsics and pose of a small image's camera, as ``rays.c`` takes them."""
 
     _fields_ = [("R", c_double * 9), ("t", c_double * 3), *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
                 ("width", c_int64), ("height", c_int64)]  # fmt: skip
 
     @classmethod
     def of(cls, T_map_camera: Transform, camera: PinholeCamera) -> "View":
-        """The pose is in the surfels' frame."""
+        """Convert a camera and its pose.
+
+        Args:
+            T_map_camera: pose of the camera in the surfels' frame.
+            camera: intrinsics of the small image.
+        """
         return cls(
             (c_double * 9)(*T_map_camera[:3, :3].ravel()), (c_double * 3)(*T_map_camera[:3, 3]), camera.fx, camera.fy, camera.cx,
             camera.cy, camera.width, camera.height,
@@ -91,7 +96,7 @@ def _library() -> ctypes.CDLL:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Gathered:
-    """Surfels that a camera may see from near a pose, in the map's order, and their numbers in the map."""
+    """Surfels that a camera may see from near a pose, in the map's order, and their indices in the map."""
 
     T_map_camera: Transform
     camera: PinholeCamera
@@ -99,7 +104,7 @@ class _Gathered:
     numbers: Int32[NDArray[np.int32], " n"]
 
     def holds(self, T_map_camera: Transform, camera: PinholeCamera) -> bool:
-        """Whether all that is seen from there is among them."""
+        """Whether these surfels include all that the camera sees from a pose."""
         if camera != self.camera or np.linalg.norm(T_map_camera[:3, 3] - self.T_map_camera[:3, 3]) > NEAR_M:
             return False
         # The trace of a rotation is 1 + 2 cos of its angle.
@@ -108,10 +113,19 @@ class _Gathered:
 
 
 class Sights:
-    """What one question's rays meet, from wherever it is asked; each pose is looked up once."""
+    """Ray casting for one request; each pose of a camera is computed once.
+
+    Attributes:
+        cloud: surfel map.
+    """
 
     def __init__(self, cloud: SurfelMap, settings: DiscSettings) -> None:
-        """The map's cloud, and what of it is met."""
+        """Prepare ray casting on a map.
+
+        Args:
+            cloud: surfel map.
+            settings: of the discs.
+        """
         self.cloud = cloud
         self._settings = settings
         self._discs = _Discs(
@@ -121,11 +135,11 @@ class Sights:
         self._met: dict[tuple[bytes, PinholeCamera], Int32[NDArray[np.int32], "H W"]] = {}
 
     def meet(self, T_map_camera: Transform, camera: PinholeCamera) -> Int32[NDArray[np.int32], "H W"]:
-        """Number of the surfel that each pixel's ray meets, -1 for none.
+        """Return the index of the surfel that each pixel's ray intersects, -1 for none.
 
         Args:
-            T_map_camera: in the surfels' frame.
-            camera: of a small picture.
+            T_map_camera: pose of the camera in the surfels' frame.
+            camera: intrinsics of the small image.
         """
         asked = T_map_camera.tobytes(), camera
         if asked not in self._met:
@@ -154,13 +168,14 @@ class Sights:
             byref(self._discs), NEAR_M + ROUNDING, NEAR_RAD + ROUNDING, surfels.ctypes.data, numbers.ctypes.data,
         )  # fmt: skip
         for each in (surfels, numbers):
-            each.resize(count, refcheck=False)  # gives back what was not needed
+            each.resize(count, refcheck=False)  # frees the unused memory
         return _Gathered(T_map_camera, camera, surfels, numbers)
 
     def _tiles_in_view(self, T_map_camera: Transform, camera: PinholeCamera) -> NDArray[np.int64]:
-        """First surfel and count of the tiles that a camera may see from near a pose.
+        """First surfel and number of surfels of the tiles that a camera may see from near a pose: (tiles, 2).
 
-        Seen from above, its field of view lies in the hull of where it stands and of what is furthest in its corners.
+        Seen from above, the field of view lies in the convex hull of five points. They are the camera and the four corners of the image
+        at the largest depth.
         """
         u, v = (np.array([-0.5, side - 0.5]) for side in (camera.width, camera.height))
         x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
@@ -178,6 +193,6 @@ class Sights:
             outward = np.array([along[1], -along[0]]) / length
             sides = (hull - hull[one]) @ outward
             for sign in (1.0, -1.0):
-                if (sign * sides <= 1e-6).all():  # all of it lies on the other side of this edge
+                if (sign * sides <= 1e-6).all():  # an edge of the hull: all points lie on its inner side
                     seen &= sign * ((away - hull[one]) @ outward) <= half
         return np.ascontiguousarray(self.cloud.tiles[seen, 2:4].astype(np.int64))

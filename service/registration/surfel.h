@@ -1,4 +1,4 @@
-/* A surface element of the map, as surfel arrays hold it (SURFEL in kernel.py). */
+/* One surfel of the map, as the surfel arrays hold it (SURFEL in kernel.py): metres in the surfels' frame, unit normal. */
 #ifndef STREETFIX_SURFEL_H
 #define STREETFIX_SURFEL_H
 #include <stdint.h>

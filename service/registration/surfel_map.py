@@ -1,6 +1,6 @@
-"""The prepared cloud of a map: surfels, the tiles they are sorted by, and a grid of nearest surfels.
+"""The surfel map of a map bundle: surfels, the tiles they are sorted by, and a lookup grid of nearest surfels.
 
-All of it is made when the map is built and read as it lies on the disk; a request builds nothing.
+``build-map`` computes all of it, and the service reads it as it is on disk. A request builds nothing.
 """
 
 from collections.abc import Mapping
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from service.errors import BundleError
 from service.registration.kernel import BLOCK, SURFEL, NearestGrid, nearest_grid
 
-#: Cells of the grid and how far from a surface they reach, metres.
+#: Edge of a cell of the lookup grid, and largest distance from a surfel to a cell that refers to it, m.
 CELL_M, REACH_M = 0.4, 1.2
-#: Edge of a tile, metres.
+#: Edge of a tile, m.
 TILE_M = 40.0
 
 
 _FLOATS, _NUMBERS, _BRIGHT = np.dtype("<f8"), np.dtype("<i4"), np.dtype("<f4")
-#: Of each surfel, where the survey's sensor told it; maps of earlier releases have none.
+#: Name of the array of intensities. Maps of earlier releases, or of a sensor without intensity, do not have it.
 BRIGHTNESS = "brightness"
-#: Type and shape of every other array; -1 is any length.
+#: Type and shape of every other array by name; -1 is any length.
 _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
     "origin": (_FLOATS, (3,)), "surfels": (SURFEL, (-1,)), "tiles": (_FLOATS, (-1, 4)),
     "grid_frame": (_FLOATS, (4,)), "grid_block": (_NUMBERS, (-1, -1, -1)), "grid_nearest": (_NUMBERS, (-1, BLOCK**3)),
@@ -32,15 +32,16 @@ _EXPECTED: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfelMap:
-    """Surfels relative to ``origin_m`` (map frame), what prepares them for a request, and their tiles for drawing.
+    """Surfels, their tiles for rendering, and their lookup grid for registration.
+
+    Positions are relative to ``origin_m``, with the axes of the map frame. We call this the surfels' frame.
 
     Attributes:
-        origin_m: of the surfels' frame, map frame.
-        surfels: of dtype ``SURFEL``, sorted by tile.
-        tiles: centre x, y (the surfels' frame, m), first surfel, count.
-        grid: of the surfel nearest to each cell.
-        brightness: of each surfel: mean intensity of its returns as the sensor gives it, NaN where it told none; None where the map
-            says nothing of it.
+        origin_m: origin of the surfels' frame, map frame, m.
+        surfels: (S,) of ``SURFEL``, sorted by tile.
+        tiles: centre x, y (surfels' frame, m), first surfel, number of surfels.
+        grid: lookup grid of the nearest surfel.
+        brightness: mean intensity of each surfel's returns in the sensor's unit, NaN where unknown; None if the map has no intensities.
     """
 
     origin_m: Float64[NDArray[np.float64], "3"]
@@ -54,13 +55,26 @@ class SurfelMap:
         cls, origin_m: Float64[NDArray[np.float64], "3"], surfels: NDArray[Any], tiles: Float64[NDArray[np.float64], "n 4"],
         brightness: Float32[NDArray[np.float32], " s"] | None = None,
     ) -> "SurfelMap":  # fmt: skip
-        """Build the grid; seconds for a district. A brightness that is nowhere above 0, as of a sensor that tells none, is none."""
+        """Build the lookup grid of a map; this takes seconds for a district.
+
+        Args:
+            origin_m: origin of the surfels' frame, map frame, m.
+            surfels: (S,) of ``SURFEL``, sorted by tile.
+            tiles: centre x, y (surfels' frame, m), first surfel, number of surfels.
+            brightness: mean intensity of each surfel's returns, NaN where unknown. An array without a value above 0 comes from a sensor
+                without intensity and counts as None.
+        """
         if brightness is not None and not (brightness > 0).any():
             brightness = None
         return cls(origin_m, surfels, tiles, nearest_grid(surfels, cell_m=CELL_M, reach_m=REACH_M), brightness)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What is written, by name; ``from_arrays`` reads it again."""
+        """Return the arrays to write, by name; ``from_arrays`` reads them again.
+
+        Returns:
+            origin (3,), surfels (S,), tiles (T, 4), grid_frame (4,), grid_block (X, Y, Z), grid_nearest (B, 512). A map with intensities
+            also has brightness (S,). ``grid_frame`` holds the grid's origin and the edge of its cells, m.
+        """
         arrays = {
             "origin": self.origin_m, "surfels": self.surfels, "tiles": self.tiles,
             "grid_frame": np.array([*self.grid.origin_m, self.grid.cell_m]), "grid_block": self.grid.block,
@@ -70,14 +84,15 @@ class SurfelMap:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], *, verify: bool = True) -> "SurfelMap":
-        """Put read or memory-mapped arrays together.
+        """Assemble a map from arrays that were read or memory-mapped.
 
         Args:
-            arrays: as ``arrays`` gave them.
-            verify: look at every index: the kernel trusts them.
+            arrays: arrays by name, as ``arrays`` returns them: origin (3,), surfels (S,), tiles (T, 4), grid_frame (4,),
+                grid_block (X, Y, Z), grid_nearest (B, 512) and, if the map has intensities, brightness (S,).
+            verify: check every index and number. The kernel itself does not check them.
 
         Raises:
-            BundleError: an array is missing, of another type or shape, or points outside another; its name is given.
+            BundleError: an array is missing, has a wrong type or shape, or refers outside another. The error names the array.
         """
         for name, (dtype, shape) in _EXPECTED.items():
             if name not in arrays:
@@ -97,10 +112,10 @@ class SurfelMap:
         return found
 
     def require_consistent(self) -> None:
-        """Refuse indices that point outside, and numbers that are none.
+        """Check that all indices refer to existing entries and that all numbers make sense.
 
         Raises:
-            BundleError: naming the array.
+            BundleError: an index refers outside its array, or a number is not finite or otherwise invalid. The error names the array.
         """
         if not np.isfinite(self.grid.origin_m).all() or not self.grid.cell_m > 0:
             raise _defect("grid_frame", "it is no frame")
