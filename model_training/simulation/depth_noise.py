@@ -1,6 +1,6 @@
 """Errors of a depth camera that triangulates: they grow with the square of the distance.
 
-Presets after feasibility.md (November 2026): ``precise`` and ``stereo``, both at focal length x baseline = 80 px m.
+Presets of the feasibility study (November 2026): ``precise`` and ``stereo``, both at focal length x baseline = 80 px m.
 Gross errors of stereo matching (bleeding edges, invented depth in sky, glass and blank walls, holes): Scharstein and
 Szeliski, IJCV 47, 2002; Menze and Geiger, CVPR 2015.
 """
