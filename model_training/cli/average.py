@@ -12,13 +12,15 @@ from service.errors import DatasetError
 
 
 def command(
-    first: Annotated[Path, typer.Argument(help="folder of a training run")],
-    second: Annotated[Path, typer.Argument(help="folder of the run that started from it")],
-    run: Annotated[Path, typer.Option(help="folder of the run to write")],
-    share: Annotated[float, typer.Option(help="of the second run in the mean", min=0, max=1)] = 0.5,
-    packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
+    first: Annotated[Path, typer.Argument(help="Folder of a training run.")],
+    second: Annotated[Path, typer.Argument(help="Folder of the run that started from the first run.")],
+    run: Annotated[Path, typer.Option(help="Folder of the run to write.")],
+    share: Annotated[float, typer.Option(help="Weight of the second run in the mean.", min=0, max=1)] = 0.5,
+    packs: Annotated[Path, typer.Option(help="Folder of the simulated training cities.")] = Path("runs/packs"),
 ) -> None:
-    """Average two runs' weights, so that the second's gain costs less of what only the first knew.
+    """Average the weights of two training runs.
+
+    The mean keeps the gain of the second run. It loses less of what only the first run learnt.
 
     \b
     Example:

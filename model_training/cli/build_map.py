@@ -13,39 +13,57 @@ from model_training.stock import CALIBRATION, ENCODER
 
 
 def command(
-    dataset: Annotated[Path, typer.Argument(help="dataset folder with a survey")],
-    out: Annotated[Path, typer.Option(help="folder of the bundle")],
+    dataset: Annotated[Path, typer.Argument(help="Dataset folder with a survey.")],
+    out: Annotated[Path, typer.Option(help="Folder of the map bundle.")],
     encoder: Annotated[
-        Path, typer.Option(help="ONNX file of `streetfix export` [default: the stock encoder]")
+        Path, typer.Option(help="ONNX file of `streetfix export`. The default is the stock encoder.")
     ] = ENCODER,
-    name: Annotated[str, typer.Option(help="how requests address the map [default: the dataset's name]")] = "",
-    spacing: Annotated[float, typer.Option(help="travelled metres between places; 0 takes every scan", min=0)] = 1.0,
+    name: Annotated[str, typer.Option(help="Name of the map in requests.  [default: the dataset's name]")] = "",
+    spacing: Annotated[
+        float, typer.Option(help="Travelled distance between places, metres. 0 takes every scan.", min=0)
+    ] = 1.0,
     headings: Annotated[
-        int, typer.Option(help="views of each place; the stock encoder was trained for 24", min=1, max=360)
+        int, typer.Option(help="Map views of each place. The stock encoder was trained for 24.", min=1, max=360)
     ] = 24,
-    voxel: Annotated[float, typer.Option(help="edge of the cloud's voxels, metres", min=0.01)] = 0.3,
-    lidar_height: Annotated[float, typer.Option(help="of the LiDAR above the ground, roughly, metres", min=0.1)] = 1.8,
-    remove_weather: Annotated[bool, typer.Option(help="drop lone points such as rain and snow by local PCA")] = False,
+    voxel: Annotated[float, typer.Option(help="Edge length of the cloud's voxels, metres.", min=0.01)] = 0.3,
+    lidar_height: Annotated[
+        float, typer.Option(help="Approximate height of the LiDAR above the ground, metres.", min=0.1)
+    ] = 1.8,
+    remove_weather: Annotated[
+        bool, typer.Option(help="Drop isolated points such as rain and snow by local PCA.")
+    ] = False,
     passes_vote: Annotated[
-        bool, typer.Option(help="drop what more passes of the survey look through than hit: vehicles that were moved")
+        bool,
+        typer.Option(
+            help="Visibility vote between passes: drop points that more passes see through than hit, such as moved "
+            "vehicles."
+        ),
     ] = False,
     traffic_vote: Annotated[
         bool,
-        typer.Option(help="drop what later scans of a drive look through: vehicles that drove while it was surveyed"),
+        typer.Option(
+            help="Visibility vote between scans: drop points that later scans of a traversal see through, such as "
+            "driving vehicles."
+        ),
     ] = True,
     align_survey: Annotated[
         bool,
         typer.Option(
-            help="bring the survey's scans into agreement first: poses are off by centimetres, scans tell by how much"
+            help="Align the survey's scans first. Survey poses are off by centimetres, and the scans show by how much."
         ),
     ] = True,
-    licence: Annotated[str, typer.Option(help="licence text kept in the manifest")] = "",
+    licence: Annotated[str, typer.Option(help="Licence text for the manifest.")] = "",
     calibration: Annotated[
-        Path, typer.Option(help="of `streetfix calibrate` for the same encoder [default: the stock encoder's]")
+        Path,
+        typer.Option(
+            help="File of `streetfix calibrate` for the same encoder. The default is the file of the stock encoder."
+        ),
     ] = CALIBRATION,
-    overwrite: Annotated[bool, typer.Option(help="replace a bundle that is there")] = False,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing map bundle.")] = False,
 ) -> None:
-    """Build a map bundle of a dataset's survey. Killed at any moment, the same command goes on where it was.
+    """Build a map bundle from a dataset's survey.
+
+    The same command resumes a build that was killed at any moment.
 
     \b
     Example:

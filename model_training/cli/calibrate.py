@@ -14,13 +14,17 @@ from service.errors import DatasetError
 
 def command(
     encoder: Annotated[
-        Path, typer.Option(help="ONNX file of `streetfix export` [default: the stock encoder]")
+        Path, typer.Option(help="ONNX file of `streetfix export`. The default is the stock encoder.")
     ] = ENCODER,
-    out: Annotated[Path, typer.Option(help="the calibration, JSON [default: beside the stock encoder]")] = CALIBRATION,
-    work: Annotated[Path, typer.Option(help="where cities, maps and answers are kept")] = Path("data/calibration"),
-    anew: Annotated[bool, typer.Option(help="ask all queries again, though their answers are kept")] = False,
+    out: Annotated[
+        Path, typer.Option(help="Calibration file to write, JSON. The default is beside the stock encoder.")
+    ] = CALIBRATION,
+    work: Annotated[Path, typer.Option(help="Folder that keeps cities, maps and answers.")] = Path("data/calibration"),
+    anew: Annotated[bool, typer.Option(help="Ask all queries again, even if their answers are kept.")] = False,
 ) -> None:
-    """Fit confidence for an encoder on simulated cities of their own; some half an hour.
+    """Fit the confidence of an encoder on calibration cities.
+
+    The command simulates these cities. It takes about half an hour.
 
     \b
     Example:

@@ -18,15 +18,21 @@ from service.maps.reader import MapBundle
 
 
 def command(
-    first: Annotated[Path, typer.Argument(metavar="A", help="folder of `evaluate --report`: what is compared with")],
-    second: Annotated[Path, typer.Argument(metavar="B", help="folder of `evaluate --report` over the same queries")],
+    first: Annotated[
+        Path, typer.Argument(metavar="A", help="Folder of `evaluate --report`. This run is the reference.")
+    ],
+    second: Annotated[Path, typer.Argument(metavar="B", help="Folder of `evaluate --report` over the same queries.")],
     out: Annotated[
-        Path | None, typer.Option(help="folder for a page to read, with the pictures of what changed")
+        Path | None, typer.Option(help="Folder for a report page with the images of the changed queries.")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write all figures here")] = None,
-    dataset: Annotated[Path | None, typer.Option(help="the queries' pictures [default: where A found them]")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="JSON file for all figures.")] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="Dataset with the query images.  [default: the dataset of A]")
+    ] = None,
 ) -> None:
-    """Compare two runs over the same queries: paired differences with intervals, and which queries changed sides.
+    """Compare two runs over the same queries.
+
+    The command reports paired differences with intervals. It also reports which queries changed sides.
 
     \b
     Example:

@@ -14,18 +14,23 @@ FORMATS = ("mcap", "sqlite3", "bag", "kitti-raw")
 
 
 def command(
-    dataset: Annotated[Path, typer.Argument(help="dataset folder")],
-    to: Annotated[str, typer.Option(help="mcap or sqlite3 (ROS 2), bag (ROS 1), kitti-raw")],
-    out: Annotated[Path, typer.Option(help="file or folder to write")],
+    dataset: Annotated[Path, typer.Argument(help="Dataset folder.")],
+    to: Annotated[str, typer.Option(help="Format: mcap or sqlite3 (ROS 2), bag (ROS 1), or kitti-raw.")],
+    out: Annotated[Path, typer.Option(help="File or folder to write.")],
     queries: Annotated[
-        str, typer.Option(help="query set whose pictures go in [default: the first with truth; '' for none]")
+        str,
+        typer.Option(
+            help="Query set whose images are written. auto takes the first set with ground truth. '' takes none."
+        ),
     ] = "auto",
 ) -> None:
-    """Write a dataset in another tool's format: survey first, then the pictures of a query set.
+    """Write a dataset in the format of another tool.
+
+    The command writes the survey first, then the images of a query set.
 
     \b
     Example:
-      streetfix convert data/small --to mcap --out small_mcap    # look at it in Foxglove or RViz
+      streetfix convert data/small --to mcap --out small_mcap    # view it in Foxglove or RViz
       streetfix import rosbag small_mcap --out data/again
     """
     if to not in FORMATS:

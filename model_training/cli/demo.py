@@ -16,19 +16,30 @@ from model_training.stock import ENCODER
 
 
 def command(
-    out: Annotated[Path | None, typer.Option(help="where all is kept [default: out/demo, out/demo-real]")] = None,
-    real: Annotated[Path | None, typer.Option(help="stereo frames in KITTI's object layout, not a city")] = None,
-    encoder: Annotated[Path, typer.Option(help="ONNX file of an encoder [default: the stock encoder]")] = ENCODER,
-    streets: Annotated[str, typer.Option(help="streets of the paper's city to map")] = "1,5,7",
-    queries: Annotated[int, typer.Option(help="picture pairs to ask", min=1)] = 12,
-    depth: Annotated[str, typer.Option(help="depth camera: ideal, precise or stereo")] = "precise",
-    seed: Annotated[int, typer.Option(help="of the city and its drives", min=0)] = 0,
-    port: Annotated[int, typer.Option(help="of the service; 0 lets the system choose", min=0, max=65535)] = 0,
-    once: Annotated[bool, typer.Option("--once", help="end after the answers instead of serving on")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of all results.  [default: out/demo, or out/demo-real with --real]")
+    ] = None,
+    real: Annotated[
+        Path | None, typer.Option(help="Folder of stereo frames in KITTI's object layout. They replace the city.")
+    ] = None,
+    encoder: Annotated[Path, typer.Option(help="ONNX file of an encoder. The default is the stock encoder.")] = ENCODER,
+    streets: Annotated[str, typer.Option(help="Streets of the paper's city to map.")] = "1,5,7",
+    queries: Annotated[int, typer.Option(help="Queries to send.", min=1)] = 12,
+    depth: Annotated[str, typer.Option(help="Depth camera: ideal, precise or stereo.")] = "precise",
+    seed: Annotated[int, typer.Option(help="Seed of the city and its traversals.", min=0)] = 0,
+    port: Annotated[int, typer.Option(help="Port of the service. 0 lets the system choose.", min=0, max=65535)] = 0,
+    once: Annotated[
+        bool, typer.Option("--once", help="End after the answers. Otherwise the service keeps running.")
+    ] = False,
 ) -> None:
-    """Make a map, serve it, ask it over HTTP where pictures were taken, and show the answers beside the truth.
+    """Build a map, serve it and compare answers with ground truth.
 
-    Example: streetfix demo --real KITTI --once
+    The command sends the queries over HTTP. It shows each answer beside the ground truth.
+
+    \b
+    Examples:
+      streetfix demo --once
+      streetfix demo --real KITTI --once
     """
     began, console = time.monotonic(), Console(highlight=False)
     with bars() as report:

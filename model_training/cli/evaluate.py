@@ -46,40 +46,50 @@ _CAPTION = (
 
 
 def command(
-    bundle: Annotated[Path, typer.Argument(help="map bundle")],
-    dataset: Annotated[Path, typer.Argument(help="dataset with query sets that have truth")],
+    bundle: Annotated[Path, typer.Argument(help="Map bundle.")],
+    dataset: Annotated[Path, typer.Argument(help="Dataset with query sets that have ground truth.")],
     queries: Annotated[
-        list[str] | None, typer.Option(help="query set; repeat for several [default: all with truth]")
+        list[str] | None, typer.Option(help="Query set. Repeat for several.  [default: all with ground truth]")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write all figures here")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="JSON file for all figures.")] = None,
     raw_baseline: Annotated[
-        bool, typer.Option("--raw-baseline", help="compare with the raw range image's nearest neighbour")
+        bool, typer.Option("--raw-baseline", help="Compare with the nearest neighbour of the raw range image.")
     ] = False,
     trajectory: Annotated[
-        Path | None, typer.Option(help="write the accepted poses in TUM format (one query set)")
+        Path | None, typer.Option(help="File for the poses of accepted answers, TUM format (one query set).")
     ] = None,
     predictions: Annotated[
-        Path | None, typer.Option(help="folder for the answers, NPZ a set, so that new measures need no run")
+        Path | None,
+        typer.Option(help="Folder for the answers, one NPZ file per query set. New measures then need no new run."),
     ] = None,
     report_folder: Annotated[
         Path | None,
-        typer.Option("--report", help="folder for a page to read (index.html), the answers and the run's settings"),
+        typer.Option(
+            "--report", help="Folder for a report page (index.html), the answers and the settings of the run."
+        ),
     ] = None,
     most: Annotated[
-        int, typer.Option("--list", help="queries that are listed one by one, the worst first; 0: none", min=0)
+        int, typer.Option("--list", help="Queries to list one by one, the worst first. 0 lists none.", min=0)
     ] = 10,
     stages: Annotated[
-        bool, typer.Option("--stages", help="say for each query which stage of the answer loses it; asks twice")
+        bool,
+        typer.Option(
+            "--stages",
+            help="Name the stage of the answer that loses each query. The command then asks each query twice.",
+        ),
     ] = False,
     refine: Annotated[
-        bool, typer.Option("--refine/--no-refine", help="register each query on the cloud, or measure retrieval alone")
+        bool,
+        typer.Option(
+            "--refine/--no-refine", help="Register each query on the map cloud. --no-refine measures retrieval alone."
+        ),
     ] = True,
-    workers: Annotated[int, typer.Option(help="queries at a time", min=1)] = 2,
+    workers: Annotated[int, typer.Option(help="Queries that run at a time.", min=1)] = 2,
 ) -> None:
-    """Measure a map against queries whose truth is known.
+    """Measure the answers of a map against ground truth.
 
     \b
-    Example:
+    Examples:
       streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
       streetfix evaluate maps/paper-city data/paper --report reports/paper
     """

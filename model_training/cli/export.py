@@ -11,10 +11,12 @@ from model_training.training.loop import load_run, trained_on
 
 
 def command(
-    run: Annotated[Path, typer.Argument(help="folder of a training run")],
-    out: Annotated[Path, typer.Option(help="ONNX file to write")],
+    run: Annotated[Path, typer.Argument(help="Folder of a training run.")],
+    out: Annotated[Path, typer.Option(help="ONNX file to write.")],
 ) -> None:
-    """Export a trained encoder to ONNX and check it against torch.
+    """Export a trained encoder to ONNX.
+
+    The command checks the ONNX file against torch.
 
     \b
     Example:

@@ -21,80 +21,95 @@ from service.errors import DatasetError
 #: Frames without poses, each a place of its own, are imported another way than drives.
 SINGLE_FRAMES = "kitti-object"
 DEPTHS = ("recorded", "stored", "sgbm", "lidar")
-_HELP = f"format: {', '.join(sorted([*KINDS, SINGLE_FRAMES]))}"
+_HELP = f"Format: {', '.join(sorted([*KINDS, SINGLE_FRAMES]))}."
 
 
 def command(
     kind: Annotated[str, typer.Argument(help=_HELP)],
-    source: Annotated[Path, typer.Argument(help="file or folder of the recording")],
-    out: Annotated[Path, typer.Option(help="folder to write the dataset to")],
+    source: Annotated[Path, typer.Argument(help="File or folder of the recording.")],
+    out: Annotated[Path, typer.Option(help="Folder of the dataset to write.")],
     depth: Annotated[
         str,
         typer.Option(
-            help="what a picture's depth is: recorded or stored beside it, sgbm of the stereo pair, lidar for the scan "
-            "nearest in time [default: recorded; kitti-object and kitti-360: sgbm]"
+            help="Depth of an image: recorded or stored beside the image, sgbm from the stereo pair, or lidar from "
+            "the scan nearest in time.  [default: recorded; kitti-object and kitti-360: sgbm]"
         ),
     ] = "",
     poses: Annotated[
         Path | None,
-        typer.Option(help="TUM file (timestamp x y z qx qy qz qw) instead of the recording's own poses"),
+        typer.Option(help="TUM file (timestamp x y z qx qy qz qw). It replaces the recording's own poses."),
     ] = None,
-    queries: Annotated[str, typer.Option(help="query set that pictures go to")] = "recorded",
-    pictures: Annotated[bool, typer.Option(help="take pictures at all")] = True,
+    queries: Annotated[str, typer.Option(help="Query set for the images.")] = "recorded",
+    pictures: Annotated[bool, typer.Option(help="Import images.")] = True,
     hold_out: Annotated[
         int,
         typer.Option(
-            help="leave each such scan out of the survey, and take only pictures near those as queries", min=0
+            help="Leave one scan in this many out of the survey. Only images near these scans become queries. "
+            "0 leaves none out.",
+            min=0,
         ),
     ] = 0,
     hold_out_first: Annotated[
         int | None,
-        typer.Option(help="with --hold-out: the first scan left out, from 0 [default: the last of each group]", min=0),
+        typer.Option(
+            help="With --hold-out: the first scan left out, counted from 0.  [default: the last of each group]", min=0
+        ),
     ] = None,
-    sync: Annotated[str, typer.Option(help="how a frame's pose is found: interpolate, or nearest")] = "interpolate",
-    tolerance: Annotated[float, typer.Option(help="seconds that a pose or scan may be from a frame", min=0)] = 0.1,
+    sync: Annotated[str, typer.Option(help="Method for the pose of a frame: interpolate or nearest.")] = "interpolate",
+    tolerance: Annotated[
+        float, typer.Option(help="Largest time from a frame to its pose or scan, seconds.", min=0)
+    ] = 0.1,
     topic: Annotated[
-        list[str] | None, typer.Option(help=f"of a bag, ROLE=NAME; roles: {', '.join(ROLES)} [default: guessed]")
+        list[str] | None,
+        typer.Option(
+            help=f"Topic of a bag, ROLE=NAME. Roles: {', '.join(ROLES)}. Repeat for several.  [default: guessed]"
+        ),
     ] = None,
     extrinsics: Annotated[
-        Path | None, typer.Option(help="JSON with T_vehicle_lidar and T_vehicle_camera, where the recording lacks them")
+        Path | None,
+        typer.Option(help="JSON file with T_vehicle_lidar and T_vehicle_camera, if the recording lacks them."),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(help="JSON with width, height, fx, fy, cx, cy, where the recording lacks them")
+        Path | None, typer.Option(help="JSON file with width, height, fx, fy, cx and cy, if the recording lacks them.")
     ] = None,
     align: Annotated[
         bool | None,
         typer.Option(
-            help="mend the recording's poses by matching its scans, step by step; as a whole they stay where they are "
-            f"[default: of {', '.join(sorted(ALIGNED_KINDS))}]"
+            help="Correct the recording's poses step by step by scan matching. The whole trajectory stays in place.  "
+            f"[default: on for {', '.join(sorted(ALIGNED_KINDS))} without --poses]"
         ),
     ] = None,
     odometry: Annotated[
-        bool, typer.Option(help="find the poses by LiDAR odometry, the recording's own are not looked at")
+        bool, typer.Option(help="Find the poses by LiDAR odometry. The command ignores the recording's own poses.")
     ] = False,
-    loops: Annotated[bool, typer.Option(help="with --odometry: close loops where a place is met again")] = True,
+    loops: Annotated[
+        bool, typer.Option(help="With --odometry: close loops at places that the vehicle visits again.")
+    ] = True,
     lidar_height: Annotated[
-        float, typer.Option(help="with --odometry: of the LiDAR above the ground, roughly, metres", min=0.1)
+        float, typer.Option(help="With --odometry: approximate height of the LiDAR above the ground, metres.", min=0.1)
     ] = 1.8,
     rectified: Annotated[
-        bool | None, typer.Option(help="a bag's pictures are rectified already [default: if the topic's name says so]")
+        bool | None,
+        typer.Option(help="The images of a bag are rectified already.  [default: if the topic's name says so]"),
     ] = None,
     deskew: Annotated[
         bool,
         typer.Option(
-            help="take the vehicle's motion out of scans that tell their points' times; of kitti-raw and kitti-360 the azimuth tells them"
+            help="Remove the vehicle's motion from scans with point times. For kitti-raw and kitti-360 the azimuth "
+            "gives the times."
         ),
     ] = True,
     vertical_correction: Annotated[
         bool | None,
         typer.Option(
-            help="turn KITTI's points up by 0.205 degrees, which its HDL-64 errs by [default: of kitti-raw and kitti-odometry]"
+            help="Rotate KITTI's points up by 0.205 degrees, the error of its HDL-64.  [default: on for kitti-raw and "
+            "kitti-odometry]"
         ),
     ] = None,
 ) -> None:
-    """Turn somebody else's recording into a dataset folder.
+    """Import a recording into a dataset folder.
 
-    Frames that cannot be used are counted by reason and left out.
+    The command leaves out unusable frames. It counts them by reason.
 
     \b
     Example:

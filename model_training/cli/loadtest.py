@@ -26,43 +26,57 @@ LATE_MS = 10.0  # a generator that is later than that to send, at p99, is told o
 
 
 def command(
-    dataset: Annotated[Path, typer.Option(help="dataset whose query pairs are sent")],
-    url: Annotated[str, typer.Option(help="of the service")] = "http://127.0.0.1:8000",
-    grpc: Annotated[str | None, typer.Option(help="HOST:PORT: ask over gRPC instead", show_default=False)] = None,
-    queries: Annotated[str | None, typer.Option(help="query set [default: the first with truth]")] = None,
-    map_name: Annotated[str | None, typer.Option("--map", help="which map, where the service has several")] = None,
+    dataset: Annotated[Path, typer.Option(help="Dataset with the queries to send.")],
+    url: Annotated[str, typer.Option(help="URL of the service.")] = "http://127.0.0.1:8000",
+    grpc: Annotated[
+        str | None, typer.Option(help="Address HOST:PORT. The requests then go over gRPC.", show_default=False)
+    ] = None,
+    queries: Annotated[str | None, typer.Option(help="Query set.  [default: the first with ground truth]")] = None,
+    map_name: Annotated[str | None, typer.Option("--map", help="Map to ask, if the service has several.")] = None,
     rate: Annotated[
         list[float] | None,
-        typer.Option(help="requests a second, arriving at random, whatever the answers do; repeat for a curve"),
+        typer.Option(
+            help="Requests per second. They arrive at random and do not wait for answers. Repeat for a curve."
+        ),
     ] = None,
     concurrency: Annotated[
-        list[int] | None, typer.Option(help="clients that wait for each answer; repeat for several [default: 1]", min=1)
+        list[int] | None,
+        typer.Option(help="Clients that wait for each answer. Repeat for several.  [default: 1]", min=1),
     ] = None,
-    duration: Annotated[float, typer.Option(help="counted seconds of each run", min=0.5)] = 20.0,
-    warm_up: Annotated[float, typer.Option(help="seconds before them", min=0.0)] = 3.0,
-    timeout: Annotated[float, typer.Option(help="seconds until a request is given up", min=0.01)] = 30.0,
-    pairs: Annotated[int, typer.Option(help="different picture pairs, sent in turn", min=1)] = 50,
-    refine: Annotated[bool, typer.Option("--refine/--no-refine", help="full answers, or retrieval alone")] = True,
+    duration: Annotated[float, typer.Option(help="Measured time of each run, seconds.", min=0.5)] = 20.0,
+    warm_up: Annotated[float, typer.Option(help="Time before the measurement, seconds.", min=0.0)] = 3.0,
+    timeout: Annotated[float, typer.Option(help="Time until the client gives up a request, seconds.", min=0.01)] = 30.0,
+    pairs: Annotated[
+        int, typer.Option(help="Largest number of different queries. The command sends them in turn.", min=1)
+    ] = 50,
+    refine: Annotated[
+        bool, typer.Option("--refine/--no-refine", help="Ask for full answers. --no-refine asks for retrieval alone.")
+    ] = True,
     cheap_depth: Annotated[
-        bool, typer.Option("--cheap-depth", help="send depth as raw16+lz4, the cheapest to decode")
+        bool, typer.Option("--cheap-depth", help="Send depth as raw16+lz4, the cheapest format to decode.")
     ] = False,
     api_key: Annotated[
-        str | None, typer.Option("--api-key", envvar="STREETFIX_API_KEY", help="where the service asks for one")
+        str | None, typer.Option("--api-key", envvar="STREETFIX_API_KEY", help="API key, if the service requires one.")
     ] = None,
     ca: Ca = None,
     cert: Cert = None,
     key: Key = None,
     tls: Annotated[
         bool | None,
-        typer.Option("--tls/--no-tls", help="over gRPC [default: if --ca or --cert is given]", show_default=False),
+        typer.Option("--tls/--no-tls", help="TLS over gRPC.  [default: on with --ca or --cert]", show_default=False),
     ] = None,
     pid: Annotated[
-        int | None, typer.Option(help="process of a service on this machine: its processor time is counted")
+        int | None,
+        typer.Option(help="Process of a service on this machine. The command then counts its processor time."),
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="write all figures here")] = None,
-    plot: Annotated[Path | None, typer.Option(help="draw latency against rate (PNG or SVG; needs matplotlib)")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="JSON file for all figures.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Plot of latency against rate, PNG or SVG. It needs matplotlib.")
+    ] = None,
 ) -> None:
-    """Load a running service with a dataset's queries; latency counts from when a request was due.
+    """Load a running service with the queries of a dataset.
+
+    Latency counts from the time at which a request was due.
 
     \b
     Example, a curve:

@@ -19,18 +19,18 @@ from service.errors import BundleError
 from service.maps.reader import MapBundle
 
 app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Look after map bundles: info, verify, diff, merge, update."
+    no_args_is_help=True, rich_markup_mode=None, help="Maintain map bundles: info, verify, diff, merge, update."
 )
 
-_Bundle = Annotated[Path, typer.Argument(help="folder of a bundle")]
-_Json = Annotated[bool, typer.Option("--json", help="print JSON")]
-_Out = Annotated[Path, typer.Option(help="folder of the new bundle")]
-_Overwrite = Annotated[bool, typer.Option(help="replace a bundle that is there")]
+_Bundle = Annotated[Path, typer.Argument(help="Folder of a map bundle.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+_Out = Annotated[Path, typer.Option(help="Folder of the new map bundle.")]
+_Overwrite = Annotated[bool, typer.Option(help="Replace an existing map bundle.")]
 
 
 @app.command()
 def info(bundle: _Bundle, as_json: _Json = False) -> None:
-    """Tell what a bundle holds.
+    """Show the content of a map bundle.
 
     \b
     Example:
@@ -46,7 +46,10 @@ def info(bundle: _Bundle, as_json: _Json = False) -> None:
 
 @app.command()
 def verify(bundle: _Bundle) -> None:
-    """Check a bundle: hashes, sizes, format, index against places, streets. Leaves with 1 and a line for each defect.
+    """Check a map bundle.
+
+    The command checks hashes, sizes, format and streets. It also checks the index against the places.
+    A damaged bundle gives a line for each defect and exit code 1.
 
     \b
     Example:
@@ -64,9 +67,11 @@ def verify(bundle: _Bundle) -> None:
 @app.command()
 def diff(
     before: _Bundle, after: _Bundle, as_json: _Json = False,
-    picture: Annotated[Path | None, typer.Option(help="write a PNG of both clouds from above")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG file for a view of both clouds from above.")] = None,
 ) -> None:  # fmt: skip
-    """Tell what changed from one bundle to another: places, cloud by area, streets, parameters, encoder.
+    """Show the changes from one map bundle to another.
+
+    The command compares places, cloud by area, streets, parameters and encoder.
 
     \b
     Example:
@@ -91,10 +96,14 @@ def diff(
 @app.command()
 def merge(
     first: _Bundle, second: _Bundle, out: _Out,
-    name: Annotated[str | None, typer.Option(help="how requests address the map [default: that of the first]")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the map in requests.  [default: the name of the first]")
+    ] = None,
     overwrite: _Overwrite = False,
 ) -> None:  # fmt: skip
-    """Make one bundle of two in the same frame, of the same encoder and parameters.
+    """Merge two map bundles into one.
+
+    Both have the same frame, encoder and parameters.
 
     \b
     Example:
@@ -107,17 +116,26 @@ def merge(
 
 @app.command()
 def update(
-    bundle: _Bundle, dataset: Annotated[Path, typer.Argument(help="dataset folder with a survey in the map's frame")], out: _Out,
-    replace: Annotated[bool, typer.Option("--replace", help="replace what the new drive covered: a rebuilt block")] = False,
+    bundle: _Bundle,
+    dataset: Annotated[Path, typer.Argument(help="Dataset folder with a survey in the map's frame.")],
+    out: _Out,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace the area that the new survey covers, such as a rebuilt block.")
+    ] = False,
     replace_area: Annotated[
-        Path | None, typer.Option(help="GeoJSON of a polygon in map metres: replace what lies in it")
+        Path | None, typer.Option(help="GeoJSON file of a polygon in map metres. The command replaces the part inside.")
     ] = None,
     passes_vote: Annotated[
-        bool, typer.Option(help="drop what more passes of the new drive look through than hit")
+        bool,
+        typer.Option(
+            help="Visibility vote between passes of the new survey: drop points that more passes see through than hit."
+        ),
     ] = False,
     overwrite: _Overwrite = False,
 ) -> None:  # fmt: skip
-    """Add a survey drive to a map, with the map's own encoder and settings; or replace what was rebuilt.
+    """Add a survey to a map, or replace a rebuilt part.
+
+    The command uses the map's own encoder and settings.
 
     \b
     Example:

@@ -22,14 +22,20 @@ RANGES, CHECKS = 8, 4  # batches
 
 
 def command(
-    encoder: Annotated[Path, typer.Argument(help="ONNX file of `streetfix export`")],
-    out: Annotated[Path, typer.Option(help="ONNX file to write")],
-    packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
-    cities: Annotated[int, typer.Option(help="of them to take views from; made where missing", min=1, max=1000)] = 2,
-    pairs: Annotated[int, typer.Option(help="pairs of views a batch", min=2, max=2048)] = 128,
-    seed: Annotated[int, typer.Option(help="of the views", min=0)] = 0,
+    encoder: Annotated[Path, typer.Argument(help="ONNX file of `streetfix export`.")],
+    out: Annotated[Path, typer.Option(help="ONNX file to write.")],
+    packs: Annotated[Path, typer.Option(help="Folder of the simulated training cities.")] = Path("runs/packs"),
+    cities: Annotated[
+        int,
+        typer.Option(help="Training cities that the views come from. The command makes missing ones.", min=1, max=1000),
+    ] = 2,
+    pairs: Annotated[int, typer.Option(help="Pairs of views per batch.", min=2, max=2048)] = 128,
+    seed: Annotated[int, typer.Option(help="Seed of the views.", min=0)] = 0,
 ) -> None:
-    """Write an encoder in eight bits: a quarter of the size, less than half of the time, checked against the original.
+    """Quantise an encoder to eight bits.
+
+    The result has a quarter of the size. It needs less than half of the time.
+    The command checks it against the original.
 
     \b
     Example:

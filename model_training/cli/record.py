@@ -11,17 +11,19 @@ from service.errors import DatasetError
 
 
 def command(
-    kind: Annotated[str, typer.Argument(help="what is recorded from: carla")],
-    out: Annotated[Path, typer.Option(help="new folder of the recording")],
-    host: Annotated[str, typer.Option(help="of the CARLA server")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="of the CARLA server", min=1, max=65535)] = 2000,
-    town: Annotated[str, typer.Option(help="map to load, such as Town01 [default: the one that is loaded]")] = "",
-    weather: Annotated[str, typer.Option(help="a preset of CARLA's, such as ClearNoon or HardRainSunset")] = "",
-    frames: Annotated[int, typer.Option(help="frames to record", min=1)] = 600,
-    step: Annotated[float, typer.Option(help="simulated seconds between frames", min=0.01, max=1.0)] = 0.1,
-    seed: Annotated[int, typer.Option(help="of the vehicle's place and the traffic", min=0)] = 0,
+    kind: Annotated[str, typer.Argument(help="Simulator to record from: carla.")],
+    out: Annotated[Path, typer.Option(help="New folder for the recording.")],
+    host: Annotated[str, typer.Option(help="Host of the CARLA server.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port of the CARLA server.", min=1, max=65535)] = 2000,
+    town: Annotated[str, typer.Option(help="CARLA map to load, such as Town01.  [default: the loaded one]")] = "",
+    weather: Annotated[str, typer.Option(help="Weather preset of CARLA, such as ClearNoon or HardRainSunset.")] = "",
+    frames: Annotated[int, typer.Option(help="Frames to record.", min=1)] = 600,
+    step: Annotated[float, typer.Option(help="Simulated time between frames, seconds.", min=0.01, max=1.0)] = 0.1,
+    seed: Annotated[int, typer.Option(help="Seed of the vehicle's place and the traffic.", min=0)] = 0,
 ) -> None:
-    """Record a drive by autopilot from a running CARLA; Ctrl-C ends it, and what was recorded stays.
+    """Record a traversal by autopilot from a running CARLA.
+
+    Ctrl-C ends the recording. The recorded frames stay.
 
     \b
     Example:

@@ -14,12 +14,17 @@ from model_training.simulation.sensor_parameters import DepthParameters, RgbPara
 from model_training.simulation.simulate import simulate
 from service.errors import DatasetError
 
-EXAMPLE = """Simulate a city, its LiDAR survey and RGB-D query drives into a dataset folder.
+EXAMPLE = """Simulate a city, its LiDAR survey and its RGB-D query traversals.
+
+The command writes a dataset folder.
+The same command resumes an interrupted run.
+The same seed gives the same bytes, for any number of workers.
 
 \b
 Examples:
   streetfix simulate --city paper --table1 --drives 5 --depth precise --depth stereo --out data/paper
 
+\b
   streetfix simulate --seed 9001 --queries 334 --out data/unseen1
 
 \b
@@ -27,97 +32,114 @@ Examples:
 
 \b
   streetfix simulate --lidar os1_128 --rgb small --set lidar.channels=64 --set rgb.noise=2 --set depth.noise_px=0.3 --out data/others
-
-An interrupted run goes on where it stopped. Same seed, same bytes, for any number of workers.
 """
 
 
 def command(
-    out: Annotated[Path, typer.Option(help="folder to write the dataset to")],
+    out: Annotated[Path, typer.Option(help="Folder of the dataset to write.")],
     city: Annotated[
         str,
         typer.Option(
-            help="paper: the paper's nine streets; city: another city for each seed; mixed: like city, with eight kinds of districts"
+            help="paper: the paper's nine streets. city: another city for each seed. mixed: like city, with eight "
+            "kinds of districts."
         ),
     ] = "city",
-    seed: Annotated[int, typer.Option(help="decides everything that is random", min=0)] = 0,
-    name: Annotated[str, typer.Option(help="name of the dataset [default: that of the folder]")] = "",
+    seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 0,
+    name: Annotated[str, typer.Option(help="Name of the dataset.  [default: the folder's name]")] = "",
     size: Annotated[
-        str | None, typer.Option(help="extent of a random city, metres, 30 to 10000 each [default: 300x400]")
+        str | None, typer.Option(help="Extents of a random city, metres, 30 to 10000 each.  [default: 300x400]")
     ] = None,
-    streets: Annotated[str, typer.Option(help="drive only these streets, e.g. 1,5,between")] = "",
-    lidar: Annotated[str, typer.Option(help=", ".join(LIDARS))] = "paper_32",
-    spacing: Annotated[float, typer.Option(help="metres between scans", min=0.02)] = 1.0,
-    queries: Annotated[int, typer.Option(help="queries of each drive; 0 for none", min=0)] = 200,
-    drives: Annotated[int, typer.Option(help="query drives, each with its own vehicles, people and light", min=1)] = 1,
+    streets: Annotated[str, typer.Option(help="Drive only these streets, such as 1,5,between.")] = "",
+    lidar: Annotated[str, typer.Option(help=f"LiDAR preset: {', '.join(LIDARS)}.")] = "paper_32",
+    spacing: Annotated[float, typer.Option(help="Distance between scans, metres.", min=0.02)] = 1.0,
+    queries: Annotated[int, typer.Option(help="Queries of each query traversal. 0 simulates none.", min=0)] = 200,
+    drives: Annotated[
+        int, typer.Option(help="Query traversals. Each has its own vehicles, people and light.", min=1)
+    ] = 1,
     table1: Annotated[
-        bool, typer.Option("--table1", help="as many queries of each class as the paper's Table I (626)")
+        bool, typer.Option("--table1", help="Simulate as many queries of each class as the paper's Table I (626).")
     ] = False,
     on_track: Annotated[
         int,
         typer.Option(
-            help="queries at the survey's own poses and among its vehicles too: the paper's split, which leaks", min=0
+            help="Additional queries at the survey's own poses and among its vehicles. This is the paper's split. It "
+            "leaks.",
+            min=0,
         ),
     ] = 0,
     depth: Annotated[
         list[str] | None,
         typer.Option(
-            help="ideal, precise or stereo: errors drawn by a model; sgbm, sgbm3way or bm: a stereo pair is rendered and matched; "
-            "repeat for several of one sort [default: precise]"
+            help="ideal, precise or stereo: modelled depth error. sgbm, sgbm3way or bm: depth from a rendered and "
+            "matched stereo pair. Repeat for several of one sort.  [default: precise]"
         ),
     ] = None,
     rgb: Annotated[
         str,
         typer.Option(
-            help="automatic, small, fixed, or machine: a machine-vision camera, whose lights clip and whose shadows are dark"
+            help="RGB camera: automatic, small, fixed or machine. machine is a machine-vision camera. Its lights "
+            "clip, and its shadows are dark."
         ),
     ] = "automatic",
     sun_elevation: Annotated[
         float | None,
-        typer.Option(help="of the sun above the horizon, degrees [default: by the condition]", min=1, max=90),
+        typer.Option(
+            help="Elevation of the sun above the horizon, degrees.  [default: by the condition]", min=1, max=90
+        ),
     ] = None,
     sun_azimuth: Annotated[
         float | None,
-        typer.Option(help="of the sun, from east counter-clockwise, degrees [default: by chance]", min=-360, max=360),
+        typer.Option(
+            help="Azimuth of the sun, counter-clockwise from east, degrees.  [default: random]", min=-360, max=360
+        ),
     ] = None,
     condition: Annotated[
-        str, typer.Option(help="of all queries: clear, hard_light, rain, snow, fog, night or low_sun")
+        str, typer.Option(help="Condition of all queries: clear, hard_light, rain, snow, fog, night or low_sun.")
     ] = "clear",
-    survey_condition: Annotated[str, typer.Option(help="of the survey")] = "clear",
-    survey_error: Annotated[bool, typer.Option(help="smooth error of survey poses: 3 cm, 0.05 degrees")] = True,
+    survey_condition: Annotated[str, typer.Option(help="Condition of the survey.")] = "clear",
+    survey_error: Annotated[bool, typer.Option(help="Add a smooth error to survey poses: 3 cm, 0.05 degrees.")] = True,
     parked_changed: Annotated[
         float,
-        typer.Option(help="share of parking slots that differ from drive to drive (not --on-track)", min=0, max=1),
+        typer.Option(help="Share of parking slots that differ between traversals (not --on-track).", min=0, max=1),
     ] = 0.5,
     aside: Annotated[
         float,
-        typer.Option(help="how far queries may be beside the survey's lane, metres (not --on-track)", min=0, max=10),
+        typer.Option(
+            help="Largest distance of a query from the survey's lane, metres (not --on-track).", min=0, max=10
+        ),
     ] = 2.0,
     heading: Annotated[
         float,
-        typer.Option(help="how far queries may look off the street's axis, degrees (not --on-track)", min=0, max=180),
+        typer.Option(
+            help="Largest angle between a query and the street's axis, degrees (not --on-track).", min=0, max=180
+        ),
     ] = 15.0,
-    turn: Annotated[float, typer.Option(help="camera turned against the vehicle, degrees", min=-180, max=180)] = 0.0,
-    pitch: Annotated[float, typer.Option(help="camera pitched wrong by this, degrees", min=-45, max=45)] = 0.0,
+    turn: Annotated[
+        float, typer.Option(help="Turn of the camera against the vehicle, degrees.", min=-180, max=180)
+    ] = 0.0,
+    pitch: Annotated[float, typer.Option(help="Pitch error of the camera, degrees.", min=-45, max=45)] = 0.0,
     followed: Annotated[
         float | None,
-        typer.Option(help="share of pictures with a vehicle driving ahead (not --blocked)", min=0, max=1),
+        typer.Option(help="Share of images with a vehicle driving ahead (not --blocked).", min=0, max=1),
     ] = None,
     blocked: Annotated[
-        float, typer.Option(help="share of the columns that a lorry right ahead hides", min=0, max=0.9)
+        float, typer.Option(help="Share of the columns that a lorry right ahead hides.", min=0, max=0.9)
     ] = 0.0,
-    max_depth: Annotated[float | None, typer.Option(help="cut depth at this, metres", min=1)] = None,
+    max_depth: Annotated[
+        float | None, typer.Option(help="Largest depth, metres. The simulator removes depth beyond it.", min=1)
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="SENSOR.NUMBER=VALUE",
-            help="a number of lidar, rgb, depth, stereo or survey in place of its preset's; repeat",
+            help="A number of lidar, rgb, depth, stereo or survey. It replaces the preset's number. Repeat for "
+            "several.",
         ),
     ] = None,
-    camera: Annotated[str, typer.Option(help="picture size in pixels, up to 4096x4096")] = "640x480",
-    hfov: Annotated[float, typer.Option(help="horizontal field of view, degrees", min=20, max=150)] = 90.0,
-    workers: Annotated[int | None, typer.Option(help="processes [default: one a core]", min=1)] = None,
+    camera: Annotated[str, typer.Option(help="Image size, pixels, up to 4096x4096.")] = "640x480",
+    hfov: Annotated[float, typer.Option(help="Horizontal field of view, degrees.", min=20, max=150)] = 90.0,
+    workers: Annotated[int | None, typer.Option(help="Processes.  [default: one per core]", min=1)] = None,
 ) -> None:
     """See ``EXAMPLE``, which the command line shows."""
     lidar_parameters, rgb_parameters, depth_parameters, stereo_parameters, survey_parameters = sensor_parameters(

@@ -25,30 +25,38 @@ _SHOWN = 10
 
 
 def command(
-    kind: Annotated[str, typer.Argument(help="what SOURCE is: geojson, opendrive or osm")],
-    source: Annotated[Path, typer.Argument(help="the file: .geojson, .xodr, .osm or .osm.pbf")],
-    dataset: Annotated[Path, typer.Option(help="dataset folder to write streets.geojson into")],
+    kind: Annotated[str, typer.Argument(help="Format of SOURCE: geojson, opendrive or osm.")],
+    source: Annotated[Path, typer.Argument(help="Source file: .geojson, .xodr, .osm or .osm.pbf.")],
+    dataset: Annotated[Path, typer.Option(help="Dataset folder. The command writes streets.geojson into it.")],
     section_length: Annotated[
-        float | None, typer.Option(help="cut streets longer than this into sections, metres")
+        float | None, typer.Option(help="Cut streets longer than this into sections, metres.")
     ] = None,
     sections: Annotated[
-        str, typer.Option(help="ends: its first and last metres are beginning and end; numbered: equal sections")
+        str,
+        typer.Option(
+            help="ends: the first and last metres of a street are its beginning and end. numbered: equal sections."
+        ),
     ] = "ends",
     width: Annotated[
-        float | None, typer.Option(help="of centre lines whose width the source does not tell, metres")
+        float | None, typer.Option(help="Width of centre lines, if the source gives none, metres.")
     ] = None,
-    lanes: Annotated[str, typer.Option(help="driving: the carriageway; all: with shoulders and pavements")] = "all",
+    lanes: Annotated[str, typer.Option(help="driving: the carriageway. all: also shoulders and pavements.")] = "all",
     frame: Annotated[
         str | None,
         typer.Option(
-            help="map: the source's coordinates are the map's metres; wgs84: they are degrees or a projection's, and the "
-            "dataset's georeference brings them into the map; default: wgs84 where it has one"
+            help="map: the source has map coordinates, metres. wgs84: the source has degrees or projected "
+            "coordinates. The dataset's georeference transforms them into the map.  [default: wgs84 if the dataset "
+            "has a georeference]"
         ),
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="write over a streets.geojson that is there")] = False,
-    picture: Annotated[Path | None, typer.Option(help="draw the streets and the survey's places into this PNG")] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace an existing streets.geojson.")] = False,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG file for a drawing of the streets and the survey's places.")
+    ] = None,
 ) -> None:
-    """Name streets: from GeoJSON, OpenDRIVE or OpenStreetMap into a dataset.
+    """Import named streets from GeoJSON, OpenDRIVE or OpenStreetMap.
+
+    The command writes the streets into a dataset.
 
     \b
     Example:

@@ -15,46 +15,52 @@ from service.imaging.view_grid import ViewGrid
 
 
 def command(
-    run: Annotated[Path, typer.Option(help="folder of the run: configuration, checkpoint, TensorBoard log")],
+    run: Annotated[Path, typer.Option(help="Folder of the run: configuration, checkpoint, TensorBoard log.")],
     recipe: Annotated[
         str,
         typer.Option(
-            help="stock: many cities; matched: some of them, and cities whose depth comes from matched stereo pairs; paper: the paper's "
-            "city itself"
+            help="stock: many cities. matched: some of them, and cities with stereo-matched depth. paper: the paper's "
+            "city itself."
         ),
     ] = "stock",
     cities: Annotated[
         int | None,
         typer.Option(
-            help=f"of the stock recipe, the only one that takes it [default: {STOCK_CITIES}]", min=1, max=1000
+            help=f"Cities of the stock recipe. Only this recipe takes the option.  [default: {STOCK_CITIES}]",
+            min=1,
+            max=1000,
         ),
     ] = None,
-    packs: Annotated[Path, typer.Option(help="where simulated training cities are kept")] = Path("runs/packs"),
-    steps: Annotated[int, typer.Option(help="optimiser steps", min=1)] = 4000,
-    pairs: Annotated[int, typer.Option(help="pairs of views a step", min=2, max=2048)] = 128,
-    optimiser: Annotated[str, typer.Option(help="adamw, or sgdm (the paper's)")] = "adamw",
-    rate: Annotated[float, typer.Option(help="highest learning rate", min=1e-8, max=1)] = 2e-3,
+    packs: Annotated[Path, typer.Option(help="Folder of the simulated training cities.")] = Path("runs/packs"),
+    steps: Annotated[int, typer.Option(help="Optimiser steps.", min=1)] = 4000,
+    pairs: Annotated[int, typer.Option(help="Pairs of views per step.", min=2, max=2048)] = 128,
+    optimiser: Annotated[str, typer.Option(help="Optimiser: adamw or sgdm. The paper uses sgdm.")] = "adamw",
+    rate: Annotated[float, typer.Option(help="Highest learning rate.", min=1e-8, max=1)] = 2e-3,
     turn: Annotated[
-        float, typer.Option(min=0, max=180, help="largest turn between a query and its map view, degrees")
+        float, typer.Option(min=0, max=180, help="Largest turn between a query and its map view, degrees.")
     ] = 9.0,
-    seed: Annotated[int, typer.Option(help="of everything that is drawn", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.", min=0)] = 0,
     precision: Annotated[
-        str, typer.Option(help="float32, or bfloat16: twice as fast on processors that have it, and on GPUs")
+        str, typer.Option(help="float32 or bfloat16. bfloat16 is twice as fast on GPUs and on processors that have it.")
     ] = "float32",
     start_from: Annotated[
-        Path | None, typer.Option(help="run whose weights to start from, or an exported encoder (.onnx)")
+        Path | None, typer.Option(help="Run or exported encoder (.onnx). Training starts from its weights.")
     ] = None,
     negatives: Annotated[
         str,
         typer.Option(
-            help="batch: a batch's own pairs; look-alikes: half of it drawn from look-alikes; memory: and descriptors of earlier "
-            "batches, which undo a training on a single city"
+            help="batch: the batch's own pairs. look-alikes: half of a batch of 128 is hard negatives. memory: also "
+            "descriptors of earlier batches. Such descriptors undo a training on a single city."
         ),
     ] = "look-alikes",
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
-    workers: Annotated[int | None, typer.Option(help="processes that simulate [default: one a core]", min=1)] = None,
+    device: Annotated[str, typer.Option(help="Device: auto, cpu or cuda.")] = "auto",
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that simulate.  [default: one per core]", min=1)
+    ] = None,
 ) -> None:
-    """Simulate training cities and train an encoder on them; Ctrl-C saves, the same command goes on.
+    """Simulate training cities and train an encoder on them.
+
+    Ctrl-C saves a checkpoint. The same command then resumes the training.
 
     \b
     Example, the stock encoder:

@@ -12,13 +12,16 @@ from model_training.viewing.source import events_of
 
 
 def command(
-    source: Annotated[Path, typer.Argument(help="a dataset, a map bundle, or a folder of `evaluate --report`")],
-    save: Annotated[Path | None, typer.Option(help="write a file for Rerun instead of starting its viewer")] = None,
-    mcap: Annotated[Path | None, typer.Option(help="write an MCAP file for Foxglove or Lichtblick instead")] = None,
-    scans: Annotated[int, typer.Option(help="scans of a survey that are shown at most", min=1)] = 200,
-    points: Annotated[int, typer.Option(help="points that a cloud is shown with at most", min=1)] = 200_000,
+    source: Annotated[Path, typer.Argument(help="Dataset, map bundle or folder of `evaluate --report`.")],
+    save: Annotated[Path | None, typer.Option(help="Write a file for Rerun instead of starting its viewer.")] = None,
+    mcap: Annotated[Path | None, typer.Option(help="Write an MCAP file for Foxglove or Lichtblick instead.")] = None,
+    scans: Annotated[int, typer.Option(help="Largest number of survey scans to show.", min=1)] = 200,
+    points: Annotated[int, typer.Option(help="Largest number of points to show of a cloud.", min=1)] = 200_000,
 ) -> None:
-    """Look at a dataset, a map or answers: clouds, tracks, cameras with their pictures, 2.5D pictures, what was found and answered.
+    """Show a dataset, a map or answers in Rerun, Foxglove or Lichtblick.
+
+    The viewer shows clouds, tracks, cameras with their images, and 2.5D images. For answers it also shows the places
+    that retrieval found, and the poses of the answers.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""The bridge, whatever carries its messages: pictures come in, poses and diagnoses go out."""
+"""The bridge, independent of the middleware: takes images, returns poses and diagnoses."""
 
 import time
 from collections import deque
@@ -18,15 +18,24 @@ from service.errors import StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 
-#: (H, W, 3) uint8, (H, W) metres, intrinsics: a client's ``localize``, or the pipeline in this process.
+#: Localizes an RGB image (H, W, 3) and a depth image (H, W) in metres with their intrinsics: by a client, or by the pipeline in this
+#: process.
 Localize = Callable[[NDArray[np.uint8], NDArray[np.float32], PinholeCamera], LocalizeAnswer]
-#: The rate that is told is over so many questions.
+#: Number of queries over which the reported rate is averaged.
 _RECENT = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """Names as ROS has them."""
+    """ROS names of the topics.
+
+    Attributes:
+        color: RGB images, input.
+        depth: depth images registered to the RGB images, input.
+        info: calibration of the RGB camera, input.
+        pose: poses, output.
+        diagnostics: diagnoses, output.
+    """
 
     color: str = "/camera/color/image_raw"
     depth: str = "/camera/aligned_depth_to_color/image_raw"
@@ -37,12 +46,12 @@ class Topics:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """What one look at the pictures leads to.
+    """The result of one image pair.
 
     Attributes:
-        pose: to publish, if any.
+        pose: to publish; None if there is none.
         diagnosis: to publish.
-        answer: of the service, if there was one.
+        answer: of the service; None if there was an error.
     """
 
     pose: StampedPose | None
@@ -52,17 +61,18 @@ class Published:
 
 @dataclass(slots=True, kw_only=True)
 class Bridge:
-    """Pairs pictures, asks, and says what is to be published.
+    """Pairs images, sends queries, and decides what to publish.
 
     Attributes:
-        localize: whom to ask; errors of ours become diagnoses.
-        topics: for messages to people.
-        gate: how often to ask, and what goes out.
-        pairs: what has come.
-        T_vehicle_camera: where the camera sits on what is posed.
+        localize: answers a query; a ``StreetfixError`` becomes a diagnosis.
+        topics: named in messages.
+        gate: query rate, and which answers are published.
+        pairs: received messages.
+        T_vehicle_camera: from the camera frame to the vehicle frame, metres.
         frame_id: of the map.
         rectified: see ``camera_from``.
-        clock: monotonic seconds.
+        clock: monotonic time, s.
+        counts: since the start.
     """
 
     localize: Localize
@@ -77,13 +87,13 @@ class Bridge:
     _recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
 
     def wait_s(self) -> float:
-        """Seconds until the next question may be asked; until then nobody needs to look at messages."""
+        """Return the seconds until the next query is due. Until then messages need not be read."""
         return self.gate.wait_s(self.clock())
 
     def step(self) -> Published | None:
-        """Ask about the newest pair (every pair in its turn, where there is no limit on the rate), if there is one and it is time.
+        """Send a query for the newest pair, if there is one and a query is due; else return None.
 
-        Blocks as long as the answer takes.
+        Without a rate limit it takes the oldest pair, so that every pair has its turn. It blocks until the answer arrives.
         """
         if self.wait_s() > 0:
             return None
@@ -91,11 +101,11 @@ class Bridge:
         return None if pair is None else self._ask(pair)
 
     def quiet_s(self) -> float:
-        """So long without a question is no silence of the camera's, but a slow rate."""
+        """Return the seconds without a query that the rate limit explains; a longer silence means missing images."""
         return 2.0 / self.gate.rate_hz if self.gate.rate_hz else 0.0
 
     def idle(self) -> Diagnosis:
-        """What to say where no pair has come for a while."""
+        """Build the diagnosis for a time without image pairs."""
         missing = self.pairs.missing()
         if missing:
             told = ", ".join(f"{name} ({getattr(self.topics, name)})" for name in missing)
@@ -135,7 +145,11 @@ class Bridge:
 
 
 def line_of(published: Published) -> str:
-    """One look, as a line for people."""
+    """Format the result of one image pair as a line of text.
+
+    Args:
+        published: the result.
+    """
     answer, diagnosis = published.answer, published.diagnosis
     at = f"{diagnosis.stamp_ns / 1e9:.3f}"
     if answer is None:

@@ -1,4 +1,4 @@
-"""How the bridge does, as ROS' diagnostics say it."""
+"""State of the bridge as ROS diagnostics."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -7,7 +7,7 @@ from service.contract.schema import LocalizeAnswer
 
 
 class Level(IntEnum):
-    """Of diagnostic_msgs/DiagnosticStatus."""
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -19,13 +19,13 @@ NAME = "streetfix: localization"
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """One status.
+    """One diagnostic status.
 
     Attributes:
-        stamp_ns: of the colour picture it speaks of; 0 where there is none.
-        level: how bad.
-        message: for people.
-        values: name and value.
+        stamp_ns: of the RGB image that it refers to, ns; 0 if there is none.
+        level: severity.
+        message: readable text.
+        values: names and values.
     """
 
     stamp_ns: int
@@ -36,13 +36,13 @@ class Diagnosis:
 
 @dataclass(slots=True)
 class Counts:
-    """What has happened since the start.
+    """Counts since the start.
 
     Attributes:
-        asked: questions.
-        answered: of them, those that were answered.
-        published: of them, those whose pose went out.
-        failed: questions that ended in an error.
+        asked: queries.
+        answered: queries with an answer.
+        published: answers whose pose was published.
+        failed: queries that ended with an error.
     """
 
     asked: int = 0
@@ -51,7 +51,12 @@ class Counts:
     failed: int = 0
 
     def values(self, dropped: int, rate_hz: float) -> tuple[tuple[str, str], ...]:
-        """With pictures that found no partner, and questions a second of late."""
+        """Return all counts as names and values.
+
+        Args:
+            dropped: number of images that were dropped without a partner.
+            rate_hz: recent rate of queries, Hz.
+        """
         counted = {"asked": self.asked, "answered": self.answered, "published": self.published, "failed": self.failed}
         told = {name: str(count) for name, count in counted.items()}
         return tuple((told | {"dropped": str(dropped), "rate_hz": f"{rate_hz:.2f}"}).items())
@@ -60,14 +65,14 @@ class Counts:
 def of_answer(
     answer: LocalizeAnswer, why_not: str, *, stamp_ns: int, latency_s: float, counted: tuple[tuple[str, str], ...]
 ) -> Diagnosis:
-    """OK where the pose went out, else a warning that says why not.
+    """Build the diagnosis of an answer: OK if the pose was published, else a warning with the reason.
 
     Args:
-        answer: what the service said.
-        why_not: why the pose stayed in; empty if it did not.
-        stamp_ns: of the picture.
-        latency_s: from the question to the answer.
-        counted: see ``Counts``.
+        answer: of the service.
+        why_not: why the pose was not published; empty if it was.
+        stamp_ns: of the RGB image, ns.
+        latency_s: from the query to the answer, s.
+        counted: names and values of ``Counts.values``.
     """
     confidence = "unknown" if answer.confidence is None else f"{answer.confidence:.3f}"
     values = (

@@ -1,4 +1,4 @@
-"""How often to ask, and which answers go out."""
+"""Query rate, and which answers are published."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,11 @@ from service.errors import RequestError
 
 @dataclass(slots=True)
 class Gate:
-    """A limit on the rate of questions and on the doubt of answers. An answer that is not LOCALIZED never goes out.
+    """Limits on the rate of queries and on the confidence of published answers. Only LOCALIZED answers are published.
 
     Attributes:
-        rate_hz: questions a second at most; 0 asks for every pair.
-        min_confidence: of an answer that goes out; an uncalibrated map's, which has none, passes only at 0.
+        rate_hz: maximum queries per second; 0 queries every pair.
+        min_confidence: of a published answer. Answers of an uncalibrated map have no confidence and pass only at 0.
     """
 
     rate_hz: float = 1.0
@@ -20,7 +20,7 @@ class Gate:
     _asked_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what is no limit.
+        """Check the limits.
 
         Raises:
             RequestError: a number is out of bounds.
@@ -35,17 +35,29 @@ class Gate:
             )
 
     def wait_s(self, now_s: float) -> float:
-        """Seconds until the next question; 0 where it may be asked."""
+        """Return the seconds until the next query is due; 0 if it is due now.
+
+        Args:
+            now_s: current time of a monotonic clock, s.
+        """
         if self._asked_s is None or not self.rate_hz:
             return 0.0
         return max(0.0, self._asked_s + 1.0 / self.rate_hz - now_s)
 
     def asked(self, now_s: float) -> None:
-        """A question begins."""
+        """Record the beginning of a query.
+
+        Args:
+            now_s: current time of a monotonic clock, s.
+        """
         self._asked_s = now_s
 
     def why_not(self, answer: LocalizeAnswer) -> str:
-        """Why an answer stays in; empty if it goes out."""
+        """Return why an answer is not published; empty if it is published.
+
+        Args:
+            answer: of the service.
+        """
         if answer.status != "LOCALIZED":
             return answer.status
         if self.min_confidence > 0 and answer.confidence is None:

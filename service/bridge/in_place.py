@@ -1,4 +1,4 @@
-"""The pipeline in the bridge's own process: no service, no encoding of pictures."""
+"""The pipeline in the process of the bridge, without a service and without encoded images."""
 
 from pathlib import Path
 
@@ -17,13 +17,13 @@ from service.runtime.threads import limit_pools
 
 
 class InPlace:
-    """A map that this process has open.
+    """Localizes in a map that this process has open.
 
     Args:
-        bundle: its folder.
+        bundle: folder of the map bundle.
 
     Raises:
-        BundleError: it is missing or damaged.
+        BundleError: the bundle is missing or damaged.
     """
 
     def __init__(self, bundle: Path) -> None:
@@ -31,10 +31,15 @@ class InPlace:
         self._localizer = MapRegistry.open((bundle,)).get(None)
 
     def __call__(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera) -> LocalizeAnswer:
-        """Where a pair was taken, as ``Client.localize`` says it.
+        """Localize an image pair, like ``Client.localize``.
+
+        Args:
+            rgb: sRGB image, (H, W, 3).
+            depth_m: z along the optical axis, metres, (H, W).
+            camera: intrinsics of both images.
 
         Raises:
-            RequestError: the camera's numbers make no sense, a picture is of another size than it, or holds no depth.
+            RequestError: the intrinsics are invalid, an image does not fit them, or the depth image holds no depth.
         """
         require_camera(camera)
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)

@@ -1,7 +1,7 @@
-"""Messages of ROS 2 as DDS has them: type names and fields as rosidl makes them, so that a ROS node on the same domain reads them.
+"""Messages of ROS 2 for DDS. Type names and fields are those of rosidl, so that a ROS node on the same domain can read them.
 
 Definitions: common_interfaces and rcl_interfaces (builtin_interfaces, std_msgs, geometry_msgs, sensor_msgs, diagnostic_msgs) of
-ROS 2 Humble and later, which have not changed since. A ROS topic ``/a`` is the DDS topic ``rt/a``.
+ROS 2 Humble. Later versions are the same. A ROS topic ``/a`` is the DDS topic ``rt/a``.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
 
 @dataclass
 class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
-    """An instant."""
+    """A time stamp: seconds and nanoseconds."""
 
     sec: int32 = 0
     nanosec: uint32 = 0
@@ -22,7 +22,7 @@ class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
 
 @dataclass
 class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
-    """When, and in which frame."""
+    """Time stamp and coordinate frame of a message."""
 
     stamp: Time = field(default_factory=Time)
     frame_id: str = ""
@@ -30,7 +30,7 @@ class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
 
 @dataclass
 class Image(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):
-    """A picture, row by row; ``step`` bytes a row."""
+    """An image, stored row by row with ``step`` bytes per row."""
 
     header: Header = field(default_factory=Header)
     height: uint32 = 0
@@ -43,7 +43,7 @@ class Image(IdlStruct, typename="sensor_msgs.msg.dds_.Image_"):
 
 @dataclass
 class RegionOfInterest(IdlStruct, typename="sensor_msgs.msg.dds_.RegionOfInterest_"):
-    """A window of a sensor; all zero means the whole."""
+    """A window of the sensor in pixels. All zeros mean the whole sensor."""
 
     x_offset: uint32 = 0
     y_offset: uint32 = 0
@@ -54,7 +54,7 @@ class RegionOfInterest(IdlStruct, typename="sensor_msgs.msg.dds_.RegionOfInteres
 
 @dataclass
 class CameraInfo(IdlStruct, typename="sensor_msgs.msg.dds_.CameraInfo_"):
-    """A camera's calibration: K of the raw picture, P of the rectified one."""
+    """Calibration of a camera: K of the raw image, P of the rectified image."""
 
     header: Header = field(default_factory=Header)
     height: uint32 = 0
@@ -71,7 +71,7 @@ class CameraInfo(IdlStruct, typename="sensor_msgs.msg.dds_.CameraInfo_"):
 
 @dataclass
 class Point(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
-    """A position, metres."""
+    """A position in metres."""
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -80,7 +80,7 @@ class Point(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
 
 @dataclass
 class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
-    """A rotation."""
+    """A rotation as a unit quaternion."""
 
     x: float64 = 0.0
     y: float64 = 0.0
@@ -98,7 +98,7 @@ class Pose(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
 
 @dataclass
 class PoseWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.PoseWithCovariance_"):
-    """A pose, and its 6 x 6 covariance row by row: x, y, z, rotations about the fixed axes x, y, z."""
+    """A pose and its (6, 6) covariance, stored row by row: x, y, z (m), rotations about the fixed axes x, y, z (rad)."""
 
     pose: Pose = field(default_factory=Pose)
     covariance: Annotated[Sequence[float], array(float64, 36)] = field(default_factory=lambda: [0.0] * 36)
@@ -106,7 +106,7 @@ class PoseWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.PoseWithCov
 
 @dataclass
 class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs.msg.dds_.PoseWithCovarianceStamped_"):
-    """The same with its instant and frame."""
+    """A pose with covariance, time stamp and frame."""
 
     header: Header = field(default_factory=Header)
     pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
@@ -114,7 +114,7 @@ class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs.msg.dds_.Pose
 
 @dataclass
 class KeyValue(IdlStruct, typename="diagnostic_msgs.msg.dds_.KeyValue_"):
-    """A word about a component."""
+    """A named value of a diagnostic status."""
 
     key: str = ""
     value: str = ""
@@ -122,7 +122,7 @@ class KeyValue(IdlStruct, typename="diagnostic_msgs.msg.dds_.KeyValue_"):
 
 @dataclass
 class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticStatus_"):
-    """How a component does; ``level`` 0 OK, 1 WARN, 2 ERROR, 3 STALE (ROS' octet)."""
+    """State of a component; ``level`` is 0 OK, 1 WARN, 2 ERROR or 3 STALE (an octet in ROS)."""
 
     level: uint8 = 0
     name: str = ""
@@ -133,7 +133,7 @@ class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticS
 
 @dataclass
 class DiagnosticArray(IdlStruct, typename="diagnostic_msgs.msg.dds_.DiagnosticArray_"):
-    """How components do."""
+    """States of several components."""
 
     header: Header = field(default_factory=Header)
     status: Annotated[Sequence[DiagnosticStatus], sequence(DiagnosticStatus)] = field(default_factory=list)

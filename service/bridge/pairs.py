@@ -1,4 +1,4 @@
-"""Colour, depth and calibration of one instant, out of three streams that come in any order."""
+"""Match RGB images, depth images and calibrations by time stamp. The three streams may arrive in any order."""
 
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -9,14 +9,24 @@ from service.errors import RequestError
 
 
 def nanoseconds_of(message: Any) -> int:
-    """A message's stamp."""
+    """Return the time stamp of a message in nanoseconds.
+
+    Args:
+        message: with a ROS header.
+    """
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Messages that belong together."""
+    """Messages with matching time stamps.
+
+    Attributes:
+        color: RGB image.
+        depth: depth image.
+        info: calibration of the RGB camera.
+    """
 
     color: ImageLike
     depth: ImageLike
@@ -24,17 +34,20 @@ class Pair:
 
 
 class Pairs:
-    """Puts the nearest stamps together; colour and depth are each used once.
+    """Matches messages with the nearest time stamps. Each RGB and depth image is used once.
 
-    A calibration holds until another comes: drivers send it with every picture, others once; of those that are kept, the nearest is
-    taken.
+    Some drivers send a calibration with every image, others only once. So calibrations are kept, and the nearest one is used.
 
     Args:
-        tolerance_s: how far the stamps of colour and depth may lie apart.
-        most: messages of a stream that wait for their partner; the oldest leaves.
+        tolerance_s: maximum difference between the stamps of RGB and depth image, s.
+        most: maximum number of waiting messages per stream. The oldest one is dropped.
 
     Attributes:
-        dropped: pictures that left without a partner.
+        most: as given.
+        dropped: number of images that were dropped without a partner.
+
+    Raises:
+        RequestError: a parameter is out of bounds.
     """
 
     def __init__(self, *, tolerance_s: float = 0.02, most: int = 10) -> None:
@@ -50,49 +63,61 @@ class Pairs:
         self.dropped = 0
 
     def color(self, message: ImageLike) -> None:
-        """A colour picture has come."""
+        """Add an RGB image.
+
+        Args:
+            message: the image.
+        """
         self._keep(self._colors, message)
 
     def depth(self, message: ImageLike) -> None:
-        """A depth picture has come."""
+        """Add a depth image.
+
+        Args:
+            message: the image.
+        """
         self._keep(self._depths, message)
 
     def info(self, message: CameraInfoLike) -> None:
-        """A calibration has come."""
+        """Add a calibration.
+
+        Args:
+            message: of the RGB camera.
+        """
         self._infos[nanoseconds_of(message)] = message
         while len(self._infos) > self.most:
             self._infos.popitem(last=False)
 
     def oldest(self) -> Pair | None:
-        """The earliest pair that is whole, once; pictures older than it, which nothing can come for, are dropped."""
+        """Take the oldest complete pair and drop older images; None if there is no pair."""
         found = self._matches()
         return self._take(min(found)) if found else None
 
     def newest(self) -> Pair | None:
-        """The latest pair that is whole, once; all that is older is dropped."""
+        """Take the newest complete pair and drop older images; None if there is no pair."""
         found = self._matches()
         return self._take(max(found)) if found else None
 
     @property
     def waiting(self) -> int:
-        """Pictures without a partner yet."""
+        """Number of images that have no partner yet."""
         return len(self._colors) + len(self._depths)
 
     def missing(self) -> tuple[str, ...]:
-        """Which streams nothing waits of: ``color``, ``depth``, ``info``."""
+        """Return the streams without any kept message: ``color``, ``depth``, ``info``."""
         streams: dict[str, OrderedDict[int, Any]] = {"color": self._colors, "depth": self._depths, "info": self._infos}
         return tuple(name for name, waiting in streams.items() if not waiting)
 
     def _keep(self, waiting: OrderedDict[int, ImageLike], message: ImageLike) -> None:
         at = nanoseconds_of(message)
-        self.dropped += at in waiting  # a stamp that comes twice
+        self.dropped += at in waiting  # a second image with the same stamp replaces the first
         waiting[at] = message
         while len(waiting) > self.most:
             waiting.popitem(last=False)
             self.dropped += 1
 
     def _matches(self) -> list[tuple[int, int]]:
-        """Stamps of colour and depth that are each other's nearest and near enough."""
+        """Return stamps of RGB and depth images that are mutually nearest and within the tolerance."""
         if not (self._colors and self._depths and self._infos):
             return []
         nearest = {color: _nearest(self._depths, color) for color in self._colors}
@@ -113,5 +138,5 @@ class Pairs:
 
 
 def _nearest(waiting: "OrderedDict[int, Any]", stamp: int) -> int:
-    """Of two that are equally near the earlier."""
+    """Return the nearest stamp; of two equally near ones the earlier."""
     return min(waiting, key=lambda each: (abs(each - stamp), each))

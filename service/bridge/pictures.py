@@ -1,4 +1,7 @@
-"""Messages of ROS as numpy pictures and a camera. Whatever has ROS' fields will do: rclpy's messages as well as our own."""
+"""Convert ROS messages to numpy images and a camera.
+
+Any object with the fields of the ROS message is accepted, so both rclpy messages and ``service.bridge.messages`` work.
+"""
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -10,7 +13,7 @@ from numpy.typing import NDArray
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 
-#: Channels, and what OpenCV calls the way to RGB; None where it is RGB already.
+#: Number of channels, and the OpenCV conversion to RGB; None if the image is RGB already.
 _COLOURS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -18,26 +21,26 @@ _COLOURS: dict[str, tuple[int, int | None]] = {
     "bgra8": (4, cv2.COLOR_BGRA2RGB),
     "mono8": (1, cv2.COLOR_GRAY2RGB),
 }
-#: REP 118: unsigned millimetres, or floating metres. mono16 is what some drivers call the former.
+#: Depth encodings of REP 118: unsigned millimetres or floating-point metres. Some drivers call the former mono16.
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 
 
 class StampLike(Protocol):
-    """builtin_interfaces/Time."""
+    """Fields of builtin_interfaces/Time."""
 
     sec: int
     nanosec: int
 
 
 class HeaderLike(Protocol):
-    """std_msgs/Header."""
+    """Fields of std_msgs/Header."""
 
     stamp: Any
     frame_id: str
 
 
 class ImageLike(Protocol):
-    """sensor_msgs/Image."""
+    """Fields of sensor_msgs/Image."""
 
     header: Any
     height: int
@@ -49,7 +52,7 @@ class ImageLike(Protocol):
 
 
 class CameraInfoLike(Protocol):
-    """sensor_msgs/CameraInfo."""
+    """Fields of sensor_msgs/CameraInfo."""
 
     header: Any
     height: int
@@ -61,10 +64,14 @@ class CameraInfoLike(Protocol):
 
 
 def rgb_from(message: ImageLike, topic: str) -> NDArray[np.uint8]:
-    """A colour picture, (H, W, 3) sRGB.
+    """Convert an RGB image message to an (H, W, 3) sRGB array.
+
+    Args:
+        message: the image.
+        topic: of the message; named in errors.
 
     Raises:
-        RequestError: an encoding that is not read, or sizes that contradict each other; ``field`` is the topic.
+        RequestError: the encoding is not supported, or the sizes contradict each other; ``field`` is the topic.
     """
     known = _COLOURS.get(message.encoding)
     if known is None:
@@ -77,10 +84,14 @@ def rgb_from(message: ImageLike, topic: str) -> NDArray[np.uint8]:
 
 
 def depth_from(message: ImageLike, topic: str) -> NDArray[np.float32]:
-    """Depth along the optical axis, (H, W), metres; 0 and NaN where nothing was measured.
+    """Convert a depth image message to z along the optical axis, (H, W), metres; 0 or NaN where nothing was measured.
+
+    Args:
+        message: the image.
+        topic: of the message; named in errors.
 
     Raises:
-        RequestError: as ``rgb_from``.
+        RequestError: as for ``rgb_from``.
     """
     known = _DEPTHS.get(message.encoding)
     if known is None:
@@ -91,15 +102,15 @@ def depth_from(message: ImageLike, topic: str) -> NDArray[np.float32]:
 
 
 def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False) -> PinholeCamera:
-    """The rectified camera: P where it is set, else K; moved into the region of interest.
+    """Return the rectified camera: from P if it is set, else from K, shifted by the region of interest.
 
     Args:
-        message: of the colour picture.
-        topic: that it came by.
-        rectified: the pictures are rectified already, whatever distortion the message tells of the lens.
+        message: calibration of the RGB camera.
+        topic: of the message; named in errors.
+        rectified: the images are rectified already, although the message has distortion coefficients.
 
     Raises:
-        RequestError: it is not calibrated, or the pictures are not rectified.
+        RequestError: the camera is not calibrated, or the images are not rectified.
     """
     if any(message.d) and not rectified:
         raise RequestError(
@@ -121,10 +132,10 @@ def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False)
 
 
 def _rows(message: ImageLike, topic: str, dtype: np.dtype[Any], channels: int) -> NDArray[Any]:
-    """Pixels without the padding of their rows, (H, W, channels)."""
+    """Return the pixels without row padding, (H, W, channels)."""
     height, width, step = message.height, message.width, message.step
     row = width * channels * dtype.itemsize
-    # DDS' own library gives a list of numbers, rclpy an array.
+    # Cyclone DDS gives a list of numbers, rclpy an array.
     data = np.frombuffer(bytes(message.data) if isinstance(message.data, list) else message.data, np.uint8)
     if height < 1 or width < 1 or step < row or data.size < height * step:
         raise RequestError(

@@ -1,4 +1,4 @@
-"""An answer as what ROS calls a pose with covariance: of the vehicle, in the map, about the vehicle's origin."""
+"""Convert an answer to a ROS pose with covariance: pose of the vehicle in the map frame, covariance about the vehicle origin."""
 
 import math
 from dataclasses import dataclass
@@ -20,22 +20,23 @@ from service.geometry.rigid import (
 
 Covariance = Float64[NDArray[np.float64], "6 6"]
 
-#: A vehicle whose frame sits in the camera: x along the optical axis, y left, z up. Without it a planner would read the heading
-#: off the optical frame's x, which looks to the right.
+#: Vehicle frame at the camera: x along the optical axis, y left, z up. Without it a planner would take the x axis of the optical
+#: frame as heading, which points right.
 CAMERA_AS_BODY: Transform = transform_from(R_BODY_OPTICAL, np.zeros(3))
-#: Where the service knows no covariance (``options.refine`` false): retrieval's, several metres and all headings' tenth, roughly.
+#: Covariance if the answer has none (``options.refine`` false), for the accuracy of retrieval: standard deviations of 3 m in x and y,
+#: 1 m in z, 0.1 rad about x and y, 0.32 rad about z.
 _UNKNOWN: Covariance = np.diag([9.0, 9.0, 1.0, 0.01, 0.01, 0.1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StampedPose:
-    """What is published.
+    """A pose to publish.
 
     Attributes:
-        stamp_ns: of the colour picture.
+        stamp_ns: of the RGB image, ns.
         frame_id: of the map.
-        T_map_vehicle: metres.
-        covariance: x, y, z (m), rotations about the map's axes x, y, z (rad), about the vehicle's origin.
+        T_map_vehicle: from the vehicle frame to the map frame, metres.
+        covariance: of x, y, z (m) and the rotations about the map axes x, y, z (rad), at the vehicle origin.
     """
 
     stamp_ns: int
@@ -45,17 +46,17 @@ class StampedPose:
 
     @property
     def quaternion_xyzw(self) -> Float64[NDArray[np.float64], "4"]:
-        """Of the vehicle's axes in the map."""
+        """Orientation of the vehicle in the map frame, as x, y, z, w."""
         return quaternion_xyzw_from(self.T_map_vehicle[:3, :3])
 
 
 def pose_of(answer: LocalizeAnswer, T_vehicle_camera: Transform, *, stamp_ns: int, frame_id: str) -> StampedPose:
-    """The vehicle's pose.
+    """Compute the pose of the vehicle from an answer.
 
     Args:
-        answer: of the service; ``pose`` is the camera's, its covariance about the camera.
-        T_vehicle_camera: where the camera sits; ``CAMERA_AS_BODY`` where the vehicle is the camera.
-        stamp_ns: of the picture.
+        answer: of the service; its pose and covariance are those of the camera.
+        T_vehicle_camera: from the camera frame to the vehicle frame, metres; ``CAMERA_AS_BODY`` if the vehicle is the camera.
+        stamp_ns: of the RGB image, ns.
         frame_id: of the map.
 
     Raises:
@@ -73,13 +74,13 @@ def pose_of(answer: LocalizeAnswer, T_vehicle_camera: Transform, *, stamp_ns: in
 
 
 def about(covariance: Covariance, lever_m: Float64[NDArray[np.float64], "3"]) -> Covariance:
-    """The same pose's covariance about another point of the same body.
+    """Transform a pose covariance to another reference point of the same rigid body.
 
-    A small turn w about the first point moves the second by w x lever, so its error is dp - [lever]x w.
+    A small rotation w about the first point moves the second by w x lever, so its error is dp - [lever]x w.
 
     Args:
-        covariance: translation first, then rotation, map axes, about the first point.
-        lever_m: from the first to the second point, map axes.
+        covariance: at the first point: translation (m), then rotation (rad), map axes.
+        lever_m: from the first to the second point, map axes, metres.
     """
     x, y, z = lever_m
     J = np.eye(6)
@@ -89,10 +90,13 @@ def about(covariance: Covariance, lever_m: Float64[NDArray[np.float64], "3"]) ->
 
 
 def mount_from(text: str) -> Transform:
-    """T_vehicle_camera as ``tf2_echo base_link camera_optical_frame`` prints it: X,Y,Z,QX,QY,QZ,QW.
+    """Parse T_vehicle_camera as ``tf2_echo base_link camera_optical_frame`` prints it.
+
+    Args:
+        text: X,Y,Z,QX,QY,QZ,QW; metres and a unit quaternion.
 
     Raises:
-        RequestError: it is no transform.
+        RequestError: the text is no transform.
     """
     try:
         numbers = [float(part) for part in text.split(",")]

@@ -1,4 +1,4 @@
-"""The same bridge as a node of rclpy, for those who have ROS 2: its parameters, remappings and executors then hold."""
+"""The bridge as an rclpy node, for users with ROS 2. Its parameters, remappings and executors then apply."""
 
 from collections.abc import Callable
 from threading import Event
@@ -10,7 +10,7 @@ from service.bridge.pose import StampedPose
 from service.errors import ExtraMissingError
 from service.runtime.wakeup import Wakeup
 
-#: Pictures are looked at so often, and diagnoses come after so long without any.
+#: Seconds between two checks for images, and minimum seconds without a query until an idle diagnosis is published.
 _LOOK_S, _IDLE_S = 0.05, 1.0
 
 
@@ -18,10 +18,18 @@ def run(
     bridge: Bridge, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None, *,
     domain: int = 0, reliable: bool = False, depth: int = 5,
 ) -> None:  # fmt: skip
-    """Answer pictures until it is over; arguments as for ``DdsNode``.
+    """Process images and publish the results until ``over`` is set.
+
+    Args:
+        bridge: that processes the messages.
+        over: ends the loop; set from elsewhere, for example by a signal.
+        told: called with the result of every processed pair.
+        domain: ``ROS_DOMAIN_ID`` of the robot.
+        reliable: request lost images again; see ``DdsNode``.
+        depth: length of the image queue during a query; 0 keeps all.
 
     Raises:
-        ExtraMissingError: there is no rclpy.
+        ExtraMissingError: rclpy or a ROS message package is not installed.
     """
     try:
         import rclpy
@@ -68,7 +76,12 @@ def run(
 
 
 def filled_pose(message: Any, pose: StampedPose) -> Any:
-    """A geometry_msgs/PoseWithCovarianceStamped with a pose in it."""
+    """Fill a geometry_msgs/PoseWithCovarianceStamped and return it.
+
+    Args:
+        message: empty.
+        pose: of the vehicle.
+    """
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(pose.stamp_ns, 10**9)
     message.header.frame_id = pose.frame_id
     at, turned = message.pose.pose.position, message.pose.pose.orientation
@@ -79,12 +92,12 @@ def filled_pose(message: Any, pose: StampedPose) -> Any:
 
 
 def filled_diagnostics(message: Any, diagnosis: Diagnosis, now: Any) -> Any:
-    """A diagnostic_msgs/DiagnosticArray with a diagnosis in it.
+    """Fill a diagnostic_msgs/DiagnosticArray and return it.
 
     Args:
         message: empty.
-        diagnosis: to tell.
-        now: builtin_interfaces/Time.
+        diagnosis: to publish.
+        now: current time, builtin_interfaces/Time.
     """
     from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 

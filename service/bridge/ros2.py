@@ -1,4 +1,4 @@
-"""The bridge over DDS, which ROS 2 speaks: no ROS installation is needed on this side."""
+"""The bridge over DDS, the protocol of ROS 2. This side needs no ROS installation."""
 
 import time
 from collections.abc import Callable
@@ -21,20 +21,21 @@ from service.errors import AddressError
 from service.runtime.wakeup import Wakeup
 
 M = TypeVar("M", bound=IdlStruct)
-#: Diagnoses come at least so often, whether pictures do or not.
+#: Maximum seconds between two diagnoses without images; longer only for a slow query rate.
 IDLE_S = 1.0
-#: A signal is noticed after so long at the latest.
+#: Maximum seconds until a signal is noticed.
 _LOOK_S = 0.2
-#: What ROS 2 speaks on the wire.
+#: Data representation of ROS 2 on the wire.
 _CDR = Policy.DataRepresentation(use_cdrv0_representation=True)
 
 
 def qos_of(*, reliable: bool, depth: int) -> Qos:
-    """Quality of service as ROS 2 has it.
+    """Build the quality of service of ROS 2.
 
     Args:
-        reliable: lost messages are sent again; a best-effort reader hears reliable writers as well, a reliable one no best-effort ones.
-        depth: messages that wait; 0 keeps all.
+        reliable: send lost messages again. A best-effort reader also receives from reliable writers. A reliable reader does not
+            receive from best-effort writers.
+        depth: length of the message queue; 0 keeps all.
     """
     history = Policy.History.KeepLast(depth) if depth else Policy.History.KeepAll
     reliability = Policy.Reliability.Reliable(duration(seconds=10)) if reliable else Policy.Reliability.BestEffort
@@ -42,21 +43,25 @@ def qos_of(*, reliable: bool, depth: int) -> Qos:
 
 
 def dds_name(topic: str) -> str:
-    """A ROS topic's name on DDS."""
+    """Return the DDS name of a ROS topic.
+
+    Args:
+        topic: name in ROS.
+    """
     return f"rt/{topic.strip('/')}"
 
 
 class DdsNode:
-    """Readers and writers of one bridge.
+    """DDS readers and writers of one bridge.
 
     Args:
-        bridge: what it is for.
-        domain: ``ROS_DOMAIN_ID`` of those it talks to.
-        reliable: ask for lost pictures again; publishers of sensor data are often best effort, which such a reader does not hear.
-        depth: pictures that wait while a question is under way; 0 keeps all.
+        bridge: that processes the messages.
+        domain: ``ROS_DOMAIN_ID`` of the robot.
+        reliable: request lost images again. Sensor publishers are often best effort; a reliable reader does not receive them.
+        depth: length of the image queue during a query; 0 keeps all.
 
     Raises:
-        AddressError: DDS does not start, as with a wrong ``CYCLONEDDS_URI``.
+        AddressError: DDS does not start, for example because of a wrong ``CYCLONEDDS_URI``.
     """
 
     def __init__(self, bridge: Bridge, *, domain: int = 0, reliable: bool = False, depth: int = 5) -> None:
@@ -81,15 +86,15 @@ class DdsNode:
             ) from error
 
     def run(self, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None) -> None:
-        """Answer pictures until it is over.
+        """Process images and publish the results until ``over`` is set.
 
         Args:
-            over: set from elsewhere, as by a signal.
-            told: hears of every look at a pair.
+            over: ends the loop; set from elsewhere, for example by a signal.
+            told: called with the result of every processed pair.
         """
         spoken_s = time.monotonic() - IDLE_S
         while not over.is_set():
-            if (wait_s := self._bridge.wait_s()) > 0:  # what comes meanwhile nobody needs to unpack
+            if (wait_s := self._bridge.wait_s()) > 0:  # no query is due, so messages need not be unpacked
                 over.wait(min(wait_s, _LOOK_S))
             else:
                 self._waiting.wait(duration(seconds=_LOOK_S))
@@ -128,7 +133,11 @@ class DdsNode:
 
 
 def pose_message(pose: StampedPose) -> messages.PoseWithCovarianceStamped:
-    """As geometry_msgs has it."""
+    """Convert a pose to geometry_msgs/PoseWithCovarianceStamped.
+
+    Args:
+        pose: of the vehicle.
+    """
     x, y, z, w = pose.quaternion_xyzw.tolist()
     position = messages.Point(*pose.T_map_vehicle[:3, 3].tolist())
     posed = messages.Pose(position, messages.Quaternion(x, y, z, w))
@@ -139,7 +148,11 @@ def pose_message(pose: StampedPose) -> messages.PoseWithCovarianceStamped:
 
 
 def diagnostics_message(diagnosis: Diagnosis) -> messages.DiagnosticArray:
-    """As diagnostic_msgs has it; its stamp is now's."""
+    """Convert a diagnosis to diagnostic_msgs/DiagnosticArray, stamped with the current time.
+
+    Args:
+        diagnosis: to publish.
+    """
     status = messages.DiagnosticStatus(
         level=int(diagnosis.level), name=NAME, message=diagnosis.message, hardware_id="streetfix",
         values=[messages.KeyValue(name, value) for name, value in diagnosis.values],
@@ -148,5 +161,9 @@ def diagnostics_message(diagnosis: Diagnosis) -> messages.DiagnosticArray:
 
 
 def stamp_message(stamp_ns: int) -> messages.Time:
-    """As builtin_interfaces has it."""
+    """Convert a time stamp to builtin_interfaces/Time.
+
+    Args:
+        stamp_ns: POSIX time, ns.
+    """
     return messages.Time(*divmod(stamp_ns, 10**9))

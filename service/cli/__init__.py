@@ -1,4 +1,4 @@
-"""The command line. Where the service cannot run it ends at once, before an import of something that is missing there fails."""
+"""The command line. On an unsupported platform it exits at once, before an import of a missing package fails."""
 
 import sys
 

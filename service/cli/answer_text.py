@@ -1,4 +1,4 @@
-"""An answer of the service as a person would want to read it."""
+"""Print an answer of the service as readable text."""
 
 import math
 from typing import Any
@@ -8,11 +8,11 @@ from rich.table import Table
 
 
 def print_answer(answer: dict[str, Any], console: Console | None = None) -> None:
-    """Print status, street, pose, why there is none, neighbours and timings.
+    """Print status, street, pose, neighbours and timings. Without a pose, also print likely reasons and the hypotheses.
 
     Args:
-        answer: as in the REST contract; with ``focal_length_factor`` where another focal length was tried, None if none fits.
-        console: where to; standard output by default.
+        answer: as in the REST contract. If other focal lengths were tried, it has ``focal_length_factor``; None if none fits.
+        console: destination; None prints to standard output.
     """
     out = console or Console(highlight=False)
     facts = Table.grid(padding=(0, 2))
@@ -55,14 +55,14 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _why(answer: dict[str, Any]) -> list[str]:
-    """What to check, the likeliest cause first."""
+    """Lines that say what to check, the likeliest cause first."""
     found, factor = [], answer.get("focal_length_factor")
     if factor is not None:
         found.append(
             f"the focal length is probably off by a factor of two: fx and fy times {factor:g} fit the map better; check the intrinsics, "
             "and whether they are of pictures of this size"
         )  # fmt: skip
-    for reason in answer.get("reasons", []):  # an earlier service sends none
+    for reason in answer.get("reasons", []):  # an older service sends no reasons
         told = ", ".join(f"{name} {size:+.1f}" for name, size in reason["evidence"].items())
         where = f" (standard deviations from what calibration saw: {told})" if told else ""
         found.append(f"{reason['check']}{where}: {reason['remedy']}")
@@ -79,13 +79,13 @@ def _why(answer: dict[str, Any]) -> list[str]:
 
 
 def _doubt(spread: dict[str, Any]) -> str:
-    """How far apart the places are where the camera may be."""
+    """Text for the uncertainty of the position over all hypotheses."""
     largest_m = math.sqrt(max(spread["covariance"][4 * k] for k in range(3)))
     return f"+- {largest_m:.1f} m (one sigma) over the hypotheses and the rest of the map"
 
 
 def _spread(covariance: list[float] | None, rows: slice, scale: float, unit: str) -> str:
-    """The largest of the standard deviations, where they are known."""
+    """Text for the largest standard deviation of the given rows; empty if the covariance is unknown."""
     if covariance is None:
         return ""
     largest = max(covariance[7 * k] for k in range(6)[rows])

@@ -1,4 +1,4 @@
-"""``streetfix bridge ros2``: a robot's topics in, its pose in the map out."""
+"""``streetfix bridge ros2``: subscribe to the topics of a robot, and publish its pose in the map."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from service.runtime.wakeup import Wakeup
 
 app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Answer a robot's own messages with its pose in the map."
+    no_args_is_help=True, rich_markup_mode=None, help="Answer a robot's messages with its pose in the map."
 )
-#: A picture that is asked about for longer is of a place that the robot has left.
+#: Limits of a query. After a longer time the robot has left the place of the images.
 _ATTEMPTS, _PATIENCE_S, _TIMEOUT_S = 3, 3.0, 10.0
 
 
@@ -29,18 +29,23 @@ def _of_several() -> None:
 
 @app.command("ros2")
 def ros2(
-    url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
+    url: Annotated[str, typer.Option(help="URL of the service.")] = "http://127.0.0.1:8000",
     map_bundle: Annotated[
         Path | None,
-        typer.Option("--map", help="Answer from this bundle, in this process, and ask no service.", show_default=False),
+        typer.Option(
+            "--map",
+            help="Answer from this map bundle in this process. The bridge then asks no service.",
+            show_default=False,
+        ),
     ] = None,
     map_name: Annotated[
-        str | None, typer.Option("--map-name", help="Needed where the service has several.", show_default=False)
+        str | None,
+        typer.Option("--map-name", help="Map to ask. Required if the service has several.", show_default=False),
     ] = None,
     api_key: Annotated[
         str | None,
         typer.Option(
-            "--api-key", envvar="STREETFIX_API_KEY", help="Where the service asks for one.", show_default=False
+            "--api-key", envvar="STREETFIX_API_KEY", help="API key, if the service requires one.", show_default=False
         ),
     ] = None,
     ca: Ca = None,
@@ -52,7 +57,7 @@ def ros2(
     depth_topic: Annotated[
         str, typer.Option(help="sensor_msgs/Image, registered to colour: 16UC1 (mm) or 32FC1 (m).")
     ] = "/camera/aligned_depth_to_color/image_raw",
-    info_topic: Annotated[str, typer.Option(help="sensor_msgs/CameraInfo of the colour picture.")] = (
+    info_topic: Annotated[str, typer.Option(help="sensor_msgs/CameraInfo of the colour image.")] = (
         "/camera/color/camera_info"
     ),
     pose_topic: Annotated[str, typer.Option(help="geometry_msgs/PoseWithCovarianceStamped.")] = "/initialpose",
@@ -61,32 +66,42 @@ def ros2(
     mount: Annotated[
         str | None,
         typer.Option(
-            help="Where the camera sits on the vehicle, X,Y,Z,QX,QY,QZ,QW as tf2_echo base_link OPTICAL_FRAME prints it: the "
-            "vehicle's pose is published then, else that of the camera as a body (x forward, z up).",
+            help="Camera pose on the vehicle, X,Y,Z,QX,QY,QZ,QW as tf2_echo base_link OPTICAL_FRAME prints it. The "
+            "bridge then publishes the vehicle's pose. Otherwise it publishes the camera's pose as a body (x forward, "
+            "z up).",
             show_default=False,
         ),
     ] = None,
     rectified: Annotated[
-        bool, typer.Option("--rectified", help="The pictures are rectified, whatever lens the info tells of.")
+        bool, typer.Option("--rectified", help="The images are rectified, whatever lens the CameraInfo describes.")
     ] = False,
-    rate: Annotated[float, typer.Option(help="Questions a second at most; 0: one for every pair.")] = 1.0,
+    rate: Annotated[
+        float, typer.Option(help="Largest number of queries per second. 0 sends one for every pair.")
+    ] = 1.0,
     min_confidence: Annotated[
-        float, typer.Option(help="Of a pose that is published; 0 lets every LOCALIZED answer pass.")
+        float, typer.Option(help="Smallest confidence of a published pose. 0 passes every LOCALIZED answer.")
     ] = 0.9,
-    tolerance: Annotated[float, typer.Option(help="Seconds that stamps of colour and depth may differ.")] = 0.02,
-    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="Of the robot.")] = 0,
+    tolerance: Annotated[
+        float, typer.Option(help="Largest difference between the stamps of colour and depth, seconds.")
+    ] = 0.02,
+    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain of the robot.")] = 0,
     reliable: Annotated[
         bool,
-        typer.Option("--reliable", help="Ask for lost pictures again; best-effort publishers are not heard then."),
+        typer.Option("--reliable", help="Request lost images again. The bridge then hears no best-effort publishers."),
     ] = False,
-    queue: Annotated[int, typer.Option(min=0, help="Pictures that wait during a question; 0: all.")] = 5,
+    queue: Annotated[int, typer.Option(min=0, help="Images that wait during a query. 0 keeps all.")] = 5,
     node: Annotated[
-        Literal["dds", "rclpy"], typer.Option(help="dds needs no ROS; rclpy takes its ROS' middleware.")
+        Literal["dds", "rclpy"], typer.Option(help="dds needs no ROS. rclpy uses the middleware of its ROS.")
     ] = "dds",
 ) -> None:
-    """Subscribe to a camera's topics, localize, and publish the pose for Nav2; Ctrl-C ends it.
+    """Publish the pose of a robot from its camera's ROS 2 topics.
 
-    Example: streetfix bridge ros2 --url http://127.0.0.1:8000 --mount 0.2,0,0.5,-0.5,0.5,-0.5,0.5 --rate 0.5
+    The bridge subscribes to the topics and localises image pairs. It publishes the pose for Nav2.
+    Ctrl-C ends the bridge.
+
+    \b
+    Example:
+      streetfix bridge ros2 --url http://127.0.0.1:8000 --mount 0.2,0,0.5,-0.5,0.5,-0.5,0.5 --rate 0.5
     """
     from service.bridge.bridge import Bridge, Topics
     from service.bridge.gate import Gate
@@ -113,7 +128,7 @@ def ros2(
 
 
 def _node_of(node: str, *, domain: int, reliable: bool, depth: int) -> "Callable[..., None]":
-    """What carries the messages, imported before anything is opened: what it lacks is told at once."""
+    """Import the middleware before anything is opened, so that a missing package is reported at once."""
     if node == "rclpy":
         from service.bridge import rclpy_node
 
@@ -127,7 +142,7 @@ def _node_of(node: str, *, domain: int, reliable: bool, depth: int) -> "Callable
 def _asking(
     url: str, bundle: Path | None, *, map_name: str | None, api_key: str | None, ca: Path | None, cert: Path | None, key: Path | None
 ) -> "Iterator[Localize]":  # fmt: skip
-    """Whom to ask: a service, or the map itself."""
+    """Provide the function that localizes: by a service, or by the map in this process."""
     if bundle is not None:
         if given := next((name for name, file in (("ca", ca), ("cert", cert), ("key", key)) if file is not None), None):
             raise RequestError(f"--{given} is for a service; --map asks none", field=given)
@@ -149,7 +164,7 @@ def _asking(
 
 @contextmanager
 def _until_told() -> Iterator["Wakeup"]:
-    """Set by the first SIGINT or SIGTERM; the second does what it did before."""
+    """Provide an event that the first SIGINT or SIGTERM sets. A second signal has its original effect."""
     from service.runtime.wakeup import Wakeup
 
     over = Wakeup()

@@ -1,4 +1,4 @@
-"""TLS for both faces, from the settings' PEM files, which may be replaced while the service runs."""
+"""TLS for REST and gRPC from the PEM files of the settings. The files may be replaced while the service runs."""
 
 import ssl
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ class _Loaded:
     """One state of the files.
 
     Attributes:
-        context: for the handshakes of REST.
+        context: for handshakes of REST.
         certificate: PEM chain.
-        key: PEM.
-        client_ca: PEM; None asks for no certificates.
+        key: PEM private key.
+        client_ca: PEM authorities of clients; None requires no client certificate.
     """
 
     context: ssl.SSLContext
@@ -33,15 +33,15 @@ class _Loaded:
 
 
 class Certificates:
-    """Certificate, key and the clients' authorities; handshakes take the state of the last successful ``reload``.
+    """Certificate, key and client authorities. Handshakes use the state of the last successful ``reload``.
 
     Args:
-        certificate: file of the service's chain.
+        certificate: file of the certificate chain of the service.
         key: file of its private key.
-        client_ca: file of the authorities of the clients' certificates; None asks for none.
+        client_ca: file of the authorities for client certificates; None requires no client certificate.
 
     Raises:
-        KeysError: one cannot be read, or key and certificate do not belong together.
+        KeysError: a file cannot be read, or key and certificate do not belong together.
     """
 
     def __init__(self, certificate: Path, key: Path, client_ca: Path | None) -> None:
@@ -52,10 +52,13 @@ class Certificates:
 
     @classmethod
     def read(cls, settings: "Settings") -> "Certificates":
-        """Check the settings' files before anything listens.
+        """Read the files of the settings, before anything listens.
+
+        Args:
+            settings: of the service.
 
         Raises:
-            KeysError: as above, or the settings name none.
+            KeysError: as for the class, or the settings name no files.
         """
         if settings.tls_certificate is None or settings.tls_key is None:
             raise KeysError("tls_certificate and tls_key are not set")
@@ -63,23 +66,23 @@ class Certificates:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """All files."""
+        """Paths of all files."""
         return tuple(path for path in (self._certificate, self._key, self._client_ca) if path is not None)
 
     def reload(self) -> None:
-        """Read the files again, for handshakes from now on; connections that are open go on as they are.
+        """Read the files again for new handshakes. Open connections do not change.
 
         Raises:
-            KeysError: they cannot be used; what was in force stays so.
+            KeysError: the files cannot be used; the old state stays in force.
         """
         self._now = self._load()
 
     def for_uvicorn(self) -> dict[str, Any]:
-        """Arguments of its configuration."""
+        """Return keyword arguments for ``uvicorn.Config``."""
         return {"ssl_context_factory": lambda _config, _default: _context_of(self)}
 
     def for_grpc(self) -> "grpc.ServerCredentials":
-        """Credentials of its server."""
+        """Return the credentials for a gRPC server."""
         import grpc
 
         def configuration(loaded: _Loaded) -> Any:
@@ -90,7 +93,7 @@ class Certificates:
         given = self._now
 
         def newer() -> Any:
-            """Asked before every handshake; None where nothing has changed."""
+            """Return the state for the next handshake; None if it has not changed."""
             nonlocal given
             now = self._now
             if now is given:
@@ -103,7 +106,12 @@ class Certificates:
         )
 
     def wrap_bio(self, *given: Any, **named: Any) -> ssl.SSLObject:
-        """Begin a handshake of REST."""
+        """Begin a handshake of REST.
+
+        Args:
+            given: positional arguments of ``SSLContext.wrap_bio``.
+            named: keyword arguments of ``SSLContext.wrap_bio``.
+        """
         return self._now.context.wrap_bio(*given, **named)
 
     def _load(self) -> _Loaded:
@@ -138,7 +146,7 @@ class Certificates:
 
 
 class _DelegatingContext(ssl.SSLContext):
-    """What asyncio's server is given once; every handshake is one of the certificates in force."""
+    """Context for the asyncio server, which gets it once. Every handshake uses the certificates in force."""
 
     certificates: Certificates
 

@@ -1,4 +1,4 @@
-"""A server that says it is leaving before it leaves, so that balancers send their requests elsewhere."""
+"""A server that reports not ready before it stops, so that load balancers send their requests elsewhere."""
 
 import asyncio
 import signal
@@ -15,18 +15,19 @@ if TYPE_CHECKING:
 
 
 class DrainingServer(uvicorn.Server):
-    """On SIGTERM: not ready at once, then a while of answering everybody, then no new connections, then the end of running requests.
+    """uvicorn server that drains on SIGTERM.
 
-    Ctrl-C, and a second SIGTERM, skip the while.
+    On SIGTERM it reports not ready at once and still answers everybody for ``delay_s``. Then it takes no new connections and waits
+    for running requests. Ctrl-C or a second SIGTERM skips the delay.
 
     Args:
         config: of the service.
-        engine: that is told first.
-        delay_s: the while, seconds.
-        started: called once it listens.
-        leaving: called when it is over.
-        beside: further listeners of the same loop, each with its configuration, as the health port's: a loop that hangs must not
-            look alive.
+        engine: marked as draining.
+        delay_s: seconds between the signal and the refusal of new connections.
+        started: called once the server listens.
+        leaving: called after the delay, when the server begins to stop.
+        beside: further listeners on the same event loop, each with its configuration, such as the health port. A blocked loop then
+            fails the health check too.
     """
 
     def __init__(
@@ -43,7 +44,11 @@ class DrainingServer(uvicorn.Server):
         self._leave_at_s: float | None = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, beside too."""
+        """Listen on the sockets and on the further listeners.
+
+        Args:
+            sockets: of the service.
+        """
         await super().startup(sockets)
         for listener, config in self._beside:
             config.load()
@@ -57,12 +62,21 @@ class DrainingServer(uvicorn.Server):
         self._started()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """No new connections, then the end of running requests; other faces begin to leave at the same moment."""
+        """Take no new connections and wait for running requests. The gRPC server begins to stop at the same time.
+
+        Args:
+            sockets: of the service.
+        """
         self._leaving()
         await super().shutdown(sockets)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Uvicorn's handler of signals."""
+        """Handle a signal: begin to drain, or exit.
+
+        Args:
+            sig: number of the signal.
+            frame: unused by this class; passed on.
+        """
         first = not self._engine.is_draining
         self._engine.drain()
         if first and sig == signal.SIGTERM and self._delay_s > 0:
@@ -71,10 +85,13 @@ class DrainingServer(uvicorn.Server):
         super().handle_exit(sig, frame)
 
     async def on_tick(self, counter: int) -> bool:
-        """Uvicorn's look at what is to be done, ten times a second; whether to leave.
+        """Check whether to exit. uvicorn calls this ten times per second.
 
-        The while is watched here: a timer's thread cannot be started in a signal handler, which may have interrupted the start of
-        another thread, whose lock it would wait for.
+        The delay ends here and not by a timer. A signal handler must not start the thread of a timer: it may have interrupted the
+        start of another thread, and would wait for its lock.
+
+        Args:
+            counter: of the ticks.
         """
         if self._leave_at_s is not None and time.monotonic() >= self._leave_at_s:
             self.should_exit = True

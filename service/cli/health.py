@@ -1,4 +1,4 @@
-"""``streetfix health``: whether the service of these settings is ready; what a container's health check runs."""
+"""``streetfix health``: check whether the service of these settings is ready. The health check of the container runs it."""
 
 import socket
 import ssl
@@ -14,17 +14,21 @@ _TIMEOUT_S = 2.0
 
 
 def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
-    """Ask the service that STREETFIX_* describes, on this machine, whether it is ready: leaves with 0 or 1.
+    """Ask the service on this machine whether it is ready.
 
-    Without --ca any certificate will do, since the service is on this machine. A service that asks for client certificates is only
-    asked if --cert and --key are given, else it has to listen.
+    The variables STREETFIX_* describe the service. The exit code is 0 if the service is ready, otherwise 1.
 
-    Example: STREETFIX_PORT=8000 streetfix health
+    Without --ca the command accepts any certificate, because the service is on this machine. A service that requires
+    client certificates needs --cert and --key. Without them the command only checks that the service listens.
+
+    \b
+    Example:
+      STREETFIX_PORT=8000 streetfix health
     """
     from service.client.tls import ClientTls
     from service.runtime.settings import load_settings
 
-    settings = load_settings(insecure_public=True)  # what is asked here is not what is served
+    settings = load_settings(insecure_public=True)  # this command serves nothing, so it needs no protection
     if settings.health_port is not None:
         _ask(f"http://{_address(settings.health_host or settings.host)}:{settings.health_port}/readyz", None)
         return
@@ -32,7 +36,7 @@ def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
     address = _address(settings.host)
     if (
         settings.tls_client_ca is not None and tls.cert is None
-    ):  # without a certificate only that it listens can be seen
+    ):  # without a certificate it can only check that the service listens
         try:
             socket.create_connection((address.strip("[]"), settings.port), timeout=_TIMEOUT_S).close()
         except OSError as error:
@@ -40,7 +44,7 @@ def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
         return
     scheme = "http" if settings.tls_certificate is None else "https"
     context = None
-    if scheme == "https":  # its own certificate names the outside, not loopback
+    if scheme == "https":  # the certificate names the public host, not loopback
         context = tls.context()
         context.check_hostname = False
         if not tls.is_wanted or tls.ca is None:
@@ -57,6 +61,6 @@ def _ask(url: str, context: ssl.SSLContext | None) -> None:
 
 
 def _address(host: str) -> str:
-    """Where a service that listens on a host is reached from this machine, as in a URL."""
+    """Address in a URL by which this machine reaches a service that listens on a host."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  # a question, nothing is bound
     return f"[{host}]" if ":" in host else host

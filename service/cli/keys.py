@@ -1,4 +1,4 @@
-"""``streetfix keys``: a new API key, and the line that lets it in."""
+"""``streetfix keys``: create an API key and its line for the file of keys."""
 
 import re
 from typing import Annotated
@@ -9,16 +9,19 @@ from service.errors import RequestError
 
 
 def command(
-    name: Annotated[str, typer.Argument(help="Who will use it: letters, digits, '.', '_' and '-'.")],
+    name: Annotated[str, typer.Argument(help="Name of the user: letters, digits, '.', '_' and '-'.")],
     operator: Annotated[
-        bool, typer.Option(help="May also change what the service does: which version of a map serves.")
+        bool, typer.Option(help="The key may also change the service: which version of a map serves.")
     ] = False,
 ) -> None:
-    """Make an API key: the key on stderr, for its user; its line for the service's file on stdout.
+    """Make an API key and its line for the service's file.
 
-    The file holds a hash; the key is shown this once and kept nowhere.
+    The command prints the key on stderr, for its user. It prints the line on stdout. The line holds a hash.
+    The command shows the key only once and stores it nowhere.
 
-    Example: streetfix keys robot-7 >> keys.txt && STREETFIX_API_KEYS=keys.txt streetfix serve maps/paper-city
+    \b
+    Example:
+      streetfix keys robot-7 >> keys.txt && STREETFIX_API_KEYS=keys.txt streetfix serve maps/paper-city
     """
     from service.runtime.keys import hash_of, new_key
 

@@ -16,24 +16,26 @@ NOT_LOCALIZED = 3
 
 
 def command(
-    rgb: Annotated[Path, typer.Option(help="Colour picture: JPEG, PNG or WebP.", show_default=False)],
-    depth: Annotated[Path, typer.Option(help="Depth picture: 16-bit PNG, TIFF, NPY or SFD1.", show_default=False)],
+    rgb: Annotated[Path, typer.Option(help="Colour image: JPEG, PNG or WebP.", show_default=False)],
+    depth: Annotated[Path, typer.Option(help="Depth image: 16-bit PNG, TIFF, NPY or SFD1.", show_default=False)],
     camera: Annotated[
-        Path, typer.Option(help='JSON: {"camera": {...}, "depth": {...}, "gravity": {...}}.', show_default=False)
+        Path, typer.Option(help='JSON file: {"camera": {...}, "depth": {...}, "gravity": {...}}.', show_default=False)
     ],
-    url: Annotated[str, typer.Option(help="The service.")] = "http://127.0.0.1:8000",
-    map_name: Annotated[str | None, typer.Option("--map", help="Needed where several are mounted.")] = None,
+    url: Annotated[str, typer.Option(help="URL of the service.")] = "http://127.0.0.1:8000",
+    map_name: Annotated[
+        str | None, typer.Option("--map", help="Map to ask. Required if the service has several.")
+    ] = None,
     near: Annotated[
         str | None,
-        typer.Option(help="Where it was, roughly: X,Y or X,Y,STD in metres of the map frame.", show_default=False),
+        typer.Option(help="Approximate position: X,Y or X,Y,STD in the map frame, metres.", show_default=False),
     ] = None,
     heading: Annotated[
-        float | None, typer.Option(help="Where it looked, roughly: degrees, counter-clockwise from map x.")
+        float | None, typer.Option(help="Approximate heading, degrees counter-clockwise from map x.")
     ] = None,
     api_key: Annotated[
         str | None,
         typer.Option(
-            "--api-key", envvar="STREETFIX_API_KEY", help="Where the service asks for one.", show_default=False
+            "--api-key", envvar="STREETFIX_API_KEY", help="API key, if the service requires one.", show_default=False
         ),
     ] = None,
     ca: Ca = None,
@@ -43,23 +45,34 @@ def command(
         bool,
         typer.Option(
             "--try-focal/--no-try-focal",
-            help="If the answer is not LOCALIZED, ask twice more, with fx and fy halved and doubled, and say so if that fits the map.",
+            help="If the answer is not LOCALIZED, ask twice more, with fx and fy halved and doubled. Report a factor "
+            "that fits.",
         ),
     ] = True,
     as_json: Annotated[
         bool,
         typer.Option(
             "--json",
-            help="Print the answer as it came; with focal_length_factor (null: neither fits) if that was tried.",
+            help="Print the answer as it came. --try-focal adds focal_length_factor if it ran (null: neither fits).",
         ),
     ] = False,
 ) -> None:
-    """Ask where two pictures were taken.
+    """Ask a service for the pose of one query.
 
-    Exit code: 0 if the answer is LOCALIZED; 3 if it is AMBIGUOUS or OUT_OF_MAP, then there is no pose, and the command says what to check,
-    the likeliest cause first; 1 for an error, 2 for wrong options.
+    A query is a colour image and a depth image.
 
-    Example: streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json --near 12,-40
+    \b
+    Exit codes:
+      0  the answer is LOCALIZED
+      1  an error
+      2  wrong options
+      3  the answer is AMBIGUOUS or OUT_OF_MAP
+
+    With exit code 3 there is no pose. The command then says what to check, the likeliest cause first.
+
+    \b
+    Example:
+      streetfix localize --url http://127.0.0.1:8000 --rgb 0.jpg --depth 0.png --camera camera.json --near 12,-40
     """
     prior = _prior(near, heading)
 
@@ -83,14 +96,14 @@ def command(
 
 
 def _fitting_factor(answer: dict[str, Any], ask: Callable[[float], dict[str, Any]]) -> float | None:
-    """The factor of fx and fy that fits the map clearly better than the camera as it was given; None: there is none."""
+    """Factor of fx and fy that fits the map clearly better than the given camera; None if there is none."""
     from service.localization.reasons import FOCAL_FACTORS, GAIN_OF_ONE
 
     before, best, most = _support(answer), None, (False, GAIN_OF_ONE)
     for factor in FOCAL_FACTORS:
         try:
             changed = ask(factor)
-        except StreetfixError as error:  # the answer itself stands
+        except StreetfixError as error:  # the first answer stays valid
             typer.echo(f"streetfix: fx and fy times {factor:g} could not be tried: {error}", err=True)
             continue
         gained = _support(changed) - before
@@ -101,7 +114,7 @@ def _fitting_factor(answer: dict[str, Any], ask: Callable[[float], dict[str, Any
 
 
 def _support(answer: dict[str, Any]) -> float:
-    """What speaks for the first hypothesis, nats; 0 where nothing could be registered."""
+    """Support of the first hypothesis in nats; 0 if nothing could be registered."""
     from service.localization.reasons import support_of
 
     return max((support_of(each["inliers"], each["similarity"]) for each in answer["hypotheses"][:1]), default=0.0)
@@ -134,25 +147,25 @@ def localize(
     key: Path | None = None,
     focal_factor: float = 1.0,
 ) -> dict[str, Any]:
-    """Post a pair of pictures.
+    """Send an image pair to a service and return its answer.
 
     Args:
         url: of the service, without a path.
-        rgb: file of the colour picture.
-        depth: file of the depth picture.
-        camera: JSON file with the request's parts: camera, depth, gravity and so on.
-        map_name: which map; goes above the file's.
-        prior: as in the REST contract; goes above the file's.
-        api_key: where the service asks for one.
+        rgb: file of the RGB image.
+        depth: file of the depth image.
+        camera: JSON file with the parts of the request: camera, depth, gravity and so on.
+        map_name: name of the map; overrides the file.
+        prior: as in the REST contract; overrides the file.
+        api_key: if the service requires one.
         ca: PEM file of the authorities of the service's certificate, as in ``Client``.
         cert: PEM file of the client's certificate.
-        key: PEM file of its private key.
-        focal_factor: of the camera file's fx and fy.
+        key: PEM file of the client's private key.
+        focal_factor: multiplies fx and fy of the camera file.
 
     Raises:
-        RequestError: a file cannot be read, the camera file is no JSON object, or the address is none.
-        KeysError: a file of TLS cannot be used.
-        UnreachableError: nothing answers at the address, or something that is no Streetfix.
+        RequestError: a file cannot be read, the camera file is no JSON object, or the URL is invalid.
+        KeysError: a TLS file cannot be used.
+        UnreachableError: nothing answers at the address, or the answer is not from Streetfix.
         RefusedError: the service answered with a problem.
     """
     from service.client import Client, RetryPolicy, rest
@@ -164,17 +177,17 @@ def localize(
         "depth": (depth.name, _bytes_of(depth, "depth"), "application/octet-stream"),
         "request": ("request.json", json.dumps(request).encode(), "application/json"),
     }
-    # Who types a command wants to know at once.
+    # No retries: the user of a command wants the result at once.
     patience = RetryPolicy(attempts=1)
     with Client(url, api_key=api_key, timeout_s=_TIMEOUT_S, retry=patience, ca=ca, cert=cert, key=key) as client:
         return client.call(rest.Call("POST", "/v1/localize", _answer, files))
 
 
 def _answer(body: bytes) -> dict[str, Any]:
-    """As it came, whatever a later service has put beside what we know.
+    """Parse an answer without changes, with any unknown fields of a newer service.
 
     Raises:
-        ValueError: it is no answer.
+        ValueError: the body is no answer.
     """
     answer = json.loads(body)
     if (
@@ -193,7 +206,7 @@ def _camera_parts(path: Path, focal_factor: float) -> dict[str, Any]:
         raise RequestError(f"{path}: this is no JSON ({error})", field="camera") from error
     if not isinstance(parts, dict) or "camera" not in parts:
         raise RequestError(f'{path}: it must be an object like {{"camera": {{"width": 640, ...}}}}', field="camera")
-    if focal_factor != 1.0:  # the first question goes as it stands, for the service to judge
+    if focal_factor != 1.0:  # the first query is sent unchanged, so that the service checks it
         parts["camera"] |= {name: float(parts["camera"][name]) * focal_factor for name in ("fx", "fy")}
     return parts
 

@@ -1,4 +1,4 @@
-"""The command ``streetfix``: the commands of the service, and those that other packages bring by entry point."""
+"""The command ``streetfix``: commands of the service, and commands of other packages by entry point."""
 
 import functools
 import sys
@@ -15,29 +15,29 @@ from service.cli import bridge, health, keys, localize, serve
 from service.errors import ExtraMissingError, StreetfixError, how_to_install
 
 GROUP = "streetfix.commands"
-#: One line for ``--help``, which must not import what it lists, and the extra that brings a command's packages.
+#: One line per command for ``--help``, which must not import the commands, and the extra that installs the packages of the command.
 _KNOWN = {
-    "simulate": ("Make a city by seed and drive through it: survey and queries.", "mapping"),
-    "import": ("Bring recorded data into the dataset folder.", "mapping"),
-    "record": ("Record a drive from a running simulator.", "mapping"),
+    "simulate": ("Simulate a city, its LiDAR survey and its query traversals.", "mapping"),
+    "import": ("Import a recording into a dataset folder.", "mapping"),
+    "record": ("Record a traversal from a running simulator.", "mapping"),
     "convert": ("Write a dataset as a ROS bag or in KITTI's layout.", "mapping"),
-    "streets": ("Name streets: from GeoJSON, OpenDRIVE or OpenStreetMap into a dataset.", "mapping"),
-    "build-map": ("Make a map bundle from a dataset's survey.", "mapping"),
-    "map": ("Look after map bundles: info, verify, diff, merge, update.", "mapping"),
-    "calibrate": ("Fit an encoder's confidence on simulated cities of their own.", "mapping"),
-    "evaluate": ("Compare answers of a map with the truth of a dataset.", "mapping"),
-    "compare": ("Compare two evaluations over the same queries.", "mapping"),
-    "view": ("Look at a dataset, a map or answers in Rerun, Foxglove or Lichtblick.", "view"),
-    "loadtest": ("Load a running service with a dataset's queries.", "mapping"),
-    "demo": ("Map streets, serve the map, ask it where pictures were taken.", "mapping"),
+    "streets": ("Import named streets from GeoJSON, OpenDRIVE or OpenStreetMap.", "mapping"),
+    "build-map": ("Build a map bundle from a dataset's survey.", "mapping"),
+    "map": ("Maintain map bundles: info, verify, diff, merge, update.", "mapping"),
+    "calibrate": ("Fit the confidence of an encoder on calibration cities.", "mapping"),
+    "evaluate": ("Measure the answers of a map against ground truth.", "mapping"),
+    "compare": ("Compare two runs over the same queries.", "mapping"),
+    "view": ("Show data, maps or answers in Rerun, Foxglove or Lichtblick.", "view"),
+    "loadtest": ("Load a running service with the queries of a dataset.", "mapping"),
+    "demo": ("Build a map, serve it and compare answers with ground truth.", "mapping"),
     "train": ("Train an encoder on simulated cities.", "training"),
     "average": ("Average the weights of two training runs.", "training"),
-    "export": ("Make an ONNX encoder from a training's checkpoint.", "training"),
-    "quantize": ("Write an encoder in eight bits: smaller, faster, nearly the same.", "training"),
+    "export": ("Export a trained encoder to ONNX.", "training"),
+    "quantize": ("Quantise an encoder to 8 bits: smaller, faster, nearly equal.", "training"),
 }
 
 
-#: Packages that only some of a command's work needs, and the extra that brings each.
+#: Packages that a command needs only for some tasks, and the extra that installs each.
 _EXTRA_OF_PACKAGE = {
     "rosbags": "ros",
     "laspy": "clouds",
@@ -53,7 +53,7 @@ _EXTRA_OF_PACKAGE = {
     "rerun": "view",
     "foxglove": "view",
 }
-#: Packages without a wheel for every supported platform, as the markers in ``pyproject.toml`` have it.
+#: Packages without a wheel for every supported platform, as in the markers of ``pyproject.toml``.
 _NOT_EVERYWHERE = {
     "embreex": "for x86-64 and macOS",
     "carla": "for Python before 3.13 on x86-64",
@@ -63,14 +63,20 @@ _NOT_EVERYWHERE = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and leave the process: 0 done, 1 refused with a message, 2 wrong usage; a command may have more."""
+    """Run the command line and exit.
+
+    Exit codes: 0 done, 1 refused with a message, 2 wrong usage. A command may have further codes.
+
+    Args:
+        arguments: of the command line; None takes those of the process.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         _run(given)
     except StreetfixError as error:
         typer.echo(f"streetfix: {error.message}", err=True)
         sys.exit(1)
-    except ValidationError as error:  # of a command's own settings: name the option, not the model
+    except ValidationError as error:  # invalid settings of a command: name the option, not the model
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         typer.echo(f"streetfix: {where}: {first['msg']} (given: {first.get('input')!r})", err=True)
@@ -79,20 +85,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.stderr.close()
         sys.exit(1)
     except OSError as error:
-        if error.errno is None:  # not the system's: a defect of ours, to be seen whole
+        if error.errno is None:  # not from the system: a defect, so show the traceback
             raise
         typer.echo(f"streetfix: {_told_by_system(error)}", err=True)
         sys.exit(1)
 
 
 def _told_by_system(error: OSError) -> str:
-    """What the system says of a file, in a line: it vanished, may not be read, or the disk is full or fails."""
+    """One line for a system error of a file: it is missing or unreadable, or the disk is full or fails."""
     files = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
     return f"{files or 'a file'}: {error.strerror}; check the file, its folder and the disk, and start again"
 
 
 def _run(arguments: list[str]) -> None:
-    """A command, with a package that one of the service's own misses told as a missing extra."""
+    """Run a command. If a package of a service command is missing, report the extra that installs it."""
     try:
         app_for(arguments)(arguments, prog_name="streetfix")
     except ModuleNotFoundError as error:
@@ -102,7 +108,11 @@ def _run(arguments: list[str]) -> None:
 
 
 def app_for(arguments: Sequence[str]) -> typer.Typer:
-    """The application; of the commands that other packages bring only the one that is called is imported."""
+    """Build the application. Of the commands of other packages, it imports only the called one.
+
+    Args:
+        arguments: of the command line.
+    """
     called = next((argument for argument in arguments if not argument.startswith("-")), None)
     app = typer.Typer(
         add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=_HELP
@@ -127,7 +137,7 @@ def app_for(arguments: Sequence[str]) -> typer.Typer:
     return app
 
 
-_HELP = "Street and pose of a robot from one RGB and one depth picture against a LiDAR map."
+_HELP = "Find the street and the pose of a robot in a LiDAR map from one RGB image and one depth image."
 
 
 def _show_version(wanted: bool) -> None:
@@ -138,7 +148,7 @@ def _show_version(wanted: bool) -> None:
 
 def _global_options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and leave.")
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
     del version  # its callback has done the work
@@ -149,14 +159,14 @@ def _not_called() -> None:
 
 
 def _is_installed(point: EntryPoint) -> bool:
-    """Whether a command is there: the container image leaves out the package that builds maps and encoders."""
+    """Whether a command is installed. The container image omits the package that builds maps and encoders."""
     return find_spec(point.module.partition(".")[0]) is not None
 
 
 def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any] | typer.Typer:
-    """The command's function, or its application where it has commands of its own.
+    """Load the function of a command, or its application if it has subcommands.
 
-    A missing package is told as a missing extra, whether now or when it runs.
+    A missing package is reported as a missing extra, now or when the command runs.
     """
     if not _is_installed(point):
         raise ExtraMissingError(

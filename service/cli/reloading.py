@@ -1,4 +1,4 @@
-"""Keys and certificates that are replaced while the service runs: looked at every so often, and when the reloader is told to."""
+"""Reload keys and certificates while the service runs, periodically and on request."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 
 @contextmanager
 def reloading(keys: "KeyRing | None", tls: "Certificates | None", *, every_s: float) -> Iterator[Reloader]:
-    """Take over changed files inside.
+    """Reload changed files inside the context.
 
     Args:
-        keys: read from a file.
-        tls: read from files.
-        every_s: seconds between two looks; 0 looks only when the reloader is told to.
+        keys: watched if they come from a file; None for no keys.
+        tls: certificates to watch; None for no TLS.
+        every_s: seconds between two checks; 0 checks only on request.
 
     Raises:
-        KeysError: they have become unusable since they were read.
+        KeysError: the files have become unusable since they were read.
     """
     reloader = Reloader()
     if keys is not None and keys.path is not None:

@@ -1,4 +1,4 @@
-"""``streetfix serve``: open the maps, listen, answer until told to stop."""
+"""``streetfix serve``: open the maps, listen, and answer requests until a signal arrives."""
 
 import gc
 import math
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from service.runtime.settings import Settings
 
 _BACKLOG = 128
-#: Where Prometheus' client library keeps what several processes count together.
+#: Environment variable for the folder in which the Prometheus client library keeps the counts of several processes.
 METRICS_FOLDER = "PROMETHEUS_MULTIPROC_DIR"
 
 
@@ -39,49 +39,57 @@ def command(
         typer.Argument(metavar="BUNDLE", help="Map bundles, or folders of them.", show_default=False),
     ] = None,
     host: Annotated[str | None, typer.Option(help="Address to listen on.  [default: 127.0.0.1]")] = None,
-    port: Annotated[int | None, typer.Option(help="0 lets the system choose.  [default: 8000]")] = None,
+    port: Annotated[int | None, typer.Option(help="HTTP port. 0 lets the system choose.  [default: 8000]")] = None,
     grpc_port: Annotated[
-        int | None, typer.Option(help="Serve gRPC too, on this port.  [default: no gRPC]", show_default=False)
+        int | None, typer.Option(help="Also serve gRPC on this port.  [default: no gRPC]", show_default=False)
     ] = None,
-    threads: Annotated[int | None, typer.Option(help="Requests worked on at once.  [default: the cores]")] = None,
-    queue: Annotated[int | None, typer.Option(help="Requests that may wait before 503.  [default: 64]")] = None,
+    threads: Annotated[
+        int | None, typer.Option(help="Requests that a process works on at once.  [default: its share of the cores]")
+    ] = None,
+    queue: Annotated[
+        int | None, typer.Option(help="Requests that may wait in a process before 503.  [default: 64]")
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes that share the ports and the maps.  [default: 1]")
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help="Settings file, TOML; the environment and flags go above it.", show_default=False),
+        typer.Option(help="Settings file, TOML. The environment and flags override it.", show_default=False),
     ] = None,
     samples: Annotated[
         Path | None,
-        typer.Option(help="Folder of sample pairs for the console.", show_default=False),
+        typer.Option(help="Folder of sample queries for the console.", show_default=False),
     ] = None,
     check: Annotated[
         bool,
         typer.Option(
-            "--check", help="Check settings, keys, certificates and maps, print the effective settings, and leave."
+            "--check", help="Check settings, keys, certificates and maps. Print the effective settings and exit."
         ),
     ] = False,
     strict: Annotated[
         bool | None,
         typer.Option(
-            "--strict", help="Do not start if any bundle cannot be mounted, or if there is none.", show_default=False
+            "--strict", help="Do not start if there is no map bundle, or if one cannot be mounted.", show_default=False
         ),
     ] = None,
     false_accept_rate: Annotated[
         float | None,
-        typer.Option(help="Share of the queries taken outside the map that may be LOCALIZED.  [default: 0.02]"),
+        typer.Option(help="Share of out-of-map queries that may get the status LOCALIZED.  [default: 0.02]"),
     ] = None,
 ) -> None:
-    """Serve maps over HTTP and gRPC; loopback only, unless told otherwise.
+    """Serve maps over HTTP and gRPC.
 
-    Every option can be set as STREETFIX_HOST, STREETFIX_PORT and so on, the maps as STREETFIX_MAPS (':' between); or in a TOML
-    file that --config or STREETFIX_CONFIG names.
+    By default the service listens on loopback only.
 
-    Damaged bundles are passed over and reported (log, /readyz, /metrics). The service ends only if there are bundles and none can be
-    mounted. With an empty maps folder it is not ready until a bundle arrives.
+    Every option but --check has a variable: STREETFIX_HOST, STREETFIX_PORT and so on. STREETFIX_MAPS names the maps,
+    with ':' between them. A TOML file can hold the same settings. --config or STREETFIX_CONFIG names the file.
 
-    Example: streetfix serve maps/paper-city --port 8000 --grpc-port 50051
+    The service skips damaged map bundles and reports them (log, /readyz, /metrics). The service ends only if there are
+    bundles and none can be mounted. With an empty maps folder the service is not ready until a bundle arrives.
+
+    \b
+    Example:
+      streetfix serve maps/paper-city --port 8000 --grpc-port 50051
     """
     from service.runtime.threads import limit_pools_before_import
 
@@ -97,10 +105,13 @@ def command(
 
 
 def check_only(settings: "Settings") -> None:
-    """Open all that a service would open, say what it found, and leave.
+    """Open everything that a service would open, print the result, and return.
+
+    Args:
+        settings: of the service.
 
     Raises:
-        StreetfixError: what would keep it, or one of its maps, from serving.
+        StreetfixError: the service could not start, or a map could not serve.
     """
     from service.cli.certificates import Certificates
     from service.console.samples import Samples
@@ -129,11 +140,14 @@ def check_only(settings: "Settings") -> None:
 
 
 def serve(settings: "Settings") -> None:
-    """Open the maps and answer until SIGINT or SIGTERM.
+    """Open the maps and answer requests until SIGINT or SIGTERM.
+
+    Args:
+        settings: of the service.
 
     Raises:
-        StreetfixError: no map is given, or none of the given ones can be mounted; with ``strict``, one of them cannot.
-        AddressError: the address is taken or not ours.
+        StreetfixError: no map is given, or no given bundle can be mounted. With the setting ``strict``: one cannot be mounted.
+        AddressError: the address is taken or does not belong to this machine.
     """
     from service.runtime.heap import keep_little
     from service.runtime.threads import usable_cores
@@ -154,10 +168,10 @@ def serve(settings: "Settings") -> None:
 
 
 def _answer_by_workers(settings: "Settings") -> None:
-    """Several processes on the same ports. They count together in a folder of theirs, and agree on versions of maps in shared memory.
+    """Answer by several processes on the same ports. They share metrics in a folder, and map versions in shared memory.
 
-    Each listens on a socket of its own, between which the system spreads connections: of one socket that all share, whoever is quick
-    takes all connections of clients that keep them.
+    Each worker has its own listening socket (SO_REUSEPORT), and the system distributes connections among them. With one shared
+    socket, keep-alive connections would pile up in the fastest worker.
     """
     from service.cli.shared_counts import release, reserve
     from service.cli.workers import supervise
@@ -172,7 +186,7 @@ def _answer_by_workers(settings: "Settings") -> None:
     ):
         counts = Path(folder) / "metrics"
         counts.mkdir()
-        os.environ[METRICS_FOLDER] = str(counts)  # Prometheus' client looks here when it is imported, which workers do
+        os.environ[METRICS_FOLDER] = str(counts)  # the Prometheus client reads it at import, which only workers do
         shared = settings.model_copy(update={"port": port, "grpc_port": grpc_port, "health_port": health_port})
 
         def work(number: int, ready: Callable[[], None]) -> None:
@@ -187,7 +201,7 @@ def _answer_by_workers(settings: "Settings") -> None:
                     typer.echo(f"streetfix: {told}", err=True)
                 _answer(shared, listener, health, table=table, ready=ready, says_where=number == 0)
 
-        # Requests and streams each end within the grace; what still runs long after it hangs.
+        # Requests and streams each end within the grace period. A worker that runs much longer hangs.
         code = supervise(
             settings.workers, work, ended=partial(release, counts),
             kill_after_s=settings.drain_s + 2 * settings.grace_s + 10.0,
@@ -198,15 +212,15 @@ def _answer_by_workers(settings: "Settings") -> None:
 
 @contextmanager
 def _held_port(host: str, port: int | None) -> Iterator[int | None]:
-    """A port for the workers, each of which listens on it; chosen by the system where it is 0.
+    """Reserve a port for the workers inside the context; the system chooses it if it is 0.
 
     Raises:
-        AddressError: it is taken.
+        AddressError: the port is taken.
     """
     if port is None:
         yield None
         return
-    with _listen(host, port) as alone:  # a service that shares its ports would else be joined by another one in silence
+    with _listen(host, port) as alone:  # otherwise two services could share the port unnoticed
         chosen = int(alone.getsockname()[1])
     with _bind_shared(host, chosen):
         yield chosen
@@ -221,7 +235,7 @@ def _answer(
     ready: Callable[[], None] = lambda: None,
     says_where: bool = True,
 ) -> None:
-    """Open the maps and answer, in this process."""
+    """Open the maps and answer requests in this process."""
     import uvicorn
 
     from service.cli.certificates import Certificates
@@ -237,7 +251,7 @@ def _answer(
     keys = None if settings.api_keys is None else KeyRing.open(settings.api_keys)
     tls = None if settings.tls_certificate is None else Certificates.read(settings)
     if settings.grpc_port is not None:
-        import service.grpc.server  # noqa: F401  # so that it is among what stays
+        import service.grpc.server  # noqa: F401  # imported here, so that ``_settled`` freezes its objects
     with _settled():
         engine = Engine.open(settings, table)
         try:
@@ -260,7 +274,8 @@ def _answer(
                 server = DrainingServer(
                     config, engine, delay_s=settings.drain_s, started=started, leaving=leave, beside=beside
                 )
-                # While it runs uvicorn has these handlers itself, and raises again what it got; both are harmless so.
+                # uvicorn installs its own handlers while it runs, and raises received signals again at the end. With these handlers
+                # that does no harm.
                 for number in (signal.SIGINT, signal.SIGTERM):
                     signal.signal(number, server.handle_exit)
                 server.run(sockets=[listener])
@@ -269,7 +284,7 @@ def _answer(
 
 
 def _plain(app: "FastAPI") -> "uvicorn.Config":
-    """Configuration of a listener without TLS."""
+    """Build the configuration of a listener without TLS."""
     import uvicorn
 
     from service.http.protocol import BoundedHttp
@@ -281,10 +296,10 @@ def _plain(app: "FastAPI") -> "uvicorn.Config":
 
 @contextmanager
 def _settled() -> Iterator[None]:
-    """Garbage collection passes over what is here now, the hundred thousand objects of all that was imported.
+    """Exclude the present objects from garbage collection: a hundred thousand objects of imported modules.
 
-    To look through them took a full collection 100 ms now and then, in which nobody was answered (decision log). Maps are opened
-    inside, so one that is replaced is still collected.
+    A full collection of them took 100 ms, during which the service answered nobody (decision log). Maps are opened inside the
+    context, so a replaced map is still collected.
     """
     gc.collect()
     gc.freeze()
@@ -298,7 +313,7 @@ def _settled() -> Iterator[None]:
 def _grpc(
     engine: "Engine", keys: "KeyRing | None", tls: "Certificates | None"
 ) -> Iterator[tuple[int | None, Callable[[], object]]]:
-    """Serve gRPC inside, where the settings want it; its port, and what begins its end."""
+    """Serve gRPC inside the context if the settings enable it; yield its port and a function that begins to stop it."""
     settings = engine.settings
     if settings.grpc_port is None:
         yield None, lambda: None
@@ -316,7 +331,7 @@ def _grpc(
 
 @contextmanager
 def _hangup_held_back() -> Iterator[None]:
-    """SIGHUP waits inside until ``_watching`` has a handler for it; without one it would end the process.
+    """Block SIGHUP until ``_watching`` has a handler for it. Without a handler SIGHUP would end the process.
 
     The supervisor does the same for workers.
     """
@@ -324,7 +339,7 @@ def _hangup_held_back() -> Iterator[None]:
     try:
         yield
     finally:
-        # One that came after ``_watching`` had ended is dropped: ignoring a signal discards it while it is blocked.
+        # Drop a SIGHUP that arrived after ``_watching`` ended: ignoring a blocked signal discards it.
         handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         signal.signal(signal.SIGHUP, handler)
@@ -332,14 +347,14 @@ def _hangup_held_back() -> Iterator[None]:
 
 @contextmanager
 def _watching(engine: "Engine", *, also: Callable[[], None]) -> Iterator[None]:
-    """Look for new bundles inside: every so often, and on SIGHUP.
+    """Look for new bundles inside the context, periodically and on SIGHUP.
 
-    SIGHUP means: read again what lies outside. Nothing inside the service sends SIGHUP; workers tell each other about maps through
+    SIGHUP asks the service to read external files again. The service itself never sends SIGHUP; workers share news about maps through
     the serving table.
 
     Args:
-        engine: whose maps are looked for.
-        also: called on SIGHUP, too; it must be safe in a signal handler.
+        engine: its watcher looks for the bundles.
+        also: also called on SIGHUP; it must be safe in a signal handler.
     """
     watcher = engine.watcher
 
@@ -349,7 +364,7 @@ def _watching(engine: "Engine", *, also: Callable[[], None]) -> Iterator[None]:
 
     watcher.start(engine.settings.watch_s or threading.TIMEOUT_MAX)
     before = signal.signal(signal.SIGHUP, reload)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})  # one that came meanwhile is handled now
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})  # a SIGHUP that arrived meanwhile is handled now
     try:
         yield
     finally:
@@ -360,10 +375,10 @@ def _watching(engine: "Engine", *, also: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def _listen_for_health(settings: "Settings", *, shared: bool = False) -> Iterator[socket.socket | None]:
-    """The health port's listener, where the settings want one.
+    """Provide the listener of the health port; None if the settings have no such port.
 
     Raises:
-        AddressError: the address is taken or not ours.
+        AddressError: the address is taken or does not belong to this machine.
     """
     if settings.health_port is None:
         yield None
@@ -382,9 +397,10 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _bind_shared(host: str, port: int) -> socket.socket:
-    """A socket on a port that other processes share.
+    """Bind a socket to a port that other processes share.
 
-    It does not listen yet. The system gives connections only to sockets that listen, so nobody waits for a worker that still opens maps.
+    It does not listen yet. The system gives connections only to listening sockets, so no client waits for a worker that still opens
+    maps.
     """
     bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:

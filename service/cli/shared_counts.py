@@ -1,7 +1,7 @@
-"""Room on the disk for what a worker counts, taken before it counts.
+"""Reserve disk space for the metrics of a worker before it counts.
 
-Prometheus' client library keeps the counts of several processes in memory-mapped sparse files. A store into a page for which the disk has
-no block left ends the process with SIGBUS. So a full disk would end every worker at its next new count, and again after every
+With several processes the Prometheus client library keeps the counts in memory-mapped sparse files. If the disk has no block left for a
+page, a write to it ends the process with SIGBUS. So a full disk would end every worker at its next new count, and again after every
 restart.
 """
 
@@ -9,27 +9,27 @@ import os
 import struct
 from pathlib import Path
 
-#: Of each file: three times what the counts of all methods and codes take; each map adds 2.5 KiB.
+#: Size of each file: three times the size of the counts of all methods and codes. Each map adds 2.5 KiB.
 RESERVED_BYTES = 256 * 2**10
-#: Kinds of our metrics, as the library names its files: what they count stays when a process has ended, and what is true while it lives.
+#: Kinds of metrics in the file names of the library: counts that stay after a process has ended, and values of living processes.
 _COUNTS, _LIVE = ("counter", "histogram"), ("gauge_livesum",)
-#: A file begins with the number of bytes that are used, an integer of four bytes in a field of eight.
+#: A file begins with the number of used bytes, a 4-byte integer in an 8-byte field.
 _HEADER_BYTES = 8
 
 
 def reserve(folder: Path) -> OSError | None:
-    """Write the files of this process full of zeros, which the library takes for files without a count.
+    """Fill the files of this process with zeros. For the library such files hold no counts.
 
     Args:
         folder: that all workers share.
 
     Returns:
-        Why there is no room; then no file is left. None if all are there.
+        None on success. Else the error; the files are then removed.
     """
     paths = [folder / f"{kind}_{os.getpid()}.db" for kind in (*_COUNTS, *_LIVE)]
     try:
         for path in paths:
-            with path.open("ab", buffering=0) as file:  # what an earlier process with this number has counted stays
+            with path.open("ab", buffering=0) as file:  # append: counts of an earlier process with this id stay
                 missing = RESERVED_BYTES - file.tell()
                 while missing > 0:
                     missing -= file.write(bytes(missing))
@@ -41,20 +41,20 @@ def reserve(folder: Path) -> OSError | None:
 
 
 def release(folder: Path, pid: int) -> None:
-    """Give back the room of a process that has ended; what it counted stays.
+    """Release the unused space of a process that has ended. Its counts stay.
 
     Args:
         folder: that all workers share.
-        pid: of the process.
+        pid: id of the process.
     """
-    for kind in _LIVE:  # what it had in hand it has no more
+    for kind in _LIVE:  # values of a living process end with it
         (folder / f"{kind}_{pid}.db").unlink(missing_ok=True)
     for kind in _COUNTS:
         path = folder / f"{kind}_{pid}.db"
         try:
             with path.open("rb") as file:
                 (used,) = struct.unpack("i", file.read(4))
-        except (FileNotFoundError, struct.error):  # it has ended before it wrote it
+        except (FileNotFoundError, struct.error):  # it ended before it wrote the file
             continue
         if used <= _HEADER_BYTES:
             path.unlink(missing_ok=True)

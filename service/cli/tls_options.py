@@ -1,4 +1,4 @@
-"""The options of all commands that talk to a service over TLS."""
+"""Options of all commands that connect to a service over TLS."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,8 @@ Ca = Annotated[
     Path | None,
     typer.Option(
         "--ca",
-        help="PEM of the authorities that may have signed the service's certificate [env: STREETFIX_CLIENT_CA, SSL_CERT_FILE].",
+        help="PEM file of the authorities that may sign the service's certificate.  "
+        "[env: STREETFIX_CLIENT_CA, SSL_CERT_FILE]",
         show_default=False,
     ),
 ]
@@ -17,13 +18,13 @@ Cert = Annotated[
     Path | None,
     typer.Option(
         "--cert",
-        help="PEM of this client's certificate, where the service asks for one [env: STREETFIX_CLIENT_CERT].",
+        help="PEM file of this client's certificate, if the service requires one.  [env: STREETFIX_CLIENT_CERT]",
         show_default=False,
     ),
 ]
 Key = Annotated[
     Path | None,
     typer.Option(
-        "--key", help="PEM of that certificate's private key [env: STREETFIX_CLIENT_KEY].", show_default=False
+        "--key", help="PEM file of the private key of --cert.  [env: STREETFIX_CLIENT_KEY]", show_default=False
     ),
 ]

@@ -1,6 +1,6 @@
-"""``streetfix serve --workers N``: the supervisor, which starts worker processes, restarts them and ends them.
+"""``streetfix serve --workers N``: the supervisor starts, restarts and stops worker processes.
 
-The supervisor changes its list of workers in one place only, its main loop. Signal handlers do nothing: the interpreter writes the number
+Only the main loop of the supervisor changes its list of workers. Signal handlers do nothing: the interpreter writes the number
 of each signal into a pipe, and the loop reads it. So no handler can run between ``fork`` and the entry of the new process in the
 list, or between ``waitpid`` and the removal of the ended one.
 """
@@ -20,13 +20,13 @@ import typer
 
 from service.errors import StreetfixError
 
-#: Seconds before a worker that ended by itself is started again. The wait doubles, up to the most, for one that ends again within
-#: ``STEADY_S``, so that a worker that ends at once does not keep the machine busy.
+#: Seconds before a worker that ended by itself is started again. If it ends again within ``STEADY_S``, the wait doubles, up to
+#: ``MOST_RESTART_S``. So a worker that always ends at once does not keep the machine busy.
 RESTART_S, MOST_RESTART_S, STEADY_S = 1.0, 30.0, 10.0
 _PR_SET_PDEATHSIG = 1
 _STOPPING = (signal.SIGTERM, signal.SIGINT)
 _WATCHED = (*_STOPPING, signal.SIGHUP, signal.SIGCHLD)
-#: Exit codes of a worker that ended because it was told to: by itself, or by the signal before it had a handler.
+#: Exit codes of a worker that was asked to stop: it ended by itself, or by the signal before it had a handler.
 _AS_TOLD = (0, -signal.SIGTERM, -signal.SIGINT)
 Work = Callable[[int, Callable[[], None]], None]
 
@@ -36,18 +36,18 @@ def supervise(
 ) -> int:
     """Run workers until SIGTERM or SIGINT, and pass SIGHUP on to all of them.
 
-    It must be called in the main thread, before anything that starts threads, because workers are forked.
+    Call it in the main thread, before anything starts threads, because workers are forked.
 
     Args:
         count: number of workers, at most 256.
-        work: what a worker does. It gets the worker's number and a function to call once it answers requests, and returns when the worker
-            was told to stop. SIGHUP is blocked when it is called; it must unblock SIGHUP when it has a handler for it.
+        work: runs in a worker. It gets the number of the worker and a function to call once it answers requests. It returns when
+            the worker was asked to stop. SIGHUP is blocked at the call; it must unblock SIGHUP once it has a handler.
         ended: called with the process id of every worker that has ended.
-        kill_after_s: workers that still run so many seconds after they were told to stop are killed; None waits without limit.
+        kill_after_s: seconds after the request to stop, after which running workers are killed; None waits without limit.
 
     Returns:
-        The exit code. It is 1 if a worker ended before it ever answered, if one ended with an error when it was told to stop, or if one had
-        to be killed.
+        The exit code. It is 1 if a worker ended before it ever answered, ended with an error after the request to stop, or had to be
+        killed.
     """
     with _signals_as_bytes() as signals:
         return _Supervisor(count, work, signals, ended, kill_after_s).run()
@@ -61,9 +61,9 @@ class _Supervisor:
         self._ready, self._tell_ready = os.pipe()
         os.set_blocking(self._ready, False)
         self._running: dict[int, int] = {}  # process id -> number of the worker
-        self._due = dict.fromkeys(range(count), 0.0)  # number of a worker that is to be started -> when
-        self._started: dict[int, float] = {}  # number of a worker -> when it was started last
-        self._wait_s: dict[int, float] = {}  # number of a worker -> how long it waited before it was started last
+        self._due = dict.fromkeys(range(count), 0.0)  # number of a worker to start -> when
+        self._started: dict[int, float] = {}  # number of a worker -> time of its last start
+        self._wait_s: dict[int, float] = {}  # number of a worker -> wait before its last start
         self._answered: set[int] = set()
         self._stopping = False
         self._kill_at: float | None = None
@@ -85,7 +85,7 @@ class _Supervisor:
                 if self._kill_at is not None and time.monotonic() >= self._kill_at:
                     self._kill()
             return self._code
-        except BaseException:  # a defect here must not leave workers behind
+        except BaseException:  # a defect must not leave workers behind
             self._stop(signal.SIGTERM)
             raise
         finally:
@@ -95,17 +95,17 @@ class _Supervisor:
     def _start_what_is_due(self) -> None:
         now = time.monotonic()
         for number in [each for each, at in self._due.items() if at <= now]:
-            if self._due.pop(number, None) is None:  # one before it could not be started, and the service ends
+            if self._due.pop(number, None) is None:  # an earlier worker could not be started, so the service ends
                 return
             self._started[number] = now
             try:
                 self._running[_forked(number, self._work, self._tell_ready)] = number
-            except OSError as error:  # the machine has no room for another process
+            except OSError as error:  # the system cannot create another process
                 typer.echo(f"streetfix: worker {number} cannot be started ({error.strerror})", err=True)
                 self._not_running(number)
 
     def _patience_s(self) -> float | None:
-        """Seconds until something has to be done although no signal comes; None if nothing has."""
+        """Seconds until the next start or kill is due; None if there is none."""
         moments = [*self._due.values(), *([] if self._kill_at is None else [self._kill_at])]
         return max(0.0, min(moments) - time.monotonic()) if moments else None
 
@@ -114,7 +114,7 @@ class _Supervisor:
             pid, status = os.waitpid(-1, os.WNOHANG)
             if pid == 0:
                 return
-            if pid not in self._running:  # a process that somebody else in this program started
+            if pid not in self._running:  # a child process that other code started
                 continue
             number, code = self._running.pop(pid), os.waitstatus_to_exitcode(status)
             self._answered.update(_bytes(self._ready))
@@ -128,7 +128,7 @@ class _Supervisor:
                 self._not_running(number)
 
     def _not_running(self, number: int) -> None:
-        """Start a worker again after a while if it ever answered; else end the service."""
+        """Schedule a restart of a worker if it ever answered; else end the service."""
         if number in self._answered:
             now = time.monotonic()
             was_steady = now - self._started[number] >= STEADY_S
@@ -139,7 +139,7 @@ class _Supervisor:
             self._stop(signal.SIGTERM)
 
     def _stop(self, number: int) -> None:
-        """Begin the end: no worker is started any more, and all are told to stop."""
+        """Begin to stop: start no more workers, and ask all of them to stop."""
         self._stopping = True
         self._due.clear()
         if self._kill_at is None and self._kill_after_s is not None:
@@ -147,7 +147,7 @@ class _Supervisor:
         self._pass_on(number)
 
     def _pass_on(self, number: int) -> None:
-        for pid in self._running:  # none of them was reaped, so each id is still that of the worker
+        for pid in self._running:  # none was reaped, so each id still belongs to the worker
             os.kill(pid, number)
 
     def _kill(self) -> None:
@@ -159,7 +159,7 @@ class _Supervisor:
 
 @contextmanager
 def _signals_as_bytes() -> Iterator[int]:
-    """A pipe that holds one byte, the number, for each signal that has come."""
+    """Provide a pipe with one byte, the signal number, per received signal."""
     read, write = os.pipe()
     for end in (read, write):
         os.set_blocking(end, False)
@@ -176,9 +176,9 @@ def _signals_as_bytes() -> Iterator[int]:
 
 
 def _forked(number: int, work: Work, tell_ready: int) -> int:
-    """Start a worker; its process id."""
+    """Start a worker; return its process id."""
     parent = os.getpid()
-    # A signal for the child must wait until the child has its own handlers: until then it would be written into the parent's pipe and lost.
+    # Block signals until the child has its own handlers. Before that they would go into the pipe of the parent and be lost.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _WATCHED)
     try:
         pid = os.fork()
@@ -192,7 +192,7 @@ def _forked(number: int, work: Work, tell_ready: int) -> int:
         signal.set_wakeup_fd(-1)
         for each in _WATCHED:
             signal.signal(each, signal.SIG_DFL)
-        os.setpgid(0, 0)  # Ctrl-C of a terminal reaches the parent alone, which passes it on
+        os.setpgid(0, 0)  # Ctrl-C in a terminal reaches only the parent, which passes it on
         _die_with_the_parent(parent)
         # By default SIGHUP would end a worker that has no handler yet.
         signal.pthread_sigmask(signal.SIG_SETMASK, {*before, signal.SIGHUP})
@@ -220,10 +220,10 @@ def _bytes(pipe: int) -> bytes:
 
 
 def _die_with_the_parent(parent: int) -> None:
-    """On Linux a worker whose parent was killed is told to stop; elsewhere it stays until it is told."""
+    """On Linux, stop the worker if its parent is killed. On other systems it runs until it gets a signal."""
     prctl = getattr(ctypes.CDLL(None), "prctl", None)
     if prctl is None:
         return
     prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)
-    if os.getppid() != parent:  # it was killed before it could be watched
+    if os.getppid() != parent:  # the parent was killed before prctl took effect
         os.kill(os.getpid(), signal.SIGTERM)

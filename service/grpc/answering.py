@@ -1,4 +1,4 @@
-"""How every call ends: its request id, its status, one count in the metrics and one line in the log."""
+"""End every call in the same way: request id, status, one count in the metrics and one line in the log."""
 
 import re
 import uuid
@@ -24,13 +24,13 @@ _ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 def answering(
     engine: Engine, method: str, context: grpc.ServicerContext, *, lives_long: bool = False
 ) -> Iterator[Call]:
-    """Whatever is raised inside ends the call as the contract says, and is counted.
+    """Provide the call inside the context; end it according to the contract if an error is raised, and count it.
 
     Args:
-        engine: whose metrics, traces and limits hold.
+        engine: provides metrics, traces and limits.
         method: name of the call, without its service.
         context: of the call.
-        lives_long: the call is a stream, whose duration says nothing.
+        lives_long: the call is a stream, whose duration is not measured.
     """
     metadata = {name: value for name, value in context.invocation_metadata() if isinstance(value, str)}
     given = metadata.get(REQUEST_ID, "")
@@ -46,10 +46,10 @@ def answering(
     except StreetfixError as error:
         code = error.code
         refuse(context, error)
-    except (GeneratorExit, grpc.RpcError):  # the client has gone
+    except (GeneratorExit, grpc.RpcError):  # the client has disconnected
         code = "CANCELLED"
         raise
-    except CancelledError:  # it has as well; gRPC would take this one for a defect, and log a traceback
+    except CancelledError:  # also a disconnected client; gRPC would treat this error as a defect and log a traceback
         code = "CANCELLED"
         context.abort(grpc.StatusCode.CANCELLED, "the caller has gone")
     except Exception as error:

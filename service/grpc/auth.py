@@ -1,4 +1,4 @@
-"""Asks for an API key before a call is handled."""
+"""Check the API key before a call is handled."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -13,12 +13,17 @@ from service.runtime.keys import KeyRing, presented_key
 _HEALTH = "/" + health_pb2.DESCRIPTOR.services_by_name["Health"].full_name + "/Check"
 if TYPE_CHECKING:
     _Interceptor = grpc.ServerInterceptor[Any, Any]
-else:  # generic in its stub alone
+else:  # only the type stub is generic
     _Interceptor = grpc.ServerInterceptor
 
 
 class AuthInterceptor(_Interceptor):
-    """Every call but those of health needs a key in its metadata: ``authorization: Bearer KEY`` or ``x-api-key``."""
+    """Requires a key in the metadata of every call except ``Health/Check``: ``authorization: Bearer KEY`` or ``x-api-key``.
+
+    Args:
+        keys: of the callers.
+        requested: called with request handler, method, code and seconds of a refused call.
+    """
 
     def __init__(self, keys: KeyRing, requested: Callable[[str, str, str, float | None], None]) -> None:
         self._keys = keys
@@ -27,7 +32,12 @@ class AuthInterceptor(_Interceptor):
     def intercept_service(
         self, continuation: Callable[[grpc.HandlerCallDetails], Any], details: grpc.HandlerCallDetails
     ) -> Any:
-        """The handler of a call, or one that refuses it."""
+        """Return the handler of a call, or a handler that refuses it.
+
+        Args:
+            continuation: returns the handler of a call.
+            details: method and metadata of the call.
+        """
         handler = continuation(details)
         if handler is None or details.method == _HEALTH:
             return handler
@@ -41,7 +51,11 @@ class AuthInterceptor(_Interceptor):
 
 
 def _refusing(error: UnauthorizedError) -> Any:
-    """Of the one form that waits for no message, and parses none, before it is called; on the wire all forms begin alike."""
+    """Return a handler that refuses a call.
+
+    It has the stream-unary form, because only this form is called before gRPC reads and parses a message. On the wire all forms begin
+    in the same way.
+    """
 
     def one(_: Any, context: grpc.ServicerContext) -> Any:
         refuse(context, error)

@@ -1,4 +1,4 @@
-"""One call: its work on the engine's workers, its deadline, and what becomes of the work when the caller goes away."""
+"""One gRPC call: its work on the engine's workers, its deadline, and its cancellation."""
 
 import threading
 from collections.abc import Callable
@@ -17,14 +17,17 @@ T = TypeVar("T")
 
 
 class Call:
-    """Work of one call; dropped, where it still waits, if the caller goes away.
+    """Work of one call. If the client disconnects, waiting work is cancelled.
 
     Args:
         admission: of the engine.
         context: of the call.
         span: of its trace.
-        timeout_s: that the service allows; the caller's deadline may be shorter.
-        hold: memory of the call's message, kept until the work is over; None where somebody else keeps it.
+        timeout_s: limit of the service; the deadline of the client may be shorter.
+        hold: memory of the message, kept until the work is over; None if it is held elsewhere.
+
+    Attributes:
+        span: as given.
     """
 
     def __init__(
@@ -36,27 +39,34 @@ class Call:
         self._timeout_s = timeout_s
         self._hold = hold
         self._lock = threading.Lock()
-        self._under_way: set[Future[object]] = set()  # no more than these: a stream's call has frames for hours
+        self._under_way: set[Future[object]] = set()  # only unfinished work: a stream may have frames for hours
         self._gone = not context.add_callback(self._drop)
         self.begin_again()
 
     def begin_again(self) -> None:
-        """Give what follows the whole time that a request may take: the next frame of a stream."""
+        """Restart the time limit, for the next frame of a stream."""
         left = self._context.time_remaining()
         self._allowed_s = self._timeout_s if left is None else min(left, self._timeout_s)
         self._until = monotonic() + self._allowed_s
 
     def run(self, work: Callable[[], T]) -> T:
-        """Do work on a worker and wait for it.
+        """Run work on a worker and wait for the result.
+
+        Args:
+            work: to run.
 
         Raises:
             BusyError: the queue is full.
-            DeadlineError: it took longer than the call may.
+            DeadlineError: the work took longer than the call may.
+            CancelledError: the client has disconnected.
         """
         return self.result(self.submit(work))
 
     def submit(self, work: Callable[[], T]) -> Future[T]:
-        """Queue work.
+        """Submit work to the queue.
+
+        Args:
+            work: to run.
 
         Raises:
             BusyError: the queue is full.
@@ -73,11 +83,14 @@ class Call:
         return future
 
     def result(self, future: Future[T]) -> T:
-        """Wait for work.
+        """Wait for the result of submitted work.
+
+        Args:
+            future: returned by ``submit``.
 
         Raises:
-            DeadlineError: it took longer than the call may.
-            CancelledError: the caller has gone.
+            DeadlineError: the work took longer than the call may.
+            CancelledError: the client has disconnected.
         """
         try:
             return future.result(timeout=max(0.0, self._until - monotonic()))

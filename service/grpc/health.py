@@ -1,4 +1,7 @@
-"""``grpc.health.v1``, without what its ready-made servicer keeps: locks held while a peer reads, and every name it was ever asked."""
+"""The service ``grpc.health.v1``.
+
+The ready-made servicer is not used. It holds locks while a peer reads, and it keeps every service name that was ever queried.
+"""
 
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
@@ -7,10 +10,14 @@ from service.runtime.engine import Engine
 
 
 class Health(health_pb2_grpc.HealthServicer):  # type: ignore[misc]  # untyped
-    """Says what ``/readyz`` says, for the server as a whole and for our service.
+    """Reports the same as ``/readyz``, for the whole server and for LocalizationService.
 
-    ``Watch`` is not served: each watcher would hold a thread, without a key and for as long as it likes. Clients that would watch take
-    UNIMPLEMENTED for "no news", as the protocol has it.
+    ``Watch`` is not served: each watcher needs no key and would hold a thread without a time limit. The protocol lets clients handle
+    UNIMPLEMENTED as "no news".
+
+    Args:
+        engine: its readiness is reported.
+        services: known names; the empty name stands for the whole server.
     """
 
     def __init__(self, engine: Engine, services: tuple[str, ...]) -> None:
@@ -20,7 +27,12 @@ class Health(health_pb2_grpc.HealthServicer):  # type: ignore[misc]  # untyped
     def Check(
         self, request: health_pb2.HealthCheckRequest, context: grpc.ServicerContext
     ) -> health_pb2.HealthCheckResponse:
-        """One look."""
+        """Return whether a service is ready; NOT_FOUND for an unknown service.
+
+        Args:
+            request: names the service.
+            context: of the call.
+        """
         if request.service not in self._services:
             context.abort(grpc.StatusCode.NOT_FOUND, "there is no such service here")
         kinds = health_pb2.HealthCheckResponse

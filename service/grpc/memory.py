@@ -1,7 +1,8 @@
-"""Memory for gRPC messages: gRPC reads a whole message before our code sees how long it is.
+"""Memory for gRPC messages. gRPC reads a whole message before this code can see its length.
 
-A message is read only when somebody asks for it (until then flow control keeps it at the client, but for 64 KiB). So no more calls
-ask at once than there is memory for messages of the largest size. When a message is here its own size is reserved, or it is refused.
+gRPC reads a message only on request. Until then flow control keeps it at the client, except for 64 KiB. So the number of calls that
+read at once is limited by the memory for messages of the largest size. After the reading the actual size is reserved, or the message is
+refused.
 """
 
 import threading
@@ -12,25 +13,28 @@ from contextvars import ContextVar
 from service.errors import BusyError
 from service.runtime.memory import GRPC_OTHERS, GRPC_PARSED, Hold, MemoryBudget
 
-#: Share of the budget for open streams, each of which may send a message of the largest size at any time.
+#: Share of the budget for open streams. Each may send a message of the largest size at any time.
 STREAMS_SHARE = 0.5
-#: Calls and streams of other services (health, reflection) that are read at once, outside of the budget: they are answered when it is
-#: spent.
+#: Calls and streams of other services (health, reflection) that are read at once. They are outside the budget, so that the service
+#: answers them even if the budget is spent.
 OTHER_CALLS, OTHER_STREAMS = 1, GRPC_OTHERS - 1
-#: A call waits so long for its turn, one of another service so long: others may send their messages over a slow link.
+#: Seconds that a call waits for its turn, and that a call of another service waits. Other calls may send over a slow link.
 TURN_S, OTHERS_TURN_S = 5.0, 0.1
 
-#: What the call of this thread holds.
+#: The memory that the call of this thread holds.
 held_by_call: ContextVar[Hold | None] = ContextVar("held_by_call", default=None)
 
 
 class MessageMemory:
-    """Turns to read messages, within a budget.
+    """Limits the number of calls that read and parse messages at once, within a budget.
 
     Args:
         budget: of all requests.
-        most_bytes: of a message.
-        most_streams: that may be open, if there is memory for them.
+        most_bytes: largest size of a message.
+        most_streams: maximum number of open streams; the memory may allow fewer.
+
+    Attributes:
+        streams: maximum number of open streams.
     """
 
     def __init__(self, budget: MemoryBudget, *, most_bytes: int, most_streams: int) -> None:
@@ -44,35 +48,39 @@ class MessageMemory:
         self._streams = threading.Semaphore(self.streams)
 
     def hold(self) -> Hold:
-        """A reservation of nothing."""
+        """Create an empty reservation."""
         return self._budget.hold()
 
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Read one message inside.
+        """Wait for the turn to read one message inside the context.
 
         Raises:
-            BusyError: more calls read than there is memory for.
+            BusyError: more calls read than the memory allows.
         """
         with _taken(self._reading, "more calls send messages than there is memory for; try again in a second"):
             yield
 
     @contextmanager
     def parsing(self, count: int) -> Iterator[None]:
-        """Parse a message of so many bytes inside, while its bytes are there, too."""
+        """Wait for the turn to parse a message inside the context; its bytes then exist beside the message.
+
+        Args:
+            count: size of the message in bytes.
+        """
         with self._parsing:
             yield
-        self._budget.freed(count)  # the pieces that it came in, and its bytes
+        self._budget.freed(count)  # the received pieces and the joined bytes
 
     @contextmanager
     def turn_of_others(self, *, streams: bool) -> Iterator[None]:
-        """Read one message of another service than ours inside.
+        """Wait for the turn to read one message of another service inside the context.
 
         Args:
-            streams: of a stream, whose messages must not keep those of health back.
+            streams: the message belongs to a stream. Streams have their own turn, so that they do not delay health.
 
         Raises:
-            BusyError: others read.
+            BusyError: another call reads.
         """
         places = self._other_streams if streams else self._other_calls
         with _taken(places, "more calls send messages than may; try again in a second", wait_s=OTHERS_TURN_S):
@@ -80,10 +88,10 @@ class MessageMemory:
 
     @contextmanager
     def stream(self) -> Iterator[None]:
-        """Keep a stream open inside; the largest size is reserved as long as it lives.
+        """Keep a stream open inside the context, with memory for a message of the largest size.
 
         Raises:
-            BusyError: as many are open as may be, or the memory for requests is taken.
+            BusyError: the maximum number of streams is open, or the memory for requests is taken.
         """
         busy = f"all {self.streams} streams are taken; close one, or send sequences instead"
         with _taken(self._streams, busy, wait_s=0.0), self.hold() as hold:

@@ -1,4 +1,7 @@
-"""Between protobuf messages and the contract's models, in which limits and meanings are checked once for every face."""
+"""Convert between protobuf messages and the models of the contract.
+
+The models check limits and meanings once for REST and gRPC.
+"""
 
 from typing import Any
 
@@ -20,7 +23,7 @@ _ENCODINGS = {
     pb.DEPTH_ENCODING_COMPRESSED_DEPTH: "compressed_depth",
 }
 _MODELS = {pb.CAMERA_MODEL_UNSPECIFIED: "PINHOLE", pb.CAMERA_MODEL_PINHOLE: "PINHOLE"}
-#: One more than the contract takes, so that more are refused, and a message of millions does not become a list of as many.
+#: One more than the contract allows. So too many coefficients are refused, and a message with millions does not become a large list.
 _MOST_COEFFICIENTS = 15
 _STATUS = {
     "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED, "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
@@ -32,20 +35,26 @@ _SECTIONS = {
 
 
 def request_from(message: pb.LocalizeRequest) -> schema.LocalizeRequest:
-    """One pair's request, without its pictures.
+    """Convert the request of one image pair, without the images.
+
+    Args:
+        message: as received.
 
     Raises:
-        RequestError: a field makes no sense.
+        RequestError: a field is invalid.
     """
     content = _of_pair(message) | _of_all(message)
     return checked(content, schema.LocalizeRequest)
 
 
 def sequence_request_from(message: pb.LocalizeSequenceRequest) -> schema.SequenceRequest:
-    """A sequence's request, without its pictures.
+    """Convert the request of a sequence, without the images.
+
+    Args:
+        message: as received.
 
     Raises:
-        RequestError: a field makes no sense.
+        RequestError: a field is invalid.
     """
     frames = [
         _of_pair(frame) | _sub(frame, "reference_from_camera", "T_reference_camera", transform_content)
@@ -55,16 +64,19 @@ def sequence_request_from(message: pb.LocalizeSequenceRequest) -> schema.Sequenc
 
 
 def transform_from(message: pb.RigidTransform) -> schema.RigidTransform:
-    """A transform on its own.
+    """Convert a single transform.
+
+    Args:
+        message: as received.
 
     Raises:
-        RequestError: a number makes no sense.
+        RequestError: a number is invalid.
     """
     return checked(transform_content(message), schema.RigidTransform)
 
 
 def _of_all(message: pb.LocalizeRequest | pb.LocalizeSequenceRequest) -> dict[str, Any]:
-    """What a single pair and a sequence both say."""
+    """Fields that a single pair and a sequence share."""
     return (
         _given(message, "map") | _sub(message, "vehicle_from_camera", "T_vehicle_camera", transform_content)
         | _sub(message, "prior", "prior", _prior)
@@ -73,7 +85,7 @@ def _of_all(message: pb.LocalizeRequest | pb.LocalizeSequenceRequest) -> dict[st
 
 
 def _of_pair(message: pb.LocalizeRequest | pb.SequenceFrame) -> dict[str, Any]:
-    """What goes with one pair of pictures."""
+    """Fields of one image pair."""
     return (
         _sub(message, "camera", "camera", _camera) | _sub(message, "depth_format", "depth", _depth)
         | _sub(message, "gravity", "gravity", _vector)
@@ -108,7 +120,13 @@ def _prior(message: pb.Prior) -> dict[str, Any]:
 
 
 def transform_content(message: pb.RigidTransform) -> dict[str, Any]:
-    """As the contract's model takes it; a quaternion that was left out is no rotation, and refused later."""
+    """Return a transform as a dictionary for the contract model.
+
+    A missing quaternion becomes all zeros. The model refuses it later, because it is no rotation.
+
+    Args:
+        message: as received.
+    """
     q = message.orientation
     return {"position": _vector(message.position), "orientation": {"x": q.x, "y": q.y, "z": q.z, "w": q.w}}
 
@@ -118,17 +136,21 @@ def _vector(message: pb.Vector3) -> dict[str, float]:
 
 
 def _given(message: Message, *names: str) -> dict[str, Any]:
-    """Optional fields that were sent."""
+    """Return the optional fields that were sent."""
     return {name: getattr(message, name) for name in names if message.HasField(name)}
 
 
 def _sub(message: Message, field: str, name: str, content: Any) -> dict[str, Any]:
-    """A message inside another, if it was sent."""
+    """Convert a nested message if it was sent."""
     return {name: content(getattr(message, field))} if message.HasField(field) else {}
 
 
 def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
-    """The contract's answer as a message."""
+    """Convert an answer of the contract to a message.
+
+    Args:
+        answer: to send.
+    """
     times = answer.timings_ms
     message = pb.LocalizeResponse(
         status=_STATUS[answer.status],
@@ -162,7 +184,11 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
 
 
 def map_message(entry: schema.MapEntry) -> pb.MapEntry:
-    """A mounted map as a message."""
+    """Convert the entry of a mounted map to a message.
+
+    Args:
+        entry: of the map.
+    """
     return pb.MapEntry(**entry.model_dump())
 
 

@@ -1,4 +1,4 @@
-"""From a message's bytes to the message; bytes that do not parse are an error of ours that names the field at fault."""
+"""Parse the bytes of a message. If they do not parse, the error names the invalid field."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -9,25 +9,26 @@ from google.protobuf.message_factory import GetMessageClass
 
 from service.errors import RequestError
 
-#: Fields of a message at its top, repeated ones counted each: more make no sense, and each may cost a hundred times its bytes.
+#: Maximum number of top-level fields of a message; each element of a repeated field counts. No valid message has more, and a field may
+#: take a hundred times its bytes in memory.
 MOST_FIELDS = 64
 
-#: Of a message that does not parse, so many fields are searched for the one at fault: the search takes a microsecond for each.
+#: Maximum number of fields that are searched for the invalid one. The search takes a microsecond per field.
 _MOST_WALKED = 256
-#: Wire types of the encoding (protobuf.dev/programming-guides/encoding). Groups (3 and 4) are obsolete; we refuse them at the top.
+#: Wire types of the encoding (protobuf.dev/programming-guides/encoding). Groups (3 and 4) are obsolete and refused at the top level.
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 
 def parsed(raw: bytes, descriptor: Descriptor) -> Message:
-    """A message from its bytes.
+    """Parse a message from its bytes.
 
     Args:
-        raw: as they came.
+        raw: as received.
         descriptor: of the message.
 
     Raises:
-        RequestError: there are more fields than a message of ours has, or the bytes do not parse; its field is the path, in the
-            proto's names, of the innermost field that does not parse, and empty where that is the message itself.
+        RequestError: there are more than ``MOST_FIELDS`` fields, or the bytes do not parse. Its ``field`` is the path of the innermost
+            field that does not parse, in the names of the proto; empty if no single field is invalid.
     """
     require_few_fields(raw)
     try:
@@ -42,10 +43,14 @@ def parsed(raw: bytes, descriptor: Descriptor) -> Message:
 
 
 def require_few_fields(raw: bytes, *, most: int = MOST_FIELDS) -> None:
-    """Walk over the fields of a message without looking into them.
+    """Count the top-level fields of a message without parsing them, and require few.
+
+    Args:
+        raw: bytes of the message.
+        most: maximum number of fields.
 
     Raises:
-        RequestError: there are more than a message of ours has, or the bytes are no message.
+        RequestError: there are more fields, or the bytes are no message.
     """
     for count, _ in enumerate(_fields(raw), 1):
         if count > most:
@@ -60,7 +65,7 @@ def _parse(raw: bytes, descriptor: Descriptor) -> Message:
 
 
 def _field_at_fault(raw: bytes, descriptor: Descriptor) -> str:
-    """Path of the innermost field that does not parse; empty where no field of this message is at fault alone."""
+    """Path of the innermost field that does not parse; empty if no single field is invalid."""
     seen: dict[int, int] = {}
     try:
         for number, wire, begin, end in islice(_fields(raw), _MOST_WALKED):
@@ -71,18 +76,18 @@ def _field_at_fault(raw: bytes, descriptor: Descriptor) -> str:
             if _parses(content, field, descriptor):
                 seen[number] = seen.get(number, 0) + 1
                 continue
-            # A packed list of numbers is one field of the message, whatever its length.
+            # A packed list of numbers is one field, whatever its length, so its path has no index.
             counted = field.is_repeated and field.type in (FieldDescriptor.TYPE_MESSAGE, FieldDescriptor.TYPE_STRING)
             name = f"{field.name}.{seen.get(number, 0)}" if counted else str(field.name)
             inner = _field_at_fault(content, field.message_type) if field.message_type is not None else ""
             return f"{name}.{inner}" if inner else name
-    except RequestError:  # the message itself is cut off, or no message
+    except RequestError:  # the bytes are cut off, or no message at all
         pass
     return ""
 
 
 def _parses(content: bytes, field: FieldDescriptor, descriptor: Descriptor) -> bool:
-    """Whether a length-delimited field's content is what its type says, by the library's own parser."""
+    """Whether the content of a length-delimited field parses as its type, according to the protobuf library."""
     alone = _varint_of(field.number << 3 | _BYTES) + _varint_of(len(content)) + content
     try:
         _parse(alone, descriptor)
@@ -92,7 +97,9 @@ def _parses(content: bytes, field: FieldDescriptor, descriptor: Descriptor) -> b
 
 
 def _fields(raw: bytes) -> Iterator[tuple[int, int, int, int]]:
-    """Number and wire type of each field, and where its content begins and ends; of other than length-delimited ones nothing.
+    """Yield number, wire type, begin and end of each top-level field.
+
+    Begin and end delimit the content of a length-delimited field. They have no use for other wire types.
 
     Raises:
         RequestError: the bytes are no message.

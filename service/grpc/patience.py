@@ -1,4 +1,4 @@
-"""Ends calls whose client does not go on: one thread for all of them, in place of a timer for each."""
+"""End calls whose client stays silent. One thread watches all of them, instead of one timer per call."""
 
 import threading
 import time
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 class Patience:
-    """Calls functions when waits have lasted too long; to the nearest quarter of a second."""
+    """Watchdog that calls a function when a wait takes too long. It checks every 0.25 s."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -17,7 +17,7 @@ class Patience:
         self._thread = threading.Thread(target=self._run, name="streetfix-patience", daemon=True)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -26,7 +26,12 @@ class Patience:
 
     @contextmanager
     def at_most(self, seconds: float, give_up: Callable[[], object]) -> Iterator[None]:
-        """What is inside may take so long."""
+        """Limit the duration of the context.
+
+        Args:
+            seconds: the limit.
+            give_up: called once, in the thread of the watchdog, if the limit is exceeded.
+        """
         with self._lock:
             number, self._next = self._next, self._next + 1
             self._until[number] = (time.monotonic() + seconds, give_up)

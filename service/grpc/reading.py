@@ -1,7 +1,7 @@
-"""Reads a call's messages in the call's own thread, in its turn, with patience, and looks at their size before they are parsed.
+"""Read the messages of a call in its own thread, in turn, with a time limit, and check their size before parsing.
 
-Left to gRPC, bytes that do not parse end a call with its own words, a traceback in the log, and no count in the metrics. gRPC would
-also read the messages of all calls at once, whatever memory that takes.
+If gRPC parsed the messages, invalid bytes would end a call with the text of gRPC, a traceback in the log and no count in the metrics.
+gRPC would also read the messages of all calls at once, without a memory limit.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,25 +23,25 @@ from service.grpc.patience import Patience
 
 if TYPE_CHECKING:
     _Interceptor = grpc.ServerInterceptor[Any, Any]
-else:  # generic in its stub alone
+else:  # only the type stub is generic
     _Interceptor = grpc.ServerInterceptor
 
 SERVICE: str = pb.DESCRIPTOR.services_by_name["LocalizationService"].full_name
-#: Seconds in which a message of another service (health, reflection) must be there: it is small.
+#: Time limit in seconds for a message of another service (health, reflection). Such a message is small.
 OTHERS_S = 1.0
-#: Ends a call of that name as the contract says; ``service.grpc.answering.answering`` of an engine.
+#: Ends a call of the given name according to the contract: ``service.grpc.answering.answering`` bound to an engine.
 Answering = Callable[[str, grpc.ServicerContext], AbstractContextManager[Call]]
 Messages = Iterator[bytes]
 
 
 class ReadingInterceptor(_Interceptor):
-    """Takes raw bytes where gRPC would parse, ends calls that never send them, and refuses what does not parse.
+    """Reads raw bytes instead of letting gRPC parse. It ends calls that send nothing, and refuses bytes that do not parse.
 
     Args:
-        patience: ends calls.
-        memory: gives calls their turns to read.
-        timeout_s: that a call of ours may take to send its only message.
-        answering: how refused calls end.
+        patience: ends calls that take too long.
+        memory: limits the number of calls that read at once.
+        timeout_s: time limit for the only message of a call of LocalizationService.
+        answering: ends refused calls.
     """
 
     def __init__(self, patience: Patience, memory: MessageMemory, *, timeout_s: float, answering: Answering) -> None:
@@ -53,7 +53,12 @@ class ReadingInterceptor(_Interceptor):
     def intercept_service(
         self, continuation: Callable[[grpc.HandlerCallDetails], Any], details: grpc.HandlerCallDetails
     ) -> Any:
-        """The handler of a call, in another form: of ours, of health and of reflection."""
+        """Return a handler that reads raw bytes, for LocalizationService, health and reflection.
+
+        Args:
+            continuation: returns the original handler of a call.
+            details: method and metadata of the call.
+        """
         handler = continuation(details)
         if handler is None:
             return None
@@ -102,13 +107,13 @@ class ReadingInterceptor(_Interceptor):
     def _our_stream(
         self, handler: Any, message: Descriptor, method: str
     ) -> Callable[[Messages, grpc.ServicerContext], Any]:
-        del method  # our servicer ends its streams itself
+        del method  # the servicer ends its streams itself
 
         def one_by_one(messages: Messages) -> Iterator[Message]:
             while (raw := next(messages, None)) is not None:
                 with self._memory.parsing(len(raw)):
                     request = parsed(raw, message)
-                    del raw  # the stream has reserved memory for one of both
+                    del raw  # the stream has reserved memory for only one of the two
                 yield request
                 del request
 
@@ -153,10 +158,10 @@ class ReadingInterceptor(_Interceptor):
         return answers
 
     def _small(self, messages: Messages, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
-        """The only message of a call of another service.
+        """Read the only message of a call of another service.
 
-        Nobody needs a key for health. If a caller holds the turn and sends nothing, others are answered as if their messages were
-        empty: health of the whole service.
+        Health needs no key, so any client could hold the turn and send nothing. The others are then answered as if their messages
+        were empty: with the health of the whole service.
         """
         try:
             with self._memory.turn_of_others(streams=False):
@@ -166,19 +171,19 @@ class ReadingInterceptor(_Interceptor):
         return self._parsed(raw, message, method, context)
 
     def _next(self, messages: Messages, method: str, context: grpc.ServicerContext, timeout_s: float) -> bytes:
-        """The only message of a call; the call ends where none comes."""
+        """Read the only message of a call. If none arrives, the call ends."""
         try:
             with self._patience.at_most(timeout_s, context.cancel):
                 raw = next(messages, None)
         except grpc.RpcError as error:
             self._end(error, method, context)
-        # gRPC says no more of a call that was cancelled meanwhile, or whose message was beyond the limit
+        # gRPC gives no reason if the call was cancelled meanwhile or if its message exceeded the limit.
         if raw is None:
             self._end(RequestError("the call ended before its message had come; send exactly one"), method, context)
         return raw
 
     def _parsed(self, raw: bytes, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
-        """A message of a call; the call ends where the bytes are none."""
+        """Parse a message of a call. If the bytes are invalid, the call ends."""
         try:
             return parsed(raw, message)
         except RequestError as error:

@@ -1,4 +1,4 @@
-"""The gRPC face: an engine in, a listening server out."""
+"""The gRPC request handler: builds a listening server for an engine."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -21,23 +21,26 @@ from service.runtime.engine import Engine
 from service.runtime.keys import KeyRing
 
 HEALTH: str = health_pb2.DESCRIPTOR.services_by_name["Health"].full_name
-#: Calls that are refused, or ask nothing of the workers, while every place of the queue is taken.
+#: Spare threads for calls that are refused or need no worker, while the queue is full.
 _SPARE = 16
 _LOOKAHEAD_BYTES = 65_536
 
 
 class GrpcServer:
-    """Serves an engine that somebody else opens and closes.
+    """gRPC server of an engine. The caller opens and closes the engine.
 
     Args:
         engine: open.
         host: to listen on.
         port: 0 lets the system choose.
-        keys: who may ask; None lets everybody.
-        credentials: TLS; None speaks without.
+        keys: of the allowed callers; None allows everybody.
+        credentials: for TLS; None serves without TLS.
+
+    Attributes:
+        port: on which the server listens.
 
     Raises:
-        AddressError: the address is taken or not ours.
+        AddressError: the address is taken or does not belong to this machine.
     """
 
     def __init__(
@@ -57,18 +60,19 @@ class GrpcServer:
         reading = ReadingInterceptor(
             self._patience, memory, timeout_s=settings.request_timeout_s, answering=partial(answering, engine)
         )
-        # A thread waits for each call; the work itself is the engine's workers'. A stream holds its thread while it lives.
+        # Each call needs a waiting thread; the workers of the engine do the work. A stream holds its thread until it ends.
         most = engine.admission.capacity + settings.grpc_streams + _SPARE
         self._server = grpc.server(
             ThreadPoolExecutor(most, thread_name_prefix="streetfix-grpc"),
             options=[
                 ("grpc.max_receive_message_length", settings.limits.message_bytes),
                 ("grpc.max_send_message_length", -1),
-                # What a client may send ahead of our asking for its message: gRPC would widen it to megabytes by itself.
+                # Data that a client may send before the service reads its message. By default gRPC raises it to megabytes.
                 ("grpc.http2.bdp_probe", 0),
                 ("grpc.http2.lookahead_bytes", _LOOKAHEAD_BYTES),
-                ("grpc.so_reuseport", int(settings.workers > 1)),  # else a taken port would go unnoticed
-                ("grpc.keepalive_time_ms", 30_000),  # a robot that lost its link must not keep its stream
+                # Only with several workers: otherwise a taken port would go unnoticed.
+                ("grpc.so_reuseport", int(settings.workers > 1)),
+                ("grpc.keepalive_time_ms", 30_000),  # ends the stream of a robot that has lost its link
                 ("grpc.keepalive_timeout_ms", 10_000),
             ],
             maximum_concurrent_rpcs=most,
@@ -90,16 +94,24 @@ class GrpcServer:
             raise AddressError(f"cannot listen on {address} for gRPC; choose another --grpc-port") from error
 
     def start(self) -> None:
-        """Begin to answer."""
+        """Start to answer calls."""
         self._patience.start()
         self._server.start()
 
     def begin_stop(self, *, grace_s: float) -> Event:
-        """Take no further calls, let running ones end, and give up on them after the grace; the event is set when all is over."""
+        """Refuse new calls and let running ones end; return an event that is set when all have ended.
+
+        Args:
+            grace_s: seconds after which running calls are cancelled.
+        """
         ended: Event = self._server.stop(grace_s)
         return ended
 
     def stop(self, *, grace_s: float) -> None:
-        """Stop and wait for the end."""
+        """Stop the server and wait until all calls have ended.
+
+        Args:
+            grace_s: seconds after which running calls are cancelled.
+        """
         self.begin_stop(grace_s=grace_s).wait()
         self._patience.stop()

@@ -1,4 +1,4 @@
-"""The calls of LocalizationService, on the same engine and the same admission as REST."""
+"""The calls of LocalizationService. They use the same engine and the same admission as REST."""
 
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -25,7 +25,13 @@ from service.runtime.tracing import RequestSpan
 
 
 class Servicer(LocalizationServiceServicer):
-    """Answers calls; each runs in a thread of the gRPC server, which waits while a worker of the engine does the work."""
+    """Answers calls. Each call runs in a thread of the gRPC server, which waits while a worker of the engine does the work.
+
+    Args:
+        engine: does the work.
+        patience: ends streams that send no frame.
+        memory: for the messages of streams.
+    """
 
     def __init__(self, engine: Engine, patience: Patience, memory: MessageMemory) -> None:
         self._engine = engine
@@ -33,14 +39,27 @@ class Servicer(LocalizationServiceServicer):
         self._memory = memory
 
     def Localize(self, request: pb.LocalizeRequest, context: grpc.ServicerContext) -> pb.LocalizeResponse:
-        """One pair."""
+        """Localize one image pair.
+
+        Args:
+            request: the pair.
+            context: of the call.
+        """
         with self._answering("Localize", context) as call:
             return call.run(lambda: self._localize(request, call.span))
 
     def LocalizeBatch(
         self, request: pb.LocalizeBatchRequest, context: grpc.ServicerContext
     ) -> pb.LocalizeBatchResponse:
-        """Several pairs, each as if it had come alone."""
+        """Localize several image pairs, each as if it were sent alone.
+
+        Args:
+            request: the pairs.
+            context: of the call.
+
+        Raises:
+            RequestError: there is no pair, or there are too many. Inside the call it becomes the status.
+        """
         with self._answering("LocalizeBatch", context) as call:
             if not 1 <= len(request.requests) <= MOST_FRAMES:
                 raise RequestError(
@@ -54,7 +73,12 @@ class Servicer(LocalizationServiceServicer):
     def LocalizeSequence(
         self, request: pb.LocalizeSequenceRequest, context: grpc.ServicerContext
     ) -> pb.LocalizeSequenceResponse:
-        """Frames as one."""
+        """Localize several frames as one.
+
+        Args:
+            request: the frames.
+            context: of the call.
+        """
         with self._answering("LocalizeSequence", context) as call:
 
             def work() -> Located:
@@ -68,17 +92,27 @@ class Servicer(LocalizationServiceServicer):
     def LocalizeStream(
         self, request_iterator: Iterator[pb.LocalizeStreamRequest], context: grpc.ServicerContext
     ) -> Iterator[pb.LocalizeStreamResponse]:
-        """A robot that drives."""
-        # A stream holds a thread, and memory for its next frame, as long as it lives.
+        """Localize the frames of a moving robot, one answer per frame.
+
+        Args:
+            request_iterator: the frames.
+            context: of the call.
+        """
+        # A stream holds a thread and memory for its next frame until it ends.
         with self._answering("LocalizeStream", context, lives_long=True) as call, self._memory.stream():
             stream, number = Stream(self._engine), 0
             while (request := self._next_frame(number, request_iterator, context)) is not None:
                 yield self._next_of(stream, number, request, call)
                 number += 1
-                del request  # before the next one is read: memory is reserved for one
+                del request  # before the next one is read, because memory is reserved for one
 
     def ListMaps(self, request: pb.ListMapsRequest, context: grpc.ServicerContext) -> pb.ListMapsResponse:
-        """All mounted maps."""
+        """List all mounted maps.
+
+        Args:
+            request: empty.
+            context: of the call.
+        """
         del request
         with self._answering("ListMaps", context):
             registry = self._engine.registry
@@ -88,12 +122,22 @@ class Servicer(LocalizationServiceServicer):
             return pb.ListMapsResponse(maps=[map_message(entry) for entry in entries])
 
     def GetStreets(self, request: pb.GetStreetsRequest, context: grpc.ServicerContext) -> pb.GetStreetsResponse:
-        """GeoJSON."""
+        """Return the streets of a map as GeoJSON.
+
+        Args:
+            request: names the map.
+            context: of the call.
+        """
         with self._answering("GetStreets", context):
             return pb.GetStreetsResponse(geojson=self._engine.registry.get(request.map).bundle.streets_geojson())
 
     def GetCoverage(self, request: pb.GetCoverageRequest, context: grpc.ServicerContext) -> pb.GetCoverageResponse:
-        """GeoJSON."""
+        """Return the coverage of one map or of all maps as GeoJSON.
+
+        Args:
+            request: names the map, or none for all.
+            context: of the call.
+        """
         with self._answering("GetCoverage", context):
             registry = self._engine.registry
             asked = [registry.get(request.map)] if request.HasField("map") else list(registry)
@@ -106,7 +150,7 @@ class Servicer(LocalizationServiceServicer):
         return answer_message(answer_from(located))
 
     def _begin(self, call: Call, request: pb.LocalizeRequest) -> Future[pb.LocalizeResponse]:
-        """One request of a batch; refused ones come back as failed."""
+        """Submit one request of a batch. A refused request returns a failed future."""
         try:
             return call.submit(lambda: self._localize(request, call.span))
         except BusyError as error:
@@ -117,7 +161,7 @@ class Servicer(LocalizationServiceServicer):
     def _next_frame(
         self, number: int, requests: Iterator[pb.LocalizeStreamRequest], context: grpc.ServicerContext
     ) -> pb.LocalizeStreamRequest | None:
-        """The next message; None at the end.
+        """Read the next message; None at the end of the stream.
 
         Raises:
             RequestError: its bytes do not parse.
@@ -129,7 +173,7 @@ class Servicer(LocalizationServiceServicer):
             except RequestError as error:
                 error.field = error.field.removeprefix(
                     "frame."
-                )  # as errors of a frame that does parse name their fields
+                )  # errors of a frame that parses name their fields without it
                 raise
 
     def _next_of(

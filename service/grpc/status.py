@@ -1,4 +1,4 @@
-"""Errors as google.rpc.Status: one table over the kinds of the exception tree, with details that a client can act on."""
+"""Errors as google.rpc.Status. One table maps the kinds of the exceptions to codes; the details help a client to react."""
 
 import logging
 from datetime import timedelta
@@ -17,7 +17,7 @@ from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 CODE_OF_KIND: dict[Kind, int] = {
     "invalid": code_pb2.INVALID_ARGUMENT,
     "unsupported": code_pb2.INVALID_ARGUMENT,
-    "too_large": code_pb2.OUT_OF_RANGE,  # RESOURCE_EXHAUSTED would make clients try the same picture again
+    "too_large": code_pb2.OUT_OF_RANGE,  # RESOURCE_EXHAUSTED would make clients retry the same image
     "not_found": code_pb2.NOT_FOUND,
     "unauthorized": code_pb2.UNAUTHENTICATED,
     "forbidden": code_pb2.PERMISSION_DENIED,
@@ -32,7 +32,11 @@ _log = logging.getLogger("streetfix.grpc")
 
 
 def status_of(error: StreetfixError) -> status_pb2.Status:
-    """An error of ours with its details; its traceback is dropped, through which it would keep the request in memory."""
+    """Convert an error to a status with details. This clears the traceback, which would keep the request in memory.
+
+    Args:
+        error: to convert.
+    """
     error.__traceback__ = None
     details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.code, domain=DOMAIN)]
     if error.kind in ("invalid", "unsupported", "too_large"):
@@ -48,13 +52,30 @@ def status_of(error: StreetfixError) -> status_pb2.Status:
 
 
 def refuse(context: grpc.ServicerContext, error: StreetfixError) -> NoReturn:
-    """End the call with an error of ours."""
+    """End the call with an error.
+
+    Args:
+        context: of the call.
+        error: to send.
+
+    Raises:
+        AssertionError: gRPC did not end the call.
+    """
     context.abort_with_status(rpc_status.to_status(status_of(error)))
     raise AssertionError("abort returned")
 
 
 def fail(context: grpc.ServicerContext, error: Exception, request_id: str) -> NoReturn:
-    """What nobody foresaw: the log gets the story, the caller the request id only."""
+    """End the call with an unexpected error. The log gets the traceback; the caller gets only the request id.
+
+    Args:
+        context: of the call.
+        error: unexpected.
+        request_id: of the call.
+
+    Raises:
+        AssertionError: gRPC did not end the call.
+    """
     _log.error("request_failed request_id=%s", request_id, exc_info=error)
     error.__traceback__ = None  # it would keep the request in memory
     context.abort(
@@ -64,7 +85,11 @@ def fail(context: grpc.ServicerContext, error: Exception, request_id: str) -> No
 
 
 def problem_message(error: StreetfixError) -> pb.Problem:
-    """An error of one request among several; its traceback is dropped, through which it would keep the request in memory."""
+    """Convert the error of one request among several. This clears the traceback, which would keep the request in memory.
+
+    Args:
+        error: to convert.
+    """
     error.__traceback__ = None
     title = (type(error).__doc__ or "").strip().splitlines()[0]
     return pb.Problem(code=error.code, title=title, detail=error.message, field=error.field)

@@ -1,4 +1,4 @@
-"""The REST face: an engine in, an ASGI application out."""
+"""The REST request handler: builds an ASGI application for an engine."""
 
 from importlib.metadata import version as installed_version
 from typing import Any
@@ -18,22 +18,22 @@ from service.runtime.engine import Engine
 from service.runtime.hosts import AllowedHosts
 from service.runtime.keys import KeyRing
 
-_DESCRIPTION = """Street, position and heading of one RGB and one depth picture against a LiDAR map.
+_DESCRIPTION = """Streetfix localizes one RGB image and one depth image against a LiDAR map: street, position and heading.
 
-Lengths are metres, angles degrees, quaternions x, y, z, w. The map frame is right-handed with z up; the camera frame is
-x right, y down, z forward. Headings are counter-clockwise from map x, in (-180, 180]. Every error is
-`application/problem+json`, every response has an `X-Request-Id`."""
+Lengths are in metres, angles in degrees. Quaternions are x, y, z, w. The map frame is right-handed with z up. The camera
+frame is x right, y down, z forward. Headings are counter-clockwise from map x, in (-180, 180]. Every error is
+`application/problem+json`. Every response has an `X-Request-Id`."""
 
 
 def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
-    """The application; it neither opens nor closes the engine.
+    """Create the application. It neither opens nor closes the engine.
 
     Args:
         engine: open.
-        keys: who may ask; None lets everybody.
+        keys: of the allowed callers; None allows everybody.
     """
     version = installed_version("streetfix")
-    # FastAPI's pages about the contract load scripts and styles from other hosts, which a service must not make a browser do.
+    # Swagger UI and ReDoc are disabled, because they load scripts and styles from other hosts.
     app = FastAPI(
         title="Streetfix", version=version, description=_DESCRIPTION, redirect_slashes=False, docs_url=None, redoc_url=None
     )  # fmt: skip
@@ -53,14 +53,20 @@ def create_app(engine: Engine, keys: KeyRing | None = None) -> FastAPI:
     app.add_middleware(HostMiddleware, hosts=AllowedHosts.of(engine.settings))
     app.add_middleware(
         RequestIdMiddleware, requested=engine.metrics.requested, tracing=engine.tracing
-    )  # outermost: the last one added
+    )  # added last, so it is the outermost
     problems.install(app)
     app.openapi = lambda: _openapi_of(app)  # type: ignore[method-assign]  # FastAPI's documented way
     return app
 
 
 def create_health_app(engine: Engine) -> FastAPI:
-    """What the health port serves: ``/livez`` and ``/readyz``, and ``/metrics`` if the settings say so. Nobody needs a key there."""
+    """Create the application of the health port. It needs no key.
+
+    It serves ``/livez`` and ``/readyz``, and ``/metrics`` if the settings enable it.
+
+    Args:
+        engine: open.
+    """
     wanted = {"/livez", "/readyz"} | ({"/metrics"} if engine.settings.health_metrics else set())
     app = FastAPI(openapi_url=None, redirect_slashes=False)
     router = health.router_for(engine, installed_version("streetfix"))
@@ -72,7 +78,10 @@ def create_health_app(engine: Engine) -> FastAPI:
 
 
 def _openapi_of(app: FastAPI) -> dict[str, Any]:
-    """FastAPI's document with the schemas that no route declares: we split the body, and write problems, ourselves."""
+    """OpenAPI document with the schemas that no route declares.
+
+    Routes do not declare them, because this package parses bodies and writes problems itself.
+    """
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = document["components"]["schemas"]

@@ -1,4 +1,4 @@
-"""How every route that localizes takes its body: counted, bounded in number and in time."""
+"""Body handling of every route that localizes, with limits on size, number and time."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -15,20 +15,30 @@ T = TypeVar("T")
 
 
 class Asking:
-    """Reads bodies for an engine; one for all routes of an application."""
+    """Reads bodies for an engine. All routes of an application share one.
+
+    Args:
+        engine: does the work.
+
+    Attributes:
+        engine: as given.
+    """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._bodies = asyncio.Semaphore(
             engine.admission.capacity
-        )  # bounds the number of bodies that are still coming in; their memory is the budget's
+        )  # limits the number of bodies being received; the memory budget limits their size
 
     async def in_time(self, work: Callable[[], T]) -> T:
-        """Work that needs no body, on a worker, in no more time than a request may take.
+        """Run work without a body on a worker, within the time limit of a request.
+
+        Args:
+            work: to run.
 
         Raises:
-            BusyError: as many wait as may.
-            DeadlineError: it took too long.
+            BusyError: the queue is full.
+            DeadlineError: the work took too long.
         """
         settings = self.engine.settings
         try:
@@ -38,11 +48,15 @@ class Asking:
             raise DeadlineError(f"not done within {settings.request_timeout_s:g} s; try again later") from error
 
     async def __call__(self, request: Request, work: Callable[[Body], Awaitable[Response]]) -> Response:
-        """Read the body and work on it.
+        """Read the body and run the work on it.
+
+        Args:
+            request: its body has not been read yet.
+            work: answers a complete body.
 
         Raises:
-            BusyError: as many come in, or wait, as may, or the memory for requests is taken.
-            TooLargeError: the body is beyond the limit.
+            BusyError: too many requests are being received or wait, or the memory for requests is taken.
+            TooLargeError: the body exceeds the limit.
             DeadlineError: body and work took longer than a request may.
         """
         settings = self.engine.settings
@@ -62,10 +76,10 @@ class Asking:
 
 
 async def _unless_gone(request: Request, answering: Awaitable[Response]) -> Response:
-    """The answer; work that still waits is dropped where nobody waits for it any more.
+    """Return the answer, or cancel the work if the client disconnects.
 
     Raises:
-        ClientDisconnect: the caller has gone.
+        ClientDisconnect: the client has disconnected.
     """
     work, gone = asyncio.ensure_future(answering), asyncio.ensure_future(_gone(request))
     try:
@@ -79,6 +93,6 @@ async def _unless_gone(request: Request, answering: Awaitable[Response]) -> Resp
 
 
 async def _gone(request: Request) -> None:
-    """Until the connection is closed: after a body nothing else can come."""
+    """Wait until the connection is closed. After the body no other message can arrive."""
     while (await request.receive())["type"] != "http.disconnect":
         pass

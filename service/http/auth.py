@@ -1,4 +1,4 @@
-"""Asks for an API key before a byte of a body is read."""
+"""Check the API key before a byte of the body is read."""
 
 from starlette.datastructures import Headers
 from starlette.requests import Request
@@ -9,22 +9,30 @@ from service.http.problems import problem_of, problem_response
 from service.runtime.keys import Caller, KeyRing, presented_key
 from service.runtime.settings import Settings, is_loopback
 
-#: What an orchestrator asks, which has no key.
+#: Paths for an orchestrator, which has no key.
 OPEN = frozenset({"/livez", "/readyz"})
-#: The console's page is the same for everybody and says nothing of a map; what it shows it asks for with a key.
+#: The page of the console is public and holds no map data. It requests its data with a key.
 _PAGE = "/console"
 
 
 def needs_no_key(path: str) -> bool:
-    """Whether anybody may ask for a path."""
+    """Return whether a path is open without a key.
+
+    Args:
+        path: of the request.
+    """
     return path in OPEN or path in ("/", "/docs", _PAGE) or path.startswith(f"{_PAGE}/")
 
 
 def require_operator(request: Request, settings: Settings) -> None:
-    """Let only those change what a service does who may.
+    """Require that the caller is an operator.
+
+    Args:
+        request: of the caller.
+        settings: of the service.
 
     Raises:
-        ForbiddenError: the caller's key is no operator's; or there are no keys, and others than this machine's users can ask.
+        ForbiddenError: the key does not belong to an operator; or there are no keys and other machines can reach the service.
     """
     caller: Caller | None = getattr(request.state, "caller", None)
     allowed = is_loopback(settings.host) if caller is None else caller.operator
@@ -33,14 +41,19 @@ def require_operator(request: Request, settings: Settings) -> None:
 
 
 class AuthMiddleware:
-    """Inside of the request id, outside of everything else."""
+    """ASGI middleware that requires a key. It runs inside ``RequestIdMiddleware`` and ``HostMiddleware``, outside of the routes.
+
+    Args:
+        app: inner application.
+        keys: of the callers.
+    """
 
     def __init__(self, app: ASGIApp, keys: KeyRing) -> None:
         self._app = app
         self._keys = keys
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One ASGI call."""
+        """Handle one ASGI call: store the caller in ``state``, or answer with the problem."""
         if scope["type"] == "http" and not needs_no_key(scope["path"]):
             headers = Headers(scope=scope)
             try:

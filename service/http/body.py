@@ -1,7 +1,7 @@
-"""Read a request's body with its bytes counted, and split multipart/form-data without copying it to disk.
+"""Read a request body with a byte limit, and split multipart/form-data in memory.
 
-Starlette bounds form fields but no files, and spools parts over 1 MiB to temporary files; a service with a read-only
-file system and a limit of bytes does neither.
+Starlette limits form fields but not files, and writes parts over 1 MiB to temporary files. This service needs a byte limit for files
+too, and may run on a read-only file system.
 """
 
 import asyncio
@@ -19,22 +19,22 @@ from service.runtime.memory import MIB, Hold
 
 T = TypeVar("T")
 
-#: A body of unknown length reserves memory in such steps.
+#: Step of the memory reservation for a body of unknown length.
 _STEP = MIB
 _HEADERS_AT_MOST = 4096
 _BOUNDARY = re.compile(r"[0-9A-Za-z'()+_,./:=? -]{0,69}[0-9A-Za-z'()+_,./:=?-]")
 
 
 async def read_body(request: Request, *, max_bytes: int, hold: Hold) -> bytearray:
-    """The whole body, never more than the limit.
+    """Read the whole body, up to a limit.
 
     Args:
-        request: whose body has not been read.
+        request: its body has not been read yet.
         max_bytes: the limit.
-        hold: where its memory is reserved: the announced length before a byte is read, else step by step as it comes.
+        hold: reserves the memory: the announced length before the first byte, else step by step.
 
     Raises:
-        TooLargeError: the length announced, or the bytes that came, are beyond the limit.
+        TooLargeError: the announced length or the received bytes exceed the limit.
         BusyError: the memory for requests is taken.
     """
     announced = request.headers.get("content-length", "0")
@@ -53,11 +53,11 @@ async def read_body(request: Request, *, max_bytes: int, hold: Hold) -> bytearra
 
 
 class Body:
-    """A body that has come in whole, and the memory that it holds.
+    """A complete body and its reserved memory.
 
     Args:
-        content: gone when it was read.
-        hold: its reservation.
+        content: the bytes; cleared when they are read.
+        hold: reservation of the body.
         admission: of the engine.
     """
 
@@ -67,7 +67,10 @@ class Body:
         self._admission = admission
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Work on it, on a worker; its memory stays reserved until that is over.
+        """Run work on a worker thread. The memory of the body stays reserved until the work is over.
+
+        Args:
+            work: to run.
 
         Raises:
             BusyError: the queue is full.
@@ -77,21 +80,28 @@ class Body:
         return await asyncio.wrap_future(future)
 
     def split(self, content_type: str, *, max_parts: int) -> dict[str, bytes]:
-        """The parts of a multipart/form-data body by their names.
+        """Split a multipart/form-data body into its parts by name, and clear the body.
+
+        Args:
+            content_type: header of the request.
+            max_parts: limit of the number of parts.
 
         Raises:
             BusyError: the memory for requests is taken.
-            StreetfixError: as ``split_multipart``.
+            StreetfixError: as for ``split_multipart``.
         """
         before = len(self._content)
-        self._hold.grow(before)  # parts are copies, beside the body until all are made
+        self._hold.grow(before)  # the parts are copies; the body exists until all are made
         parts = split_multipart(self._content, content_type, max_parts=max_parts)
         self._content.clear()
         self._hold.shrink_to(before)
         return parts
 
     def whole(self, *, copies: int) -> bytes:
-        """All of it, for a reader that makes so many copies.
+        """Return the whole body and clear it. Memory for further copies is reserved.
+
+        Args:
+            copies: number of copies that the caller makes.
 
         Raises:
             BusyError: the memory for requests is taken.
@@ -109,15 +119,20 @@ def _too_large(what: str, max_bytes: int) -> TooLargeError:
 
 
 def split_multipart(body: bytearray, content_type: str, *, max_parts: int) -> dict[str, bytes]:
-    """The parts of a multipart/form-data body by their names.
+    """Split a multipart/form-data body into its parts by name.
+
+    Args:
+        body: the whole body.
+        content_type: header of the request.
+        max_parts: limit of the number of parts.
 
     Raises:
-        UnsupportedFormatError: the content type is another one.
-        RequestError: the body is not well formed, or a name comes twice.
-        TooLargeError: more parts than the limit.
+        UnsupportedFormatError: the content type is not multipart/form-data.
+        RequestError: the body is malformed, or a name occurs twice.
+        TooLargeError: there are more parts than the limit.
     """
     delimiter = b"\r\n--" + _boundary_of(content_type)
-    # The first delimiter has no line break before it.
+    # The first delimiter needs no line break before it.
     start = len(delimiter) - 2 if body.startswith(delimiter[2:]) else _next(body, delimiter, 0) + len(delimiter)
     parts: dict[str, bytes] = {}
     while not body.startswith(b"--", start):
@@ -149,7 +164,7 @@ def _boundary_of(content_type: str) -> bytes:
 
 
 def _part(body: bytearray, start: int, end: int) -> tuple[str, bytes]:
-    """Name and content of the part between two delimiters; ``start`` is at the line break after the first."""
+    """Return name and content of the part between two delimiters. ``start`` is at the line break after the first one."""
     blank = body.find(b"\r\n\r\n", start, min(end, start + _HEADERS_AT_MOST))
     if blank < 0:
         raise _malformed("a part has no headers, or more than 4 KiB of them")
@@ -162,7 +177,7 @@ def _part(body: bytearray, start: int, end: int) -> tuple[str, bytes]:
 
 @lru_cache(
     maxsize=64
-)  # a client sends the same few for every request, and the library's parser is the dearest step of splitting
+)  # a client repeats the same few headers, and the library's parser is the most expensive step of splitting
 def _name_from(disposition: str) -> str:
     header = Message()
     header["content-disposition"] = disposition.strip()

@@ -1,4 +1,4 @@
-"""OGC GeoPose by content negotiation: an answer that says nothing but where."""
+"""OGC GeoPose by content negotiation. Such an answer holds only the pose."""
 
 from service.contract.schema import GeoPose, LocalizeAnswer
 from service.errors import NoPoseError, NotGeoreferencedError
@@ -8,10 +8,10 @@ GEOPOSE = "application/geopose+json"
 
 
 def wants_geopose(accept: str) -> bool:
-    """Whether a caller takes GeoPose and has not asked for our own answer before it.
+    """Return whether a caller prefers GeoPose to the JSON answer of this service.
 
     Args:
-        accept: the header; qualities decide, and of equal ones the first.
+        accept: value of the header. The highest quality wins; the first entry breaks ties.
     """
     best, wanted = 0.0, False
     for entry in accept.split(","):
@@ -30,11 +30,14 @@ def wants_geopose(accept: str) -> bool:
 
 
 def sure_geopose(answer: LocalizeAnswer) -> GeoPose:
-    """The pose, if it may be given without a word of doubt, which GeoPose has none for.
+    """Return the GeoPose of an accepted answer. GeoPose has no field for the status or the confidence.
+
+    Args:
+        answer: of the service.
 
     Raises:
         NoPoseError: the answer is not LOCALIZED.
-        NotGeoreferencedError: the map does not say where on the Earth it lies.
+        NotGeoreferencedError: the map is not georeferenced.
     """
     if answer.status != "LOCALIZED":
         raise NoPoseError(

@@ -1,4 +1,4 @@
-"""Refuses requests that a web page of somebody else's made a browser send; outside of keys and routes."""
+"""Refuse requests that a foreign web page caused a browser to send. This check runs before keys and routes."""
 
 from collections.abc import Iterable
 
@@ -9,15 +9,19 @@ from service.http.auth import OPEN
 from service.http.problems import problem_of, problem_response
 from service.runtime.hosts import AllowedHosts
 
-#: Methods that change nothing and cost little; browsers send no reliable ``Origin`` with them.
+#: Methods that change nothing and cost little. Browsers send no reliable ``Origin`` with them.
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _SHOWN = 80
 
 
 class HostMiddleware:
-    """Asks every request for a ``Host`` of ours, and every one that is not GET for an ``Origin`` of ours, if it has one.
+    """ASGI middleware that checks ``Host`` of every request, and ``Origin`` of requests that may change something.
 
-    Orchestrators may ask ``/livez`` and ``/readyz`` by whatever name.
+    A request without ``Origin`` passes. ``/livez`` and ``/readyz`` are open under every name, for orchestrators.
+
+    Args:
+        app: inner application.
+        hosts: allowed names.
     """
 
     def __init__(self, app: ASGIApp, hosts: AllowedHosts) -> None:
@@ -25,7 +29,7 @@ class HostMiddleware:
         self._hosts = hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One ASGI call."""
+        """Handle one ASGI call: pass it on, or answer with the problem."""
         if scope["type"] == "http" and scope["path"] not in OPEN:
             try:
                 self._require(scope["method"], scope["headers"])
@@ -38,8 +42,8 @@ class HostMiddleware:
         """Check both headers.
 
         Raises:
-            ForbiddenHostError: there is not exactly one ``Host``, or it is none of ours.
-            ForbiddenOriginError: the method is no safe one, and a page of another origin sent the request.
+            ForbiddenHostError: there is not exactly one ``Host``, or it is not allowed.
+            ForbiddenOriginError: the method is not safe, and a page of another origin sent the request.
         """
         hosts = [value.decode("latin-1") for name, value in headers if name == b"host"]
         if len(hosts) != 1 or not self._hosts.allows(hosts[0]):

@@ -13,7 +13,7 @@ COMMITTED = Path("openapi/openapi.json")
 
 
 def openapi_text() -> str:
-    """The document, from the code alone: no map, no environment."""
+    """Generate the OpenAPI document from the code, without maps and environment variables."""
     engine = Engine(MapRegistry(), Settings.model_construct())
     try:
         return json.dumps(create_app(engine).openapi(), indent=1, sort_keys=True) + "\n"
@@ -22,7 +22,11 @@ def openapi_text() -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the file, or with ``--check`` say whether it is up to date."""
+    """Write the file, or check with ``--check`` whether it is up to date; return the exit code.
+
+    Args:
+        arguments: of the command line.
+    """
     check = "--check" in arguments
     names = [argument for argument in arguments if argument != "--check"]
     path = Path(names[0]) if names else COMMITTED

@@ -1,4 +1,4 @@
-"""What a batch answers."""
+"""The answer to a batch."""
 
 from pydantic import BaseModel, Field
 

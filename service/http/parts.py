@@ -1,17 +1,21 @@
-"""Which parts a multipart body must have, and the pictures among them."""
+"""Required parts of a multipart body."""
 
 from service.contract.schema import MOST_FRAMES
 from service.errors import RequestError
 
-#: Of any body of ours: a pair of pictures for each frame of the longest sequence, and the JSON.
+#: Maximum number of parts: an image pair for each frame of the longest sequence, and the JSON.
 MOST_PARTS = 2 * MOST_FRAMES + 1
 
 
 def require_parts(parts: dict[str, bytes], names: tuple[str, ...]) -> None:
-    """Exactly these.
+    """Require exactly the given parts.
+
+    Args:
+        parts: content by name.
+        names: required names.
 
     Raises:
-        RequestError: one is missing, or one is unknown.
+        RequestError: a part is missing or unknown.
     """
     told = f"send the parts {', '.join(names[:-1])} and {names[-1]}"
     for name in names:
@@ -22,10 +26,13 @@ def require_parts(parts: dict[str, bytes], names: tuple[str, ...]) -> None:
 
 
 def document_of(parts: dict[str, bytes]) -> bytes:
-    """The JSON part.
+    """Return the JSON part.
+
+    Args:
+        parts: content by name.
 
     Raises:
-        RequestError: it is missing.
+        RequestError: the part is missing.
     """
     if "request" not in parts:
         raise RequestError(
@@ -35,10 +42,14 @@ def document_of(parts: dict[str, bytes]) -> bytes:
 
 
 def numbered_pictures(parts: dict[str, bytes], count: int) -> list[tuple[bytes, bytes]]:
-    """rgb0, depth0, rgb1, depth1 and so on, in pairs.
+    """Return the image pairs (rgb0, depth0), (rgb1, depth1) and so on.
+
+    Args:
+        parts: content by name.
+        count: number of pairs.
 
     Raises:
-        RequestError: one is missing, or there are others.
+        RequestError: a part is missing or unknown.
     """
     require_parts(parts, (*(f"{kind}{k}" for k in range(count) for kind in ("rgb", "depth")), "request"))
     return [(parts[f"rgb{k}"], parts[f"depth{k}"]) for k in range(count)]

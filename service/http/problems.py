@@ -1,4 +1,4 @@
-"""Errors as problem+json (RFC 9457): one table over the kinds of the exception tree."""
+"""Errors as problem+json (RFC 9457). One table maps the kinds of the exceptions to status codes."""
 
 import json
 import logging
@@ -30,7 +30,7 @@ STATUS_OF_KIND: dict[Kind, int] = {
     "deadline": 504,
 }
 
-#: Problems that no exception of ours stands for: what HTTP itself refuses, and what nobody foresaw.
+#: Codes of problems without a ``StreetfixError``: refusals by HTTP itself, and unexpected errors.
 CODE_OF_STATUS = {400: "bad-request", 404: "not-found", 405: "method-not-allowed", 500: "internal"}
 
 _log = logging.getLogger("streetfix.http")
@@ -66,14 +66,23 @@ class Problem(BaseModel):
 
 
 def install(app: FastAPI) -> None:
-    """Answer every foreseen error as a problem; the unforeseen ones are the middleware's."""
+    """Answer every expected error as a problem. ``RequestIdMiddleware`` answers the unexpected ones.
+
+    Args:
+        app: that gets the handlers.
+    """
     app.add_exception_handler(StreetfixError, _on_ours)
     app.add_exception_handler(RequestValidationError, _on_invalid)
     app.add_exception_handler(HTTPException, _on_http)
 
 
 def problem_response(problem: Problem, headers: Any = None) -> Response:
-    """A problem as a response."""
+    """Build the response for a problem. Status 503 also gets ``Retry-After``.
+
+    Args:
+        problem: to send.
+        headers: further headers; None adds none.
+    """
     all_headers = dict(headers or {})
     if problem.status == 503:
         all_headers["Retry-After"] = str(RETRY_AFTER_S)
@@ -81,7 +90,12 @@ def problem_response(problem: Problem, headers: Any = None) -> Response:
 
 
 def problem_of(error: StreetfixError, request_id: str) -> Problem:
-    """An error of ours as a problem; its traceback is dropped, through which it would keep the request in memory."""
+    """Convert an error to a problem. This clears the traceback, which would keep the request in memory.
+
+    Args:
+        error: to convert.
+        request_id: of the request.
+    """
     error.__traceback__ = None
     return Problem(
         type=f"/problems/{error.code}",
@@ -95,7 +109,12 @@ def problem_of(error: StreetfixError, request_id: str) -> Problem:
 
 
 def internal_error(error: Exception, request_id: str) -> Response:
-    """What nobody foresaw: the log gets the story, the caller the request id only."""
+    """Answer an unexpected error. The log gets the traceback; the caller gets only the request id.
+
+    Args:
+        error: unexpected.
+        request_id: of the request.
+    """
     _log.error("request_failed request_id=%s", request_id, exc_info=error)
     error.__traceback__ = None
     problem = Problem(
@@ -131,5 +150,9 @@ async def _on_http(request: Request, error: Exception) -> Response:
 
 
 def title_of(kind_of_error: type[StreetfixError]) -> str:
-    """The first line of an error's docstring."""
+    """Return the title of a problem: the first line of the docstring of its error class.
+
+    Args:
+        kind_of_error: the class.
+    """
     return (kind_of_error.__doc__ or "").strip().splitlines()[0]

@@ -1,6 +1,6 @@
-"""HTTP/1.1 by httptools under uvicorn, with bounds on what is not a body: httptools itself has none.
+"""HTTP/1.1 by httptools under uvicorn, with limits on everything but the body, because httptools has none.
 
-httptools splits requests in C, which costs a tenth of what h11 costs for bodies of this size (decision log).
+httptools parses requests in C. For bodies of this size it takes a tenth of the time of h11 (decision log).
 """
 
 import asyncio
@@ -11,46 +11,67 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResp
 
 _log = logging.getLogger("streetfix.http")
 
-#: Request line, headers, chunk sizes and trailers of one request; bodies have limits of their own.
+#: Limit for request line, headers, chunk sizes and trailers of one request. Bodies have their own limits.
 HEAD_BYTES = 16 * 1024
-#: A chunked body's frames may cost so much of it again.
+#: The framing of a chunked body may take one part in this many of its size.
 _FRAMES_SHARE = 8
-#: Requests that a caller may send ahead on one connection before the first is answered.
+#: Limit for requests that a client may send on one connection before the first is answered.
 PIPELINED = 16
-#: Of a body that was answered before it was here, as refused ones are, so much is still read, for clients that read when they have
-#: sent all. Then nothing is read any more, and a moment later, in which others can read the answer, the connection is closed.
+#: A refused request may be answered before its body has arrived. The server still reads ``UNWANTED_BYTES`` of it, for clients that read
+#: only after they have sent everything. Then it stops reading. It closes the connection ``LINGER_SECONDS`` later, so that other clients
+#: can read the answer.
 UNWANTED_BYTES, LINGER_SECONDS = 2**20, 2.0
-#: A connection that has not sent a whole head by then is closed, be it new or kept.
+#: A new or kept connection that has not sent a complete head within this time is closed.
 HEAD_SECONDS = 30.0
 
 
 class BoundedHttp(HttpToolsProtocol):
-    """uvicorn's protocol on httptools; a head that is too large gets 400, one that does not come ends the connection."""
+    """uvicorn's httptools protocol with limits.
+
+    A head that is too large gets status 400. If no complete head arrives in time, the connection is closed.
+
+    Args:
+        given: positional arguments of the base class.
+        named: keyword arguments of the base class.
+    """
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
-        self._in_head = False  # it has begun and is not here as a whole
-        self._bodies_bytes = self._body_bytes = self._other_bytes = 0  # of all requests, and of this one
+        self._in_head = False  # a head has begun and is not complete
+        # Body bytes of all requests, body bytes of this request, other bytes of this request.
+        self._bodies_bytes = self._body_bytes = self._other_bytes = 0
         self._head_timer: asyncio.TimerHandle | None = None
         self._unanswered: list[RequestResponseCycle] = []
         self._unwanted_bytes = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn's own
-        """A caller has come and must say something."""
+        """Start the timer for the first head of a new connection.
+
+        Args:
+            transport: of the connection.
+        """
         super().connection_made(transport)
         self._await_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The caller has gone."""
+        """Mark all unanswered requests of the connection as disconnected.
+
+        Args:
+            exc: why the connection was lost; None if it was closed.
+        """
         self._head_came()
         super().connection_lost(exc)
-        # uvicorn tells the last one only, and uvloop refuses what the others would still send.
+        # uvicorn informs only the last request. uvloop raises if the others still send.
         for cycle in self._unanswered:
             cycle.disconnected = True
             cycle.message_event.set()
 
     def data_received(self, data: bytes) -> None:
-        """Parse, then count what was no body."""
+        """Parse data, then count the bytes that were not part of a body.
+
+        Args:
+            data: as received.
+        """
         before = self._bodies_bytes
         super().data_received(data)
         if self.transport.is_closing():
@@ -62,14 +83,18 @@ class BoundedHttp(HttpToolsProtocol):
             self._await_head()
 
     def on_message_begin(self) -> None:
-        """A request begins."""
+        """Reset the counters at the beginning of a request."""
         super().on_message_begin()
         self._in_head, self._body_bytes, self._other_bytes, self._unwanted_bytes = True, 0, 0, 0
 
     def on_headers_complete(self) -> None:
-        """Its head is here."""
+        """Accept a complete head.
+
+        Raises:
+            ValueError: too many requests were sent ahead.
+        """
         if len(self.pipeline) >= PIPELINED:
-            # httptools makes it an error of the parser, which is answered 400.
+            # httptools turns this into a parser error, which gets status 400.
             raise ValueError(f"more than {PIPELINED} requests sent ahead")
         self._in_head = False
         self._head_came()
@@ -77,7 +102,11 @@ class BoundedHttp(HttpToolsProtocol):
         self._unanswered = [cycle for cycle in (*self._unanswered, self.cycle) if not cycle.response_complete]
 
     def on_body(self, body: bytes) -> None:
-        """A piece of its body."""
+        """Count a part of the body.
+
+        Args:
+            body: the part.
+        """
         self._bodies_bytes += len(body)
         self._body_bytes += len(body)
         if self.cycle is not None and self.cycle.response_complete:
@@ -94,7 +123,7 @@ class BoundedHttp(HttpToolsProtocol):
         _log.info("head_too_large")
         if self.cycle is None or self.cycle.response_complete:
             self.send_400_response("The head of the request is too large.")
-        else:  # an answer may be under way
+        else:  # an answer may already be in transfer
             self.transport.close()
 
     def _await_head(self) -> None:

@@ -37,10 +37,10 @@ nav li { margin: 0.15rem 0 }
 
 
 def router_for(app: FastAPI) -> APIRouter:
-    """The route of the page.
+    """Create the route of the page.
 
     Args:
-        app: whose contract it shows.
+        app: its OpenAPI document is shown.
     """
     router = APIRouter(include_in_schema=False)
 
@@ -56,7 +56,7 @@ def router_for(app: FastAPI) -> APIRouter:
 
 
 def page_of(document: dict[str, Any]) -> str:
-    """The page.
+    """Render the OpenAPI document as an HTML page.
 
     Args:
         document: OpenAPI 3.1, as ``app.openapi()`` gives it.
@@ -85,7 +85,7 @@ def page_of(document: dict[str, Any]) -> str:
 
 
 def _operation(name: str, operation: dict[str, Any]) -> str:
-    """One method of one path: what it does, its parameters, its body and its answers."""
+    """Render one method of one path: purpose, parameters, body and answers."""
     parts = [f'<h2 id="{escape(operation["operationId"])}"><code>{escape(name)}</code></h2>']
     parts.append(f"<p><strong>{escape(operation.get('summary', ''))}</strong></p>")
     parts.append(_paragraphs(operation.get("description", "")))
@@ -122,7 +122,7 @@ def _answer(response: dict[str, Any]) -> list[str]:
 
 
 def _schema(name: str, schema: dict[str, Any]) -> str:
-    """One type, folded, with an example if it has one."""
+    """Render one type, folded, with an example if it has one."""
     examples = "".join(
         f"<pre>{escape(json.dumps(example, indent=1))}</pre>"
         for example in schema.get("examples", [])
@@ -148,7 +148,7 @@ def _properties(schema: dict[str, Any]) -> str:
 
 
 def _type(schema: dict[str, Any]) -> str:
-    """The type in a few words; a type of the document as a link."""
+    """Describe a type in a few words. A type of the document becomes a link."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return f'<a href="#{escape(name)}">{escape(name)}</a>'
@@ -165,7 +165,7 @@ def _type(schema: dict[str, Any]) -> str:
 
 
 def _told(schema: dict[str, Any], *, required: bool, told: str) -> str:
-    """What a field means, its limits, and its default."""
+    """Describe the meaning, the limits and the default of a field."""
     limits = [
         f"{sign} {limit[key]}" for limit in (schema, *schema.get("anyOf", [])) for key, sign in _LIMITS if key in limit
     ]

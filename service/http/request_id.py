@@ -1,4 +1,4 @@
-"""The outermost middleware: every request has an id, and nothing that nobody foresaw gets past it."""
+"""The outermost middleware: gives every request an id and answers unexpected errors."""
 
 import re
 import uuid
@@ -15,13 +15,21 @@ from service.runtime.logs import log_request
 from service.runtime.tracing import Tracing
 
 HEADER = "X-Request-Id"
-#: As other servers count a caller that went away before the answer.
+#: Status in metrics and log if the client disconnects before the answer, as nginx uses it.
 _CLIENT_CLOSED = 499
 _ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 class RequestIdMiddleware:
-    """Takes the caller's ``X-Request-Id`` if it is a plain one, else makes one; answers unforeseen errors with 500."""
+    """ASGI middleware for request ids, unexpected errors (status 500), metrics, spans and the log.
+
+    It keeps the ``X-Request-Id`` of the caller if it is 1 to 64 letters, digits, ``.``, ``_`` or ``-``; else it creates one.
+
+    Args:
+        app: inner application.
+        requested: called with request handler, operation, status and seconds of every request.
+        tracing: creates the spans.
+    """
 
     def __init__(self, app: ASGIApp, requested: Callable[[str, str, str, float], None], tracing: Tracing) -> None:
         self._app = app
@@ -29,7 +37,7 @@ class RequestIdMiddleware:
         self._tracing = tracing
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One ASGI call."""
+        """Handle one ASGI call."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

@@ -1,4 +1,4 @@
-"""A bounded pool of workers: so many at work, so many waiting, the next is refused at once."""
+"""A thread pool with a bounded queue. It refuses a task at once if the queue is full."""
 
 import threading
 import traceback
@@ -12,7 +12,16 @@ T = TypeVar("T")
 
 
 class Admission:
-    """Runs tasks on a few threads; refuses beyond a bounded queue."""
+    """Runs tasks on worker threads and refuses tasks beyond a bounded queue.
+
+    Args:
+        threads: number of worker threads.
+        queue: number of tasks that may wait.
+        initializer: called once in every worker thread.
+
+    Attributes:
+        capacity: tasks that may run or wait at the same time.
+    """
 
     def __init__(self, *, threads: int, queue: int, initializer: Callable[[], None] | None = None) -> None:
         self.capacity = threads + queue
@@ -24,33 +33,43 @@ class Admission:
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="streetfix", initializer=initializer)
 
     def watch(self, working: Callable[[float], None], waiting: Callable[[float], None]) -> None:
-        """Tell the numbers of tasks at work and waiting whenever they change."""
+        """Report the number of running and of waiting tasks at every change.
+
+        Args:
+            working: called with the number of running tasks.
+            waiting: called with the number of waiting tasks.
+        """
         self._told_working, self._told_waiting = working, waiting
         self._tell()
 
     @property
     def working(self) -> int:
-        """Tasks that a worker runs now."""
+        """Number of tasks that a worker runs now."""
         return self._working
 
     @property
     def waiting(self) -> int:
-        """Tasks that wait for a worker."""
+        """Number of tasks that wait for a worker."""
         return max(0, self._taken - self._working)
 
     def submit(self, task: Callable[[], T]) -> Future[T]:
-        """Run a task on a worker; a cancelled future that still waits gives its place back and never runs.
+        """Run a task on a worker.
+
+        A waiting task whose future is cancelled frees its place and never runs.
+
+        Args:
+            task: to run.
 
         Raises:
-            BusyError: all workers are at work and the queue is full.
+            BusyError: all workers are busy and the queue is full, or the service is shutting down.
         """
         with self._lock:
             if self._taken == self.capacity:
                 raise BusyError(f"{self.capacity} requests are being worked on or wait already; try again in a second")
             self._taken += 1
             self._tell()
-        # In a cell that is emptied when the work is over: a cancelled future stays in the pool's queue until a worker comes by, and
-        # must not keep a request's pictures there.
+        # The cell is emptied when the task is over. A cancelled future stays in the pool's queue until a worker takes it, and must
+        # not keep the images of its request in memory.
         cell: list[Callable[[], T]] = [task]
         try:
             future = self._pool.submit(self._run, cell)
@@ -67,7 +86,7 @@ class Admission:
         return future
 
     def close(self) -> None:
-        """Let running tasks end, drop waiting ones."""
+        """Wait for running tasks and drop waiting ones."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, cell: list[Callable[[], T]]) -> T:
@@ -95,10 +114,13 @@ class Admission:
 
 
 def forget_locals(error: BaseException) -> None:
-    """Drop the variables of the functions that an error has left: its traceback would keep a request's pictures as long as it lives.
+    """Clear the local variables in the tracebacks of an error, its causes and contexts.
 
-    Futures and the functions that wait for them refer to each other through their error, so that can be until the garbage collector
-    comes by.
+    A traceback keeps the images of a request in memory. Futures and the functions that wait for them refer to each other through
+    their error, so this memory would stay until the next garbage collection.
+
+    Args:
+        error: raised by a task.
     """
     seen: set[int] = set()
     one: BaseException | None = error

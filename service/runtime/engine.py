@@ -1,4 +1,4 @@
-"""The composition root: settings in, a running engine out; every face calls this and nothing below it."""
+"""The composition root: builds a running engine from the settings. Both request handlers call only this module."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -39,13 +39,25 @@ from service.runtime.tracing import Tracing
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EncodedQuery:
-    """A query as it comes in: pictures not yet decoded, numbers already checked by the face.
+    """A query as received. The images are still encoded; the request handler has checked the numbers.
 
     Attributes:
-        map_name: which map; None where only one is mounted.
-        scale_m: metres for each stored unit; None lets the format decide.
-        prior_wgs84: latitude and longitude (degrees) of the prior's position, where it was given so.
-        false_accept_rate: None takes the service's setting.
+        rgb: encoded RGB image.
+        depth: encoded depth image.
+        camera: intrinsics of both images.
+        map_name: map to localize in, as ``name`` or ``name@version``; None if only one is mounted.
+        depth_encoding: file encoding of the depth image.
+        depth_kind: meaning of the stored values.
+        scale_m: metres per stored unit; None lets the format decide.
+        baseline_m: of the stereo camera, for disparity.
+        max_range_m: depths beyond this range count as not measured; None sets no limit.
+        down_camera: direction of gravity in the camera frame, (3,); None if unknown.
+        T_vehicle_camera: from the camera frame to the vehicle frame, (4, 4), metres; None if the vehicle pose is not wanted.
+        neighbours: number of distinct places that vote and that the answer lists.
+        refine: whether to register the images on the map cloud.
+        prior: prior of the camera pose; None if nothing is known.
+        prior_wgs84: latitude and longitude (degrees) of the prior's position, if it was given so.
+        false_accept_rate: share of out-of-map queries that may be LOCALIZED; None takes the setting of the service.
     """
 
     rgb: bytes
@@ -68,19 +80,19 @@ class EncodedQuery:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """An answer and the map that gave it."""
+    """An answer and the map bundle that gave it."""
 
     answer: Answer
     bundle: MapBundle
 
 
 class Engine:
-    """Open maps and the threads that serve them.
+    """Open maps and the worker threads that serve them.
 
     Args:
         registry: of the maps.
         settings: checked.
-        watcher: of the folders that the maps came from; None makes one.
+        watcher: of the maps folders; None creates one.
     """
 
     def __init__(self, registry: MapRegistry, settings: Settings, watcher: MapWatcher | None = None) -> None:
@@ -97,15 +109,16 @@ class Engine:
 
     @classmethod
     def open(cls, settings: Settings, table: ServingTable | None = None) -> "Engine":
-        """Open the maps of the settings; those that cannot be opened are in ``registry.refused``.
+        """Open the maps of the settings. ``registry.refused`` lists those that cannot be opened.
 
         Args:
             settings: checked.
-            table: what serves, shared with other workers of the same service; None if there are none. The engine then opens what
-                serves in them, and waits until it can.
+            table: serving table that the workers of a service share; None for a single process. With a shared table the engine
+                opens the versions that serve in the other workers, and waits until it can.
 
         Raises:
-            StreetfixError: there are bundles, but none can be mounted; with the setting ``strict``, any cannot or there is none.
+            StreetfixError: there are bundles, but none can be mounted. With the setting ``strict``: one cannot be mounted, or
+                there is none.
         """
         limit_pools()
         registry = MapRegistry(provider=settings.provider, table=table)
@@ -114,7 +127,11 @@ class Engine:
         return cls(registry, settings, watcher)
 
     def serve_version(self, name: str, version: str) -> Localizer:
-        """Let another mounted version of a map serve, in every worker.
+        """Select the serving version of a map, in every worker.
+
+        Args:
+            name: of the map.
+            version: a mounted version.
 
         Raises:
             UnknownMapError: no such map or version is mounted.
@@ -123,35 +140,40 @@ class Engine:
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is a map to answer from, and the service is not leaving."""
+        """Whether a map is mounted and the service is not shutting down."""
         return len(self.registry) > 0 and not self.is_draining
 
     def drain(self) -> None:
-        """Say that the service is leaving; it still answers. Safe to call from a signal handler."""
+        """Mark the service as shutting down. It still answers. Safe to call from a signal handler."""
         self.is_draining = True
 
     def localize(self, encoded: EncodedQuery) -> Located:
-        """Decode and localize, in the thread of the caller.
+        """Decode and localize one query, in the thread of the caller.
+
+        Args:
+            encoded: the query.
 
         Raises:
-            UnknownMapError: no map of that name.
-            RequestError: a picture is undecodable, of the wrong size, or without depth.
-            UnsupportedFormatError: a picture's format is not read.
-            TooLargeError: a picture is beyond the limits.
+            NotReadyError: no map is mounted.
+            UnknownMapError: no map has that name.
+            RequestError: an image cannot be decoded, has the wrong size, or holds no depth.
+            UnsupportedFormatError: the format of an image is not supported.
+            TooLargeError: an image exceeds the limits.
         """
         return self.localize_sequence((encoded,), (np.eye(4),))
 
     def localize_sequence(
         self, encoded: tuple[EncodedQuery, ...], T_reference_camera: tuple[NDArray[np.float64], ...]
     ) -> Located:
-        """Decode several pairs and localize them as one, in the thread of the caller.
+        """Decode several image pairs and localize them as one, in the thread of the caller.
 
         Args:
-            encoded: the reference first; its map is asked.
-            T_reference_camera: of each; the first is the identity.
+            encoded: the image pairs, the reference first; its map is queried.
+            T_reference_camera: for each pair, from its camera frame to the reference camera frame, (4, 4), metres. The first is
+                the identity.
 
         Raises:
-            StreetfixError: as for a single one; its field is under ``frames.K`` where there are several.
+            StreetfixError: as for ``localize``; with several pairs its field is under ``frames.K``.
         """
         localizer = self.registry.get(encoded[0].map_name)
         frames, decode_ms = [], 0.0
@@ -167,26 +189,33 @@ class Engine:
         return self.answer(localizer, tuple(frames), decode_ms)
 
     def answer(self, localizer: Localizer, frames: tuple[Frame, ...], decode_ms: float) -> Located:
-        """Answer frames that were looked up, and count the answer.
+        """Answer frames that were looked up, and count the answer in the metrics.
 
         Args:
-            localizer: of the map they were looked up in.
+            localizer: of the map in which the frames were looked up.
             frames: the reference first.
-            decode_ms: that decoding took.
+            decode_ms: duration of decoding all frames.
         """
         answer = localizer.answer(frames)
         timings = replace(answer.timings, decode_ms=decode_ms, total_ms=answer.timings.total_ms + decode_ms)
         timed = replace(answer, timings=timings)
         self.metrics.answered(timed, localizer.bundle, frames=len(frames))
-        if self.settings.console:  # nobody else would read them
+        if self.settings.console:  # only the console reads them
             self.last_answers.add(timed, localizer.bundle, frames=len(frames))
         return Located(timed, localizer.bundle)
 
     def look_up(self, localizer: Localizer, encoded: EncodedQuery) -> tuple[Frame, float]:
-        """A pair decoded and looked up in a map, and the milliseconds that decoding took.
+        """Decode an image pair and retrieve its most similar places.
+
+        Args:
+            localizer: of the map to search.
+            encoded: the pair.
+
+        Returns:
+            The frame, and the duration of decoding in milliseconds.
 
         Raises:
-            StreetfixError: as ``localize``.
+            StreetfixError: as for ``localize``.
         """
         started = perf_counter()
         query = replace(self._decode(encoded, localizer.bundle.grid), prior=_prior_in(encoded, localizer.bundle))
@@ -194,11 +223,11 @@ class Engine:
         return localizer.look_up(query), 1e3 * (decoded - started)
 
     def close(self) -> None:
-        """Let running work end and drop what waits."""
+        """Wait for running requests and drop waiting ones."""
         self.admission.close()
 
     def _decode(self, encoded: EncodedQuery, grid: ViewGrid) -> Query:
-        """Both pictures; the memory that they take is reserved for as long as they live."""
+        """Decode both images. Their memory stays reserved until the depth image is deleted."""
         converted = encoded.depth_kind == "range" or encoded.depth_encoding == "carla"
         of_pixel = {"rgb": RGB_PEAK, "depth": DEPTH_PEAK_CONVERTED if converted else DEPTH_PEAK}
         with self.memory.hold() as hold:
@@ -226,14 +255,16 @@ class Engine:
 
 
 def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
-    """Ask a map once, in the caller's thread, so that its encoder and the first of its pages are in memory.
+    """Localize one random query, so that the encoder and the first map pages are in memory.
+
+    It runs in the thread of the caller.
 
     Args:
-        false_accept_rate: the service's setting, which holds for requests that name none.
+        false_accept_rate: setting of the service for requests that give none.
         localizer: of the map.
 
     Raises:
-        BundleError: the map's calibration cannot promise that rate, so it would refuse those requests.
+        BundleError: the calibration of the map cannot guarantee this rate, so the map would refuse such requests.
         StreetfixError: the map cannot answer.
     """
     limit_pools()
@@ -252,7 +283,7 @@ def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
 
 
 def _prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:
-    """The prior in the map's frame."""
+    """Return the prior in the map frame."""
     if encoded.prior is None or encoded.prior_wgs84 is None:
         return encoded.prior
     earth = bundle.earth

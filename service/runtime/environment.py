@@ -1,4 +1,4 @@
-"""Names of ``STREETFIX_*`` variables: which are settings, which belong to others, and which are mistakes."""
+"""Check the names of ``STREETFIX_*`` variables: settings, variables of other programs, and mistakes."""
 
 import difflib
 import re
@@ -9,11 +9,11 @@ from pydantic import BaseModel
 from service.errors import RequestError
 
 PREFIX = "STREETFIX_"
-#: Names the settings file where no flag does.
+#: Path of the settings file, if no flag gives it.
 CONFIG = "STREETFIX_CONFIG"
-#: Variables of clients begin with this; the service does not read them.
+#: Prefix of the variables of clients. The service does not read them.
 CLIENT_PREFIX = "STREETFIX_CLIENT_"
-#: What the clients read as their key. It is one letter away from the setting that asks for keys.
+#: The API key of a client. The name differs by one letter from the setting that requires keys.
 CLIENT_KEY = "STREETFIX_API_KEY"
 #: Read by ``docker compose`` on the host, see deploy/compose.yaml and deploy/compose.tls.yaml.
 COMPOSE = frozenset(
@@ -27,20 +27,22 @@ COMPOSE = frozenset(
     }
 )
 
-#: What Kubernetes and Docker inject for a service whose name begins with ``streetfix``.
+#: Variables that Kubernetes and Docker inject for a service whose name begins with ``streetfix``.
 _LINK_NAME = re.compile(r"_SERVICE_(HOST|PORT(_\w+)?)|_PORT_\d+_(TCP|UDP|SCTP)(_(PROTO|PORT|ADDR))?")
 _LINK_VALUE = re.compile(r"(tcp|udp|sctp)://")
 
 
 def require_known(environment: Mapping[str, str], settings: type[BaseModel]) -> None:
-    """Refuse variables of ours that nobody reads: a misspelt key or TLS setting would serve without protection.
+    """Refuse unknown ``STREETFIX_*`` variables.
+
+    Otherwise a service with a misspelt key or TLS setting would run without protection.
 
     Args:
         environment: of the process.
-        settings: whose fields are known, nested ones by two underscores.
+        settings: model with the known fields; nested names are joined by two underscores.
 
     Raises:
-        RequestError: a variable is no setting; the message has the nearest name.
+        RequestError: a variable is no setting; the message suggests the nearest name. Or Kubernetes injected the variable.
     """
     known = {f"{PREFIX}{name.upper().replace('.', '__')}" for name in setting_names(settings)}
     links, unknown = [], []
@@ -68,7 +70,12 @@ def require_known(environment: Mapping[str, str], settings: type[BaseModel]) -> 
 
 
 def setting_names(settings: type[BaseModel], prefix: str = "") -> list[str]:
-    """Dotted names of all fields, and of the models that hold them."""
+    """Return the dotted names of all fields and of nested models.
+
+    Args:
+        settings: the model.
+        prefix: put before each name.
+    """
     names = []
     for name, field in settings.model_fields.items():
         names.append(prefix + name)
@@ -78,7 +85,12 @@ def setting_names(settings: type[BaseModel], prefix: str = "") -> list[str]:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The nearest name in brackets, with a space before it; empty where none is near."""
+    """Suggest the nearest name: a space and the name in brackets; empty if no name is near.
+
+    Args:
+        name: unknown name.
+        known: valid names.
+    """
     near = difflib.get_close_matches(name, list(known), 1, 0.6)
     return f" (did you mean {near[0]}?)" if near else ""
 

@@ -1,27 +1,28 @@
-"""Makes the C library give large blocks back to the system as soon as they are freed.
+"""Make the C library return large freed blocks to the system at once.
 
-By default glibc learns from a freed picture of 30 MiB to take the next one from an arena, each of up to eight for every core keeps what
-is freed at its end, and nothing ever takes that back: after a flood a service of 200 MiB held 2.5 GiB.
+By default glibc raises its mmap threshold when a large block is freed. After an image of 30 MiB it takes the next one from an arena.
+There are up to eight arenas per core, and glibc never returns the free memory at their ends.
+After a flood of requests a service of 200 MiB held 2.5 GiB.
 """
 
 import ctypes
 import threading
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-#: Blocks of this size are the system's own pages; an arena keeps no more than that at its end. Lower ones cost time, since pages are
-#: fetched anew for every picture (decision log).
+#: glibc takes blocks of ``MAPPED_BYTES`` or more directly from the system. An arena keeps at most ``KEPT_BYTES`` free at its end.
+#: Lower values cost time, because every image then needs new pages (decision log).
 MAPPED_BYTES, KEPT_BYTES = 16 * 2**20, 32 * 2**20
-#: What is freed at once and worth a trim.
+#: A release of this size or more triggers a trim.
 LARGE_BYTES = 8 * 2**20
-#: Trimming takes milliseconds, so it is done for many releases at once.
+#: Delay of a trim. A trim takes milliseconds, so one trim covers many releases.
 _TRIM_AFTER_S = 0.25
 
 
 def keep_little(threads: int) -> None:
-    """Set it for this process and those forked from it; without glibc nothing happens.
+    """Limit the free memory that glibc keeps, in this process and its forks; do nothing without glibc.
 
     Args:
-        threads: that work at once.
+        threads: number of threads that work in parallel; it limits the number of arenas.
     """
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "mallopt"):
@@ -32,7 +33,7 @@ def keep_little(threads: int) -> None:
 
 
 class Trimmer:
-    """Gives the system what lies free between used blocks: a large gRPC message leaves thousands of small ones."""
+    """Returns free memory between used blocks to the system. A large gRPC message leaves thousands of small free blocks."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -40,7 +41,7 @@ class Trimmer:
         self._trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
 
     def soon(self) -> None:
-        """Trim in a moment, once for all who ask until then."""
+        """Schedule a trim. Calls before it runs share the same trim."""
         with self._lock:
             if self._is_coming or self._trim is None:
                 return
@@ -49,7 +50,7 @@ class Trimmer:
         timer.daemon = True
         try:
             timer.start()
-        except RuntimeError:  # no thread can be started now, or the interpreter ends: the next release asks again
+        except RuntimeError:  # no thread available, or the interpreter ends; the next release schedules a trim again
             with self._lock:
                 self._is_coming = False
 

@@ -1,7 +1,7 @@
-"""By which names a service may be asked: the ``Host`` of a request, and the ``Origin`` of what would change something.
+"""Allow-list of host names: checks the ``Host`` of a request, and the ``Origin`` of a request that changes something.
 
-A web page whose name an attacker lets point to this machine (DNS rebinding) is, to a browser, of the same origin as the service.
-Only the name in ``Host`` tells: an address cannot be rebound, a name that we do not know can.
+This protects against DNS rebinding: an attacker points the name of a web page to this machine. For a browser the page then has the
+same origin as the service. Only the name in ``Host`` reveals the attack. An address cannot be rebound; an unknown name can.
 """
 
 import re
@@ -20,10 +20,13 @@ _ANY = "*"
 
 
 def require_host_pattern(value: str) -> str:
-    """A name, ``*.name`` or ``*``, in lower case; also an address, which is always allowed.
+    """Return a host pattern in lower case.
+
+    Args:
+        value: a name, ``*.name`` or ``*``. An IP address is accepted too; addresses are always allowed.
 
     Raises:
-        ValueError: it has a scheme, a port or a path, or is no name.
+        ValueError: the value has a scheme, a port or a path, or is no name.
     """
     value = value.lower().rstrip(".")
     if _PATTERN.fullmatch(value) or _is_address(value.strip("[]")):
@@ -35,14 +38,23 @@ def require_host_pattern(value: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """Host and port of a ``Host`` header or an origin; the port is empty where none is written."""
+    """Host and port of a ``Host`` header or an origin.
+
+    Attributes:
+        host: name or address, lower case, without brackets.
+        port: digits; empty if none is given.
+    """
 
     host: str
     port: str
 
     @classmethod
     def read(cls, text: str) -> "Authority | None":
-        """From ``name:port``; None where it is none."""
+        """Parse ``name:port``; None if the text is not valid.
+
+        Args:
+            text: value of the header.
+        """
         found = _AUTHORITY.fullmatch(text.lower())
         if found is None:
             return None
@@ -51,12 +63,12 @@ class Authority:
 
 @dataclass(frozen=True, slots=True)
 class AllowedHosts:
-    """Names by which a service may be asked.
+    """Host names that a service accepts.
 
     Attributes:
-        names: that the operator listed: exact ones, and ``*.`` before those that stand for all below.
-        own: name that the service listens on; empty where it is an address.
-        any_name: every name is allowed.
+        names: listed by the operator; exact names, or ``*.name`` for all names below.
+        own: name that the service listens on; empty if it is an address.
+        any_name: accept every name.
     """
 
     names: tuple[str, ...]
@@ -65,10 +77,13 @@ class AllowedHosts:
 
     @classmethod
     def of(cls, settings: "Settings") -> "AllowedHosts":
-        """Those of the settings; any name where none is listed and every request must show a key or a certificate.
+        """Take the names of the settings.
 
-        A page in a browser has no key, and TLS with a name of an attacker's fails, so rebinding gains nothing there. The names of
-        a service that is reached by others are not known to it.
+        Without listed names every name is allowed if all requests need a key or a client certificate. Rebinding then gains nothing:
+        a page in a browser has no key, and TLS with the name of an attacker fails. The service cannot know its own public names.
+
+        Args:
+            settings: of the service.
         """
         guarded = settings.api_keys is not None or settings.tls_client_ca is not None
         own = "" if _is_address(settings.host) else settings.host.lower().rstrip(".")
@@ -76,7 +91,11 @@ class AllowedHosts:
         return cls(listed, own, _ANY in settings.allowed_hosts or (guarded and not settings.allowed_hosts))
 
     def allows(self, host: str) -> bool:
-        """Whether a ``Host`` header names this service: an address, a loopback name, or one of the names."""
+        """Return whether a ``Host`` header names this service: an address, a loopback name, or an allowed name.
+
+        Args:
+            host: value of the header.
+        """
         authority = Authority.read(host)
         if authority is None:
             return False
@@ -89,11 +108,11 @@ class AllowedHosts:
         )
 
     def allows_origin(self, origin: str, host: str) -> bool:
-        """Whether a page of an origin may change something: it is the service's own, or of a listed name.
+        """Return whether a page may change something: its origin is the service itself or a listed name.
 
         Args:
-            origin: as a browser sends it; ``null`` is nobody's.
-            host: the request's ``Host``.
+            origin: value of the header ``Origin``; ``null`` is refused.
+            host: value of the header ``Host`` of the same request.
         """
         scheme, _, rest = origin.partition("://")
         asked, own = Authority.read(rest), Authority.read(host)

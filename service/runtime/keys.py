@@ -1,4 +1,4 @@
-"""API keys: who may ask. The file holds names and hashes, never a key."""
+"""API keys of the callers. The file holds names and hashes, never a key."""
 
 import hashlib
 import hmac
@@ -17,7 +17,12 @@ _MOST_BYTES, _MOST_KEY = 2**20, 512
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks, and whether they may change what the service does."""
+    """A caller of the service.
+
+    Attributes:
+        name: in the file of keys.
+        operator: may change the behaviour of the service, such as the serving version of a map.
+    """
 
     name: str
     operator: bool = False
@@ -27,12 +32,11 @@ class Caller:
 class KeyRing:
     """Callers by the SHA-256 of their keys.
 
-    Attributes:
-        caller_of: replaced as a whole by ``reload``, so that a request sees the old ones or the new ones.
-        path: file that they were read from.
+    A key has 256 random bits. So an attacker cannot guess keys, and a fast hash is enough. A slow hash would only delay every request.
 
-    A key is 256 random bits, so no table of likely keys can be made and a plain hash is enough; a slow one would only cost
-    every request.
+    Attributes:
+        caller_of: callers by hash. ``reload`` replaces it atomically, so a request sees either all old or all new callers.
+        path: file of the keys; None if they came from elsewhere.
     """
 
     caller_of: dict[str, Caller]
@@ -40,10 +44,13 @@ class KeyRing:
 
     @classmethod
     def open(cls, path: Path) -> "KeyRing":
-        """Read a file with a line ``NAME SHA256`` or ``NAME SHA256 operator`` for each caller; ``#`` begins a remark.
+        """Read a file with one line ``NAME SHA256`` or ``NAME SHA256 operator`` per caller; ``#`` begins a comment.
+
+        Args:
+            path: of the file.
 
         Raises:
-            KeysError: it is not there, too large, empty, or a line of it is no such thing.
+            KeysError: the file is missing, unreadable, too large or empty; or a line is invalid or repeats a name or a key.
         """
         try:
             with path.open("rb") as file:
@@ -78,16 +85,19 @@ class KeyRing:
         """Read the file again.
 
         Raises:
-            KeysError: it cannot be used; the keys stay as they were.
+            KeysError: the file cannot be used; the old keys stay in force.
         """
         if self.path is not None:
             self.caller_of = KeyRing.open(self.path).caller_of
 
     def require(self, presented: str | None) -> Caller:
-        """The caller.
+        """Return the caller of a key.
+
+        Args:
+            presented: key of the request; None if it has none.
 
         Raises:
-            UnauthorizedError: no key, or not one of ours.
+            UnauthorizedError: there is no key, or it is unknown.
         """
         if not presented:
             raise UnauthorizedError(
@@ -101,7 +111,12 @@ class KeyRing:
 
 
 def presented_key(authorization: str | None, api_key: str | None) -> str | None:
-    """The key among the two headers that may carry it."""
+    """Return the key from the headers of a request; None if there is none.
+
+    Args:
+        authorization: value of ``Authorization``; a ``Bearer`` token takes precedence.
+        api_key: value of ``X-Api-Key``.
+    """
     scheme, _, value = (authorization or "").partition(" ")
     if scheme.lower() == "bearer" and value.strip():
         return value.strip()
@@ -109,10 +124,14 @@ def presented_key(authorization: str | None, api_key: str | None) -> str | None:
 
 
 def new_key() -> str:
-    """256 random bits, as text."""
+    """Generate a key of 256 random bits, as text."""
     return "sf_" + secrets.token_urlsafe(32)
 
 
 def hash_of(key: str) -> str:
-    """What the file keeps of a key."""
+    """Hash a key as in the file of keys.
+
+    Args:
+        key: as text.
+    """
     return hashlib.sha256(key.encode("utf-8", "replace")).hexdigest()

@@ -1,4 +1,4 @@
-"""The last answers of a process, for operators who watch; nothing of a picture is kept."""
+"""The last answers of a process, for monitoring by operators. No image data is kept."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -18,7 +18,21 @@ MOST = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LastAnswer:
-    """What is kept of an answer; ``number`` counts since the process started. Street, position and heading are None unless LOCALIZED."""
+    """Figures of one answer.
+
+    Attributes:
+        number: of the answer; counts from 1 since the process started.
+        at: time of the answer, UTC.
+        map_name: map that answered.
+        map_version: version of that map.
+        status: of the answer.
+        confidence: None if the map is not calibrated.
+        street: name of the street; None unless LOCALIZED, or if there is no street.
+        position_m: of the camera, map frame; None unless LOCALIZED.
+        heading_rad: of the camera, map frame; None unless LOCALIZED.
+        frames: number of image pairs that the answer uses.
+        total_ms: duration of the answer.
+    """
 
     number: int
     at: datetime
@@ -34,14 +48,23 @@ class LastAnswer:
 
 
 class LastAnswers:
-    """A ring of them. Safe to use from several threads: each step of the deque and of the counter is one."""
+    """Ring buffer of the last ``MOST`` answers.
+
+    It is thread-safe without a lock, because every step of the deque and of the counter is atomic.
+    """
 
     def __init__(self) -> None:
         self._kept: deque[LastAnswer] = deque(maxlen=MOST)
         self._numbers = count(1)
 
     def add(self, answer: Answer, bundle: MapBundle, *, frames: int) -> None:
-        """Keep an answer's figures."""
+        """Keep the figures of an answer.
+
+        Args:
+            answer: to keep.
+            bundle: map that answered.
+            frames: number of image pairs that the answer uses.
+        """
         localized, T_map_camera = answer.status == "LOCALIZED", answer.T_map_camera_guess
         has_street = localized and bundle.streets is not None and answer.street >= 0
         self._kept.append(
@@ -56,5 +79,9 @@ class LastAnswers:
         )  # fmt: skip
 
     def newest(self, most: int) -> list[LastAnswer]:
-        """The newest first."""
+        """Return the newest answers, the newest one first.
+
+        Args:
+            most: number of answers at most.
+        """
         return list(self._kept.copy())[: -most - 1 : -1]

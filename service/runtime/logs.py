@@ -1,4 +1,7 @@
-"""One line an event, as JSON for machines or text for people; of a request its id, its trace and its figures, nothing else."""
+"""Logging with one line per event, as JSON for machines or as text for people.
+
+Of a request the log holds only its id, its trace id and its figures.
+"""
 
 import json
 import logging
@@ -13,10 +16,14 @@ _log = logging.getLogger("streetfix.requests")
 
 
 class JsonFormatter(logging.Formatter):
-    """A JSON object a line; what an event carries beside its text is under its own names."""
+    """Formats an event as one JSON object per line. The figures of an event are top-level fields."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line."""
+        """Format one line.
+
+        Args:
+            record: the event.
+        """
         told: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(), "logger": record.name, "event": record.getMessage(),
@@ -28,10 +35,14 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """The same for people."""
+    """Formats an event as text, with its figures as ``name=value``."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line, and a traceback's below it."""
+        """Format one line, with the lines of a traceback below it.
+
+        Args:
+            record: the event.
+        """
         figures = " ".join(f"{name}={value}" for name, value in getattr(record, "figures", {}).items())
         line = super().format(record)
         head, _, rest = line.partition("\n")
@@ -39,7 +50,12 @@ class TextFormatter(logging.Formatter):
 
 
 def set_up(*, style: Literal["text", "json"], level: Literal["debug", "info", "warning", "error"]) -> None:
-    """Send all loggers to stderr."""
+    """Send all loggers to stderr.
+
+    Args:
+        style: of the lines.
+        level: lowest level to log.
+    """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(
         JsonFormatter() if style == "json" else TextFormatter("%(asctime)s %(levelname)s %(name)s %(message)s")
@@ -48,7 +64,16 @@ def set_up(*, style: Literal["text", "json"], level: Literal["debug", "info", "w
 
 
 def log_request(*, face: str, method: str, code: str, seconds: float, request_id: str, traceparent: str | None) -> None:
-    """A request that was answered or refused."""
+    """Log a request that was answered or refused.
+
+    Args:
+        face: request handler, ``rest`` or ``grpc``.
+        method: operation or call.
+        code: status code, or the code of a problem.
+        seconds: duration.
+        request_id: of the request.
+        traceparent: W3C trace context of the request; None if it has none.
+    """
     if not _log.isEnabledFor(logging.INFO):
         return
     figures: dict[str, object] = {
@@ -60,6 +85,10 @@ def log_request(*, face: str, method: str, code: str, seconds: float, request_id
 
 
 def trace_id_of(traceparent: str | None) -> str | None:
-    """The trace's id in a ``traceparent`` header; None where it is not well formed."""
+    """Return the trace id of a ``traceparent`` header; None if the header is missing or malformed.
+
+    Args:
+        traceparent: value of the header.
+    """
     found = _TRACEPARENT.fullmatch((traceparent or "").strip())
     return None if found is None else found[1]

@@ -1,4 +1,4 @@
-"""The maps that a process has open, by name and version; swapped whole while requests run."""
+"""The open maps of a process, by name and version. A change replaces them atomically while requests run."""
 
 import logging
 import threading
@@ -15,18 +15,18 @@ from service.maps.reader import MapBundle
 from service.runtime.serving_table import Key, MapVersion, ServingTable, Table
 
 _log = logging.getLogger("streetfix.maps")
-#: Refused bundles that are named to those who ask; the log names all.
+#: Maximum number of refused bundles that an answer names. The log names all of them.
 MOST_REFUSED = 20
 NO_MAP = "no map is mounted; put a map bundle into the maps folder, or ask again when the operator has done so"
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """A bundle that lies in a maps folder and is not mounted.
+    """A bundle in a maps folder that is not mounted.
 
     Attributes:
-        bundle: the folder's own name.
-        reason: for people; names no folder but the bundle's.
+        bundle: name of its folder.
+        reason: readable text; it names no folder outside the bundle.
     """
 
     bundle: str
@@ -35,7 +35,7 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class _Map:
-    """Versions of one name, the newest first, and the one that serves."""
+    """Localizers of one map, the newest version first, and the one that serves."""
 
     versions: tuple[Localizer, ...]
     serving: Localizer
@@ -43,25 +43,30 @@ class _Map:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """A state of the serving table with the localizers of this process."""
+    """One state of the serving table, with the localizers of this process."""
 
     table: Table
     maps: Mapping[str, _Map]
 
 
 class MapRegistry:
-    """Open maps. What may be asked, and which version serves, says the serving table, which all workers of a service share.
+    """Open maps. The serving table, shared by all workers of a service, decides which versions are mounted and which one serves.
 
-    Reading takes no lock: what is mounted is one value that a change replaces whole. A request keeps the localizer that it got; a
-    version that was taken out lives as long as a request has it.
+    Reading takes no lock, because a change replaces the whole view. A request keeps its localizer. A version that was removed stays
+    in memory until no request uses it.
 
     Args:
-        localizers: to mount at once.
-        provider: what runs the encoders of maps that are opened later.
-        table: None makes one for this process alone.
+        localizers: mounted at once.
+        provider: ONNX Runtime provider for the encoders of maps that are opened later.
+        table: serving table; None creates one for this process alone.
 
     Attributes:
-        refused: bundles that are not mounted, as this process found them.
+        provider: as given.
+        table: as given or created.
+        refused: bundles that this process could not mount.
+
+    Raises:
+        BundleError: two localizers have the same version of a map.
     """
 
     def __init__(
@@ -85,12 +90,12 @@ class MapRegistry:
         """Open and verify every bundle, or fail.
 
         Args:
-            paths: bundles, or folders that hold some.
-            provider: what runs their encoders.
+            paths: bundles, or folders of bundles.
+            provider: ONNX Runtime provider for their encoders.
 
         Raises:
             EncoderError: the provider is not installed.
-            BundleError: one is missing, damaged or mismatched, two are the same version of a map, or there is none at all.
+            BundleError: a bundle is missing, damaged or mismatched; two are the same version of a map; or there is no bundle.
         """
         bundles = [bundle for path in paths for bundle in bundle_paths(path)]
         if not bundles:
@@ -104,7 +109,7 @@ class MapRegistry:
         return len(self._maps())
 
     def __iter__(self) -> Iterator[Localizer]:
-        """The version that serves of each map."""
+        """Iterate over the serving version of each map."""
         return iter([each.serving for each in self._maps().values()])
 
     @property
@@ -113,11 +118,14 @@ class MapRegistry:
         return bool(self._open)
 
     def get(self, name: str | None) -> Localizer:
-        """The map of a name, or one version of it as ``name@version``; without a name, the only one.
+        """Return the localizer of a map.
+
+        Args:
+            name: of the map, or ``name@version`` for one version. None takes the only mounted map.
 
         Raises:
-            NotReadyError: no map is mounted at all.
-            UnknownMapError: no map has that name, or none is named and there are several.
+            NotReadyError: no map is mounted.
+            UnknownMapError: no map has that name, or the name is None and several maps are mounted.
         """
         maps = self._maps()
         if not maps:
@@ -138,14 +146,22 @@ class MapRegistry:
         raise UnknownMapError(f"{what}; mounted: {mounted}", field="map")
 
     def versions(self, name: str) -> tuple[Localizer, ...]:
-        """Every mounted version of a map, the newest first; none of an unknown one."""
+        """Return every mounted version of a map, the newest first; empty for an unknown map.
+
+        Args:
+            name: of the map.
+        """
         known = self._maps().get(name)
         return () if known is None else known.versions
 
     def mount(self, localizer: Localizer) -> None:
-        """Add a version, in place of the same one. It is mounted once every worker has it, and serves if no mounted version is newer.
+        """Add a version, or replace the same version.
 
-        Of more than ``MOST_VERSIONS`` the oldest that does not serve is dropped.
+        It is mounted once every worker has it, and serves if no mounted version is newer. Beyond ``MOST_VERSIONS`` the oldest version
+        that does not serve is dropped.
+
+        Args:
+            localizer: of the version.
         """
         version = version_of(localizer.bundle.manifest)
         with self._changing:
@@ -154,15 +170,28 @@ class MapRegistry:
             self._renew()
 
     def join(self, given_up: Collection[Key] = ()) -> frozenset[MapVersion]:
-        """Agree with the other workers, as ``ServingTable.join`` says: mounted versions that must be opened, or given up, first."""
+        """Join the other workers, see ``ServingTable.join``.
+
+        Args:
+            given_up: mounted versions that this worker failed to open.
+
+        Returns:
+            Mounted versions that this worker must first open or give up; empty if it has joined.
+        """
         with self._changing:
             lacking = self.table.join([version_of(each.bundle.manifest) for each in self._open.values()], given_up)
             self._renew()
             return lacking
 
     def wants(self, version: MapVersion) -> bool:
-        """Whether a version should be opened here: it is mounted, or would be if every worker had it, and is not open yet."""
-        self._maps()  # lets go of what was taken out meanwhile
+        """Return whether this process should open a version.
+
+        That holds if the version is not open here yet, and is mounted or would be mounted once every worker had it.
+
+        Args:
+            version: of a bundle in a maps folder.
+        """
+        self._maps()  # releases versions that were removed meanwhile
         if (known := self._open.get(version.key)) is not None and _made_at(known.bundle.manifest) >= version.made_at:
             return False
         table = self.table.read()
@@ -172,7 +201,11 @@ class MapRegistry:
         return table.wants(version, mine)
 
     def serve(self, name: str, version: str) -> Localizer:
-        """Let another mounted version of a map serve, in all workers: roll back, or forward again.
+        """Select the serving version of a map in all workers, to roll back or forward.
+
+        Args:
+            name: of the map.
+            version: a mounted version.
 
         Raises:
             UnknownMapError: no such map or version is mounted.
@@ -181,7 +214,12 @@ class MapRegistry:
         return self.get(f"{name}@{version}")
 
     def unmount(self, name: str, version: str) -> None:
-        """Take a version out of all workers; if it served, the newest of the others does. Nothing happens if it is not there."""
+        """Unmount a version in all workers. If it served, the newest remaining version serves.
+
+        Args:
+            name: of the map; an unknown one is ignored.
+            version: of the map; an unknown one is ignored.
+        """
         self.table.remove([(name, version)])
 
     def _maps(self) -> Mapping[str, _Map]:
@@ -191,7 +229,10 @@ class MapRegistry:
         return self._view.maps
 
     def _renew(self) -> None:
-        """Make the view that of the table, and let go of what is neither mounted nor offered; the caller holds the lock."""
+        """Update the view from the table and release versions that are neither mounted nor offered.
+
+        The caller must hold the lock.
+        """
         table = self.table.read()
         offers = table.offers.get(self.table.number)
         if offers is not None:
@@ -202,18 +243,28 @@ class MapRegistry:
             versions = {each.version: self._open[each.key] for each in known.versions if each.key in self._open}
             if known.serving in versions:
                 maps[name] = _Map(tuple(versions.values()), versions[known.serving])
-            elif offers is not None:  # a worker joins only when it has all of them
+            elif offers is not None:  # must not happen: a worker joins only when it has all of them
                 _log.error("map_lacking name=%s version=%s", name, known.serving)
         self._view = _View(table, maps)
 
 
 def version_of(manifest: Manifest) -> MapVersion:
-    """What the serving table knows of a bundle."""
+    """Return the entry of a bundle in the serving table.
+
+    Args:
+        manifest: of the bundle.
+    """
     return MapVersion(manifest.name, manifest.version, _made_at(manifest))
 
 
 def twin_error(path: Path, other: Path, manifest: Manifest) -> BundleError:
-    """Two bundles are the same version of a map."""
+    """Build the error for two bundles with the same version of a map.
+
+    Args:
+        path: of one bundle.
+        other: path of the other bundle.
+        manifest: of either.
+    """
     return BundleError(
         f"{path} and {other} are both version {manifest.version} of {manifest.name!r}: mount one of them"
     )
@@ -224,12 +275,15 @@ def _made_at(manifest: Manifest) -> float:
 
 
 def bundle_paths(path: Path) -> list[Path]:
-    """A bundle itself, or the bundles right inside a folder; none of a folder of maps that is empty as yet.
+    """Return the path itself if it is a bundle, else the bundles directly inside the folder; empty for an empty folder.
 
-    Hidden folders, which are half written, and folders without a manifest are passed over.
+    Hidden folders, which are incomplete, and folders without a manifest are ignored.
+
+    Args:
+        path: a bundle, or a folder of bundles.
 
     Raises:
-        BundleError: the folder is not there or cannot be read, or holds files but no manifest, as a bundle that was copied in part does.
+        BundleError: the folder is missing or cannot be read; or it holds files but no manifest, as a partly copied bundle does.
     """
     if _has_manifest(path):
         return [path]
@@ -252,5 +306,5 @@ _NO_MANIFEST = f"there is no {MANIFEST_FILE} in it: it is no map bundle, or its 
 def _has_manifest(folder: Path) -> bool:
     try:
         return (folder / MANIFEST_FILE).exists()
-    except OSError:  # as lost+found of a fresh volume, which nobody but root may look into
+    except OSError:  # such as lost+found of a new volume, which only root may read
         return False

@@ -1,4 +1,4 @@
-"""Sees new bundles in the maps folders, opens and warms them, and only then lets them serve; at start and as long as the service runs."""
+"""Watch the maps folders, at the start and while the service runs. A new bundle is opened and warmed up before it serves."""
 
 import logging
 import os
@@ -17,18 +17,18 @@ from service.runtime.serving_table import Key, MapVersion
 from service.runtime.wakeup import Wakeup
 
 _log = logging.getLogger("streetfix.maps")
-#: Name, size and time of every file: what tells one content of a folder from another without reading it.
+#: Name, size and mtime of every file. A change reveals new content of a folder without reading the files.
 Stamp = tuple[tuple[str, int, int], ...]
-#: How often a worker looks whether other workers have found something, in seconds; it costs the comparison of two numbers.
+#: Seconds between two checks for news of other workers. A check compares two numbers.
 _POLL_S = 0.25
-#: How often a worker that cannot open what serves in the others looks again, in seconds; and after how many times it tries files that
-#: have not changed.
+#: For a worker that cannot open a version that serves in the others: seconds between two attempts, and the number of attempts after
+#: which it also tries unchanged files again.
 _RETRY_S, _ROUNDS_UNTIL_ANEW = 1.0, 30
 
 
 @dataclass(frozen=True, slots=True)
 class _Bundle:
-    """A bundle in a maps folder; its manifest was read, no other file."""
+    """A bundle in a maps folder. Only its manifest was read."""
 
     path: Path
     stamp: Stamp
@@ -40,13 +40,13 @@ class _Bundle:
 
 
 class MapWatcher:
-    """Looks at folders every so often, at once when it is told to, and when another worker has found something.
+    """Scans the maps folders periodically, on request, and when another worker has found something.
 
     Args:
         registry: where bundles are mounted.
-        paths: bundles, or folders that hold some, as the service was started with.
-        warm: called with every new map before it serves, so that its first request is no slower than the next. What it raises says why
-            the map cannot serve.
+        paths: bundles, or folders of bundles, with which the service was started.
+        warm: called with every new map before it serves, so that its first request is as fast as the next. If it raises, the map is
+            refused for this reason.
     """
 
     def __init__(self, registry: MapRegistry, paths: Sequence[Path], *, warm: Callable[[Localizer], None]) -> None:
@@ -57,19 +57,20 @@ class MapWatcher:
         self._thread: threading.Thread | None = None
         self._manifests: dict[Path, tuple[Stamp, Manifest]] = {}
         self._failed: dict[Path, tuple[Stamp, StreetfixError]] = {}
-        self._due: set[Key] = set()  # versions that are to be taken out
+        self._due: set[Key] = set()  # versions to unmount
 
     def open_first(self, *, strict: bool = False, wait: Callable[[float], object] = time.sleep) -> None:
-        """Mount what the folders hold when the service starts; what cannot be opened is in ``MapRegistry.refused``.
+        """Mount the bundles of the folders when the service starts. ``MapRegistry.refused`` lists those that cannot be opened.
 
-        A worker that joins others opens what is mounted there. It returns when it has all that serves.
+        A worker that joins others opens the versions that are mounted there. It returns when it has every serving version.
 
         Args:
             strict: fail if any bundle cannot be mounted, or if there is none.
-            wait: called with seconds.
+            wait: called with the seconds to wait.
 
         Raises:
-            StreetfixError: there are bundles, but none can be mounted; or as ``strict`` says. A worker that joins others never fails so.
+            StreetfixError: there are bundles, but none can be mounted; or ``strict`` is not met. A worker that joins others never
+                fails so.
         """
         table = self._registry.table
         if not (table.is_shared and table.read().started):
@@ -79,7 +80,7 @@ class MapWatcher:
         while lacking := self._registry.join():
             if (
                 rounds % _ROUNDS_UNTIL_ANEW == 0
-            ):  # to read a damaged map again and again would take time from those who answer
+            ):  # reading a damaged map at every attempt would take time from the answering workers
                 self._failed.clear()
             given_up = self._open_lacking(lacking)
             if not self._registry.join(given_up):
@@ -91,13 +92,16 @@ class MapWatcher:
             wait(_RETRY_S)
 
     def scan(self, *, drop_missing: bool = False) -> list[str]:
-        """Mount what is new; what happened, for people.
+        """Mount new bundles.
 
-        Of each map the newest bundles are opened first, and none that would not stay mounted.
+        The newest bundles of each map are opened first. A bundle that would not stay mounted is not opened.
 
         Args:
-            drop_missing: take out versions whose folder is gone, and try again what was refused. Otherwise they stay, since a folder
-                that is being replaced is missing for a moment.
+            drop_missing: unmount versions whose folder is gone, and retry refused bundles. Otherwise such versions stay, because a
+                folder is missing for a moment while it is replaced.
+
+        Returns:
+            What happened, one readable line per event.
         """
         if drop_missing:
             self._failed.clear()
@@ -106,17 +110,21 @@ class MapWatcher:
             self._due = self._missing()
         told = self._mount_new(bundles)
         if dropped := self._drop():
-            told += dropped + self._mount_new(bundles)  # older versions may have found room
+            told += dropped + self._mount_new(bundles)  # older versions may fit now
         self._tell_refused()
         return told
 
     def start(self, interval_s: float) -> None:
-        """Look every so many seconds, in a thread of its own."""
+        """Start a thread that scans the folders.
+
+        Args:
+            interval_s: seconds between two scans.
+        """
         self._thread = threading.Thread(target=self._run, args=(interval_s,), name="streetfix-maps", daemon=True)
         self._thread.start()
 
     def look_now(self) -> None:
-        """Look at once, and take out what is missing; safe to call from a signal handler."""
+        """Request a scan that also unmounts missing versions. Safe to call from a signal handler."""
         self._told.set()
 
     def stop(self) -> None:
@@ -124,11 +132,11 @@ class MapWatcher:
         self._stop.set()
         self._told.set()
         if self._thread is not None:
-            self._thread.join(timeout=5.0)  # a map that is being opened must not keep the service from leaving
+            self._thread.join(timeout=5.0)  # the service must not wait for a map that is being opened
 
     def _run(self, interval_s: float) -> None:
         table = self._registry.table
-        # A worker that joined others has opened what serves; what is new beside it comes now.
+        # A worker that joined others has opened only the mounted versions, so it scans for new ones at once.
         next_look, seen = time.monotonic() + (0.0 if table.is_shared else interval_s), table.read()
         while True:
             patience_s = min(max(0.0, next_look - time.monotonic()), threading.TIMEOUT_MAX)
@@ -146,12 +154,15 @@ class MapWatcher:
                     self.scan(drop_missing=told)
                     next_look = time.monotonic() + interval_s
                 if table.is_shared and any(seen.offers.values()):
-                    table.settle()  # a worker that all wait for may have ended
-            except Exception:  # a defect here must not end the watching, nor the service
+                    table.settle()  # a worker that the others wait for may have ended
+            except Exception:  # a defect must not end this thread or the service
                 _log.exception("map_scan_failed")
 
     def _forget_failures_of(self, versions: Iterable[MapVersion]) -> None:
-        """Try again what failed here alone: the others wait for this worker, and the cause may have passed (memory, a network disk)."""
+        """Forget failures of versions that other workers have open.
+
+        The others wait for this worker, and the cause may have passed (memory, a network disk).
+        """
         keys = {each.key for each in versions}
         for path in [path for path in self._failed if path in self._manifests]:
             if manifest_key(self._manifests[path][1]) in keys:
@@ -166,7 +177,7 @@ class MapWatcher:
             name, version = each.version.key
             if (error := self._mount(each)) is None:
                 told.append(f"mounted {name} {version}")
-                # At start the command line says what serves; later only the log does.
+                # At the start the command line prints the serving maps. Later only the log reports them.
                 level = logging.INFO if self._thread is None else logging.WARNING
                 _log.log(level, "map_mounted name=%s version=%s", name, version)
             else:
@@ -174,14 +185,14 @@ class MapWatcher:
         return told
 
     def _mount(self, bundle: _Bundle) -> StreetfixError | None:
-        """Open, warm and mount a bundle; or say why not."""
+        """Open, warm up and mount a bundle; return the error if that fails."""
         try:
             localizer = Localizer.open(MapBundle.open(bundle.path), provider=self._registry.provider)
             self._warm(localizer)
             self._registry.mount(localizer)
         except StreetfixError as error:
             return self._refuse(bundle.path, bundle.stamp, error)
-        except Exception as error:  # whatever it is, this bundle does not serve, and the others are looked at
+        except Exception as error:  # any defect refuses only this bundle; the others are still processed
             _log.exception("map_failed path=%s", bundle.path)
             what = f"{bundle.path}: it cannot be opened ({type(error).__name__}); the service's log says more"
             return self._refuse(bundle.path, bundle.stamp, BundleError(what))
@@ -189,7 +200,7 @@ class MapWatcher:
         return None
 
     def _open_lacking(self, lacking: Iterable[MapVersion]) -> frozenset[Key]:
-        """Open versions that are mounted in other workers; those that cannot be opened."""
+        """Open versions that are mounted in other workers; return those that cannot be opened."""
         wanted = {each.key for each in lacking}
         for each in self._bundles():
             key = each.version.key
@@ -199,7 +210,7 @@ class MapWatcher:
         return frozenset(wanted)
 
     def _bundles(self) -> list[_Bundle]:
-        """The bundles that lie in the folders now."""
+        """Return the bundles that are in the folders now."""
         found = []
         present = self._present()
         self._manifests = {path: known for path, known in self._manifests.items() if path in present}
@@ -211,7 +222,7 @@ class MapWatcher:
             if known is None or known[0] != stamp:
                 try:
                     known = self._manifests[path] = stamp, read_manifest(path)
-                except StreetfixError as error:  # what was known of the folder before holds on
+                except StreetfixError as error:  # the earlier manifest of this folder stays valid
                     if not self._is_refused(path, stamp):
                         self._refuse(path, stamp, error)
                     continue
@@ -233,7 +244,10 @@ class MapWatcher:
         return found
 
     def _missing(self) -> set[Key]:
-        """Mounted versions whose folder is gone. One that was replaced in its folder is not: it can be rolled back to."""
+        """Return mounted versions whose folder is gone.
+
+        A version that was replaced inside its folder does not count, so that an operator can roll back to it.
+        """
         present = set(self._present())
         held = {manifest_key(manifest) for path, (_, manifest) in self._manifests.items() if path in present}
         unread = [path for path, (_, error) in self._failed.items() if _is_unreadable(error)]
@@ -244,7 +258,10 @@ class MapWatcher:
         }  # fmt: skip
 
     def _drop(self) -> list[str]:
-        """Take out what is due and still missing. What serves stays until other workers have what is to serve instead."""
+        """Unmount the due versions that are still missing.
+
+        A serving version stays until the other workers have its successor.
+        """
         if not self._due:
             return []
         self._due &= self._missing()
@@ -255,14 +272,14 @@ class MapWatcher:
             if offers and (not left or max(offers) > max(left)):
                 waits.add((name, known.serving))
         gone, self._due = self._due - waits, self._due & waits
-        # In one change: the next one to serve must not be one that is gone as well.
+        # In one change, so that the next serving version is not one that is gone as well.
         self._registry.table.remove(gone)
         for name, version in sorted(gone):
             _log.warning("map_unmounted name=%s version=%s", name, version)
         return [f"unmounted {name} {version}" for name, version in sorted(gone)]
 
     def _require(self, *, strict: bool) -> None:
-        """Raise what keeps the service from its first start."""
+        """Raise the error that prevents the first start, if any."""
         errors = [error for _, error in self._failed.values()]
         if errors and (strict or not self._registry.has_open):
             raise errors[0]
@@ -287,7 +304,10 @@ class MapWatcher:
         return error
 
     def _tell_refused(self) -> None:
-        """Let the faces say what is refused: by the folder's own name, as a probe needs no key."""
+        """Publish the refused bundles to the request handlers.
+
+        Only the name of the folder is shown, because a health probe needs no key.
+        """
         self._registry.refused = tuple(
             Refused(path.name or str(path), error.message.replace(f"{path.parent}{os.sep}", ""))
             for path, (_, error) in sorted(self._failed.items())
@@ -295,24 +315,32 @@ class MapWatcher:
 
 
 def manifest_key(manifest: Manifest) -> Key:
-    """What requests call it."""
+    """Return the name and version by which requests address a bundle.
+
+    Args:
+        manifest: of the bundle.
+    """
     return manifest.name, manifest.version
 
 
 def _is_unreadable(error: StreetfixError) -> bool:
-    """Whether a folder is there and cannot be read: nothing can be said of what lies in it."""
+    """Whether a folder exists but cannot be read, so that its content is unknown."""
     cause = error.__cause__
     return isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError | NotADirectoryError)
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Of a bundle's folder as it is now."""
+    """Return the stamp of a bundle folder as it is now.
+
+    Args:
+        path: of the folder.
+    """
     files = []
-    # os.walk passes over folders that vanish under it, as those of a bundle that is being removed do.
+    # os.walk ignores folders that vanish meanwhile, such as those of a bundle that is being removed.
     for file in (Path(folder) / name for folder, _, names in os.walk(path) for name in names):
         try:
             status = file.stat()
-        except OSError:  # being replaced
+        except OSError:  # the file is being replaced
             continue
         files.append((file.relative_to(path).as_posix(), status.st_size, status.st_mtime_ns))
     return tuple(sorted(files))

@@ -1,7 +1,7 @@
-"""One budget of bytes for all that requests bring: bodies, messages and pictures, of both faces.
+"""One memory budget for the bodies, messages and images of all requests, REST and gRPC.
 
-What a request will take is reserved before it is allocated. What does not fit is refused at once, so that a flood of large requests
-ends in refusals and not in a killed container.
+A request reserves its memory before it allocates. A request that does not fit is refused at once. So a flood of large requests causes
+refusals and not a killed container.
 """
 
 import os
@@ -22,41 +22,41 @@ if TYPE_CHECKING:
     from service.runtime.settings import Settings
 
 MIB = 2**20
-#: What a process takes without requests: packages, encoder, tables of a map; more where it is measured to be more.
+#: Minimum memory of a process without requests: packages, encoder, tables of a map. A larger measured value replaces it.
 PROCESS_BYTES = 192 * MIB
-#: What a thread takes to answer, besides the pictures: descriptors, points, candidates. Measured: 7 MiB, a stock map's 20.
+#: Memory of a thread for one answer, besides the images: descriptors, points, candidates. Measured: 7 MiB; 20 MiB for a stock map.
 THREAD_BYTES = 32 * MIB
-#: Share of the limit that stays free: fragmentation, sockets, connections, versions of maps that come.
+#: Share of the limit that stays free, for fragmentation, sockets, connections and further map versions.
 SPARE_SHARE = 0.125
-#: Pages of maps can be read again from their files, but an answer that has to do so is slow: so much of the limit stays for them, also
-#: where the maps come later.
+#: Share of the limit for pages of maps, also if the maps are mounted later. The system can read such pages again from the files, but
+#: this makes an answer slow.
 MAPS_SHARE = 0.25
-#: Largest messages that gRPC holds beside the budget: 2.2 copies while its one thread takes a message over from C, those of health
-#: and reflection, which must be answered when the budget is spent, and those that are parsed.
+#: Messages of the largest size that gRPC holds outside the budget. ``GRPC_PARSED`` are being parsed. ``GRPC_OTHERS`` belong to health and
+#: reflection, which must be answered even if the budget is spent. ``GRPC_COPIES`` exist while its one thread copies a message from C.
 GRPC_PARSED, GRPC_OTHERS = 2, 2
 GRPC_COPIES = 2.2
-#: Share of the memory for messages that are being read, whose sizes nobody knows yet.
+#: Share of the memory for messages that are being read. Their sizes are not known yet.
 GRPC_READING_SHARE = 0.25
-#: Below this the service would refuse what robots usually send.
+#: Minimum budget. Below this the service would refuse common requests of robots.
 LEAST_BYTES = 64 * MIB
 
-#: Bytes that decoding takes at its peak for each pixel, measured over all formats: colour (a progressive JPEG or a PNG of 16 bits),
-#: depth, and depth that is stored as range or by CARLA.
+#: Peak bytes per pixel while decoding, measured over all formats: RGB (progressive JPEG or 16-bit PNG), depth, and depth that is
+#: stored as range or in the CARLA encoding.
 RGB_PEAK, DEPTH_PEAK, DEPTH_PEAK_CONVERTED = 11, 17, 30
-#: Bytes that stay for each pixel of depth while its request lasts: the picture, and what registration makes of it for a while.
+#: Bytes per depth pixel during the rest of the request: the image and temporary data of registration.
 DEPTH_KEPT = 8
-#: What an explanation takes for each pixel of depth beside that.
+#: Additional bytes per depth pixel for an explanation.
 EXPLAIN_PEAK = 14
 
 _UNLIMITED = 2**60
 
 
 class MemoryBudget:
-    """Bytes that requests may hold together; safe to use from all threads.
+    """Bytes that all requests together may hold. It is thread-safe.
 
     Args:
         limit: bytes.
-        messages: of the largest size that gRPC may read at once, outside of the limit.
+        messages: number of gRPC messages of the largest size that may be read at once, outside the limit.
     """
 
     def __init__(self, limit: int, messages: int = 0) -> None:
@@ -64,29 +64,37 @@ class MemoryBudget:
         self.messages = messages
         self._lock = threading.Lock()
         self._held = 0
-        # Pictures give back where the interpreter drops them, which may be inside of this lock: that only appends here.
+        # Finalizers of images may run while this thread holds the lock. So they only append here and never take the lock.
         self._returned: deque[int] = deque()
         self._told: Callable[[float], None] = lambda _: None
         self._trimmer = Trimmer()
 
     @property
     def held(self) -> int:
-        """Bytes that are reserved now."""
+        """Number of bytes that are reserved now."""
         with self._lock:
             self._take_back()
             return self._held
 
     def watch(self, told: Callable[[float], None]) -> None:
-        """Tell the bytes that are reserved whenever somebody reserves or gives back."""
+        """Report the reserved bytes now and after every change.
+
+        Args:
+            told: called with the number of bytes.
+        """
         self._told = told
         told(self.held)
 
     def hold(self) -> "Hold":
-        """A reservation of nothing, that grows."""
+        """Create an empty reservation that can grow."""
         return Hold(self)
 
     def reserve(self, count: int) -> bool:
-        """Whether there was room for so many bytes more, which are reserved then."""
+        """Reserve bytes if they fit; return whether they did.
+
+        Args:
+            count: bytes.
+        """
         with self._lock:
             self._take_back()
             if self._held + count > self.limit:
@@ -96,7 +104,11 @@ class MemoryBudget:
             return True
 
     def give_back(self, count: int) -> None:
-        """Give back so many bytes."""
+        """Release reserved bytes.
+
+        Args:
+            count: bytes.
+        """
         with self._lock:
             self._take_back()
             self._held -= count
@@ -104,12 +116,20 @@ class MemoryBudget:
         self.freed(count)
 
     def freed(self, count: int) -> None:
-        """Take note of memory that was freed, so that the system gets it back."""
+        """Return freed memory to the system if it is large.
+
+        Args:
+            count: bytes that were freed.
+        """
         if count >= LARGE_BYTES:
             self._trimmer.soon()
 
     def give_back_later(self, count: int) -> None:
-        """Give back so many bytes, from wherever the interpreter drops an object."""
+        """Release reserved bytes at the next access to the budget. Safe to call from a finalizer, because it takes no lock.
+
+        Args:
+            count: bytes.
+        """
         self._returned.append(count)
 
     def _take_back(self) -> None:
@@ -118,30 +138,42 @@ class MemoryBudget:
 
 
 class Hold:
-    """Bytes that one request holds; inside ``with`` until its end, or until the work on it ends that its caller did not wait for."""
+    """Bytes that one request holds.
+
+    Use it as a context manager. The bytes are released when the context and all work that was passed to ``until`` have ended.
+
+    Args:
+        budget: in which the bytes are reserved.
+
+    Attributes:
+        bytes: reserved now.
+    """
 
     def __init__(self, budget: MemoryBudget) -> None:
         self._budget = budget
         self._lock = threading.Lock()
-        self._users = 1  # the request itself, and the work on it
+        self._users = 1  # the request itself, and the work for it
         self.bytes = 0
 
     def __enter__(self) -> Self:
-        """Nothing is reserved yet."""
+        """Return the hold; nothing is reserved yet."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Give back what is held, when all work is over."""
+        """Release the bytes once all work is over."""
         self._one_less()
 
     def grow(self, count: int) -> None:
-        """Reserve so many bytes more, before they are allocated.
+        """Reserve more bytes before they are allocated.
+
+        Args:
+            count: additional bytes.
 
         Raises:
-            TooLargeError: the request alone needs more than there is for all.
-            BusyError: others hold too much now.
+            TooLargeError: the request alone exceeds the budget.
+            BusyError: other requests hold too much now.
         """
         if self._budget.reserve(count):
             self.bytes += count
@@ -157,19 +189,31 @@ class Hold:
         )
 
     def shrink_to(self, count: int) -> None:
-        """Give back what is held beyond so many bytes."""
+        """Release the bytes above a count.
+
+        Args:
+            count: bytes to keep.
+        """
         if count < self.bytes:
             self._budget.give_back(self.bytes - count)
             self.bytes = count
 
     def until(self, work: "Future[Any]") -> None:
-        """Keep what is held at least until some work is over, also where its caller has gone meanwhile."""
+        """Keep the bytes at least until some work is over, even if the caller disconnects.
+
+        Args:
+            work: future of the work.
+        """
         with self._lock:
             self._users += 1
         work.add_done_callback(lambda _: self._one_less())
 
     def leave_with(self, owner: Any) -> None:
-        """Leave what is held to an object: it is given back when that is no more."""
+        """Transfer the bytes to an object. They are released when the object is deleted.
+
+        Args:
+            owner: any object that supports weak references.
+        """
         if self.bytes:
             weakref.finalize(owner, self._budget.give_back_later, self.bytes).atexit = False
         self.bytes = 0
@@ -183,14 +227,14 @@ class Hold:
 
 
 def budget_of(settings: "Settings", *, threads: int) -> MemoryBudget:
-    """The budget of one process: as set, else what the machine's or container's limit leaves.
+    """Compute the budget of one process: from the setting, else from the memory limit of the machine or container.
 
     Args:
         settings: of the service.
-        threads: that answer in a process.
+        threads: worker threads per process.
 
     Raises:
-        RequestError: too little is left for requests.
+        RequestError: too little memory is left for requests.
     """
     message, body = settings.limits.message_bytes, settings.limits.max_request_bytes
     if settings.request_memory_mib is None:
@@ -217,20 +261,25 @@ def budget_of(settings: "Settings", *, threads: int) -> MemoryBudget:
 
 
 def memory_limit(cgroups: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> int:
-    """Bytes that this process and its like may take: the least of the control groups' limits (version 2 and 1) and the machine's memory."""
+    """Return the memory limit in bytes: the lowest of the control group limits and the memory of the machine.
+
+    Args:
+        cgroups: folder of the control groups, version 2 and 1.
+        own: file that lists the groups of this process.
+    """
     found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     for folder, name in _group_folders(cgroups, own):
         try:
             words = (folder / name).read_text().split()
             if words and words[0] != "max" and 0 < int(words[0]) < _UNLIMITED:
                 found.append(int(words[0]))
-        except (OSError, ValueError):  # another version, a group that is not seen from here, or none at all
+        except (OSError, ValueError):  # the other version, a group outside this namespace, or no control groups
             continue
     return min(found)
 
 
 def _group_folders(cgroups: Path, own: Path) -> list[tuple[Path, str]]:
-    """Folders of this process' groups up to their roots, with the name of the file that limits memory there."""
+    """Folders of this process's groups up to their roots, each with the name of its memory limit file."""
     roots = {
         ("", cgroups): "memory.max",
         ("", cgroups / "unified"): "memory.max",
@@ -253,7 +302,11 @@ def _group_folders(cgroups: Path, own: Path) -> list[tuple[Path, str]]:
 
 
 def anonymous_bytes(status: Path = Path("/proc/self/status")) -> int:
-    """Memory of this process that is no file's; 0 where the system does not tell."""
+    """Return the anonymous resident memory of this process in bytes; 0 if the system does not report it.
+
+    Args:
+        status: status file of the process.
+    """
     try:
         found = re.search(r"^RssAnon:\s+(\d+) kB", status.read_text(), re.MULTILINE)
     except OSError:

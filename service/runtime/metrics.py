@@ -1,4 +1,4 @@
-"""What an operator watches, for Prometheus; nothing of a request but its figures."""
+"""Prometheus metrics of the service. They hold figures of requests, never their content."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -29,14 +29,15 @@ _STAGES = ("decode", "fuse", "encode", "search", "register")
 
 
 class Metrics:
-    """Counters and histograms with a registry of their own: of one process, or of all workers of a service together.
+    """Counters, gauges and histograms in their own registry.
 
-    Which of the two is Prometheus' client library's own setting, an environment variable that `serve --workers` sets.
+    They count for one process, or for all workers of a service together. The environment variable
+    ``PROMETHEUS_MULTIPROC_DIR`` of the Prometheus client library decides; ``serve --workers`` sets it.
 
     Args:
-        admission: whose queue is watched.
-        maps: whose versions are named.
-        memory: whose reservations are watched.
+        admission: its queue is measured.
+        maps: its map versions are reported.
+        memory: its reservations are measured.
     """
 
     def __init__(self, admission: Admission, maps: MapRegistry, memory: MemoryBudget) -> None:
@@ -89,11 +90,17 @@ class Metrics:
         )
 
     def _gauge(self, name: str, what: str) -> Gauge:
-        """Of several processes the sum over those that live."""
+        """Add a gauge. With several processes its value is the sum over the living ones."""
         return Gauge(name, what, registry=self._registry, multiprocess_mode="livesum")
 
     def answered(self, answer: Answer, bundle: MapBundle, *, frames: int) -> None:
-        """Count an answer and its stages."""
+        """Count an answer and its stages.
+
+        Args:
+            answer: to count.
+            bundle: map that answered.
+            frames: number of image pairs that the answer uses.
+        """
         self._answers.labels(bundle.name, answer.status).inc()
         self._frames.observe(frames)
         if answer.confidence is not None:
@@ -102,24 +109,28 @@ class Metrics:
             self._stage_seconds.labels(stage).observe(_milliseconds(answer.timings, stage) / 1e3)
 
     def batched(self, requests: int) -> None:
-        """Count a batch of so many requests."""
+        """Count a batch.
+
+        Args:
+            requests: number of requests in the batch.
+        """
         self._batches.observe(requests)
 
     def requested(self, face: str, method: str, code: str, seconds: float | None) -> None:
         """Count a request.
 
         Args:
-            face: rest or grpc.
-            method: operation or call, one of a few.
-            code: status, or the code of a problem.
-            seconds: that it took; None where that says nothing, as of a stream's life.
+            face: request handler, ``rest`` or ``grpc``.
+            method: operation or call, from a small fixed set.
+            code: status code, or the code of a problem.
+            seconds: duration; None for a long-lived stream, whose duration has no meaning.
         """
         self._requests.labels(face, method, code).inc()
         if seconds is not None:
             self._request_seconds.labels(face, method).observe(seconds)
 
     def text(self) -> bytes:
-        """In Prometheus' text format."""
+        """Return all metrics in the Prometheus text format."""
         if not self._is_one_of_several:
             return generate_latest(self._registry)
         together = CollectorRegistry()
@@ -130,7 +141,7 @@ class Metrics:
 
 
 class _Processes(Collector):
-    """Processor time, memory and open files of all workers together; pages that they share are counted by each."""
+    """Processor time, memory and open files, summed over all workers. Every worker counts the pages that they share."""
 
     _SUMMED = (
         "process_cpu_seconds",
@@ -140,10 +151,10 @@ class _Processes(Collector):
     )
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder  # the client library keeps a file there for each worker that lives
+        self._folder = folder  # the client library keeps one file per living worker there
 
     def collect(self) -> Iterator[Metric]:
-        """The sums, under the names that a single process has."""
+        """Yield the sums under the metric names of a single process."""
         pids = {path.stem.rpartition("_")[2] for path in self._folder.glob("gauge_livesum_*.db")}
         found: dict[str, list[Metric]] = {}
         for pid in pids:
@@ -163,13 +174,13 @@ class _Processes(Collector):
 
 
 class _Maps(Collector):
-    """What is mounted at the moment of asking."""
+    """Mounted maps and refused bundles at the time of the scrape."""
 
     def __init__(self, maps: MapRegistry) -> None:
         self._maps = maps
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        """The version that serves of each map, and what is not mounted."""
+        """Yield the serving version of each map and the bundles that are not mounted."""
         maps = GaugeMetricFamily(
             "streetfix_map", "Mounted maps; the value is their number of places.", labels=["map", "version"]
         )

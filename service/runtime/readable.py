@@ -1,4 +1,4 @@
-"""Says why a file that an operator mounted cannot be read: who asks, whose it is, and what to do."""
+"""Explain why the service cannot read a file: its own user, the owner of the file, and the remedy."""
 
 import os
 import stat
@@ -6,11 +6,13 @@ from pathlib import Path
 
 
 def why_unreadable(path: Path, error: OSError) -> str:
-    """The reason and, where permissions are it, both users and the remedy.
+    """Explain why a file cannot be read.
+
+    For a permission error the text names both users and the remedy. Otherwise it is the message of the system.
 
     Args:
         path: of the file.
-        error: what opening it raised.
+        error: raised when the file was opened.
     """
     if not isinstance(error, PermissionError) or not hasattr(os, "geteuid"):
         return error.strerror or str(error)

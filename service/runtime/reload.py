@@ -1,4 +1,4 @@
-"""Takes over files that an operator changed, such as rotated keys and certificates, while the service runs."""
+"""Reload files that an operator changed while the service runs, such as rotated keys and certificates."""
 
 import logging
 import threading
@@ -11,7 +11,8 @@ from service.runtime.wakeup import Wakeup
 
 _log = logging.getLogger("streetfix.reload")
 
-#: What tells one state of a file from another; its time of change covers permissions and mounted links.
+#: State of the files: inode, size, mtime and ctime of each, or None if it is missing. The ctime reveals changed permissions and mounted
+#: links.
 Signature = tuple[tuple[int, int, int, int] | None, ...]
 
 
@@ -24,7 +25,7 @@ class _Watched:
 
 
 class Reloader:
-    """Looks at files every so often, and at once when it is told to; what cannot be used is logged, and the old stays in force."""
+    """Checks files periodically and on request. If a new file is not usable, it logs the error and the old state stays in force."""
 
     def __init__(self) -> None:
         self._watched: list[_Watched] = []
@@ -37,21 +38,21 @@ class Reloader:
 
         Args:
             name: for the log.
-            paths: of the files; a link counts as what it leads to.
-            load: reads all of them and takes them over, or raises and changes nothing.
+            paths: of the files; links are followed.
+            load: reads all files and applies them, or raises and changes nothing.
 
         Raises:
-            StreetfixError: they cannot be used now.
+            StreetfixError: the files cannot be used now.
         """
-        seen = _signature(paths)  # before they are read: what changes meanwhile is seen at the next look
+        seen = _signature(paths)  # taken before reading, so the next check sees a change during the reading
         load()
         self._watched.append(_Watched(name, tuple(paths), load, seen))
 
     def look(self, *, everything: bool = False) -> None:
-        """Load what has changed since the last look.
+        """Load the files that have changed since the last check.
 
         Args:
-            everything: load what has not changed, too.
+            everything: load unchanged files too.
         """
         for each in self._watched:
             now = _signature(each.paths)
@@ -62,22 +63,22 @@ class Reloader:
                 each.load()
             except StreetfixError as error:
                 _log.error("reload_failed name=%s; the old stays in force: %s", each.name, error.message)
-            except Exception:  # a thread of ours must go on: the next change may be good again
+            except Exception:  # the thread must continue: the next change may be valid
                 _log.exception("reload_failed name=%s; the old stays in force", each.name)
             else:
                 _log.warning("reloaded name=%s", each.name)
 
     def start(self, every_s: float) -> None:
-        """Look from now on, in a thread.
+        """Start a thread that checks the files.
 
         Args:
-            every_s: seconds between two looks; 0 for never, only when told.
+            every_s: seconds between two checks; 0 checks only on request.
         """
         self._thread = threading.Thread(target=self._run, args=(every_s or None,), name="streetfix-reload", daemon=True)
         self._thread.start()
 
     def look_now(self) -> None:
-        """Load everything again, soon; safe to call from a signal handler."""
+        """Request that the thread loads all files again. Safe to call from a signal handler."""
         self._wake.set()
 
     def stop(self) -> None:
@@ -92,7 +93,7 @@ class Reloader:
             told = self._wake.wait(every_s)
             if self._stopping:
                 return
-            if told:  # a signal that comes after the wait has timed out is for the next look
+            if told:  # a signal after the timeout of the wait belongs to the next check
                 self._wake.clear()
             self.look(everything=told)
 

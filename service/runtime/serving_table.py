@@ -1,7 +1,7 @@
-"""The serving table: which versions of each map may be asked, and which of them serves. One fact for all workers of a service.
+"""The serving table: the mounted versions of each map, and the version that serves. All workers of a service share it.
 
 Every worker opens and warms a version on its own and then *offers* it. A version is *mounted*, for all workers in one change of
-the table, once every worker that answers has offered it. Every request looks at the table when it begins. So as soon as one
+the table, once every worker that answers has offered it. Every request reads the table when it begins. So as soon as one
 answer has named a new version, no later request is answered by the old one.
 
 Rules, for one worker and for many:
@@ -9,10 +9,11 @@ Rules, for one worker and for many:
 - A version that is newer than all mounted versions of its map serves as soon as it is mounted.
 - An operator may choose another mounted version. The choice holds until a newer version is mounted or the chosen one is removed; then
   the newest one serves.
-- ``MOST_VERSIONS`` of a map stay mounted; of more the oldest that does not serve is dropped.
-- A worker answers only after it has *joined*: it has opened every version that is mounted. A version that it cannot open, as
-  its folder is gone, is dropped for all workers if it does not serve. If it serves, the other workers keep it and this worker waits.
-- A worker that has ended has no say. After the last one has ended, the next worker takes over what it can open; a choice still holds.
+- At most ``MOST_VERSIONS`` of a map stay mounted. Beyond that the oldest version that does not serve is dropped.
+- A worker answers only after it has *joined*: it has opened every mounted version. It may be unable to open a version, for example
+  if the folder is gone. All workers drop such a version if it does not serve. If it serves, the others keep it and this worker waits.
+- A worker that has ended does not count. After the last one has ended, the next worker keeps the versions that it can open. A choice
+  of the operator still holds.
 """
 
 import fcntl
@@ -28,20 +29,22 @@ from typing import Any
 
 from service.errors import BundleError, UnknownMapError
 
-#: Versions of one map that stay open: the one that serves, and what may be rolled back to.
+#: Maximum number of open versions of one map: the serving one, and those that an operator may roll back to.
 MOST_VERSIONS = 3
-#: Most bytes of a table that is shared, as JSON: a map of three versions takes about 300.
+#: Maximum size of a shared table as JSON. A map with three versions takes about 300 bytes.
 _MOST_BYTES = 4 * 2**20
-#: Name and version: what a request addresses.
+#: Name and version of a map.
 Key = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class MapVersion:
-    """A version of a map. Copies of a bundle have one ``version``, the hash of its content, but may differ in ``made_at``.
+    """A version of a map. Copies of a bundle share ``version``, but may differ in ``made_at``.
 
     Attributes:
-        made_at: POSIX time; says which version is newer.
+        name: of the map.
+        version: hash of the content.
+        made_at: POSIX time; decides which version is newer.
     """
 
     name: str
@@ -56,7 +59,12 @@ class MapVersion:
 
 @dataclass(frozen=True, slots=True)
 class MountedMap:
-    """Versions of one map that may be asked, the newest first, and the one that answers if a request names none."""
+    """The mounted versions of one map.
+
+    Attributes:
+        versions: that requests may address, the newest first.
+        serving: version that answers if a request names none.
+    """
 
     versions: tuple[MapVersion, ...]
     serving: str
@@ -64,11 +72,12 @@ class MountedMap:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One state of the table; never changed, only replaced.
+    """One immutable state of the table.
 
     Attributes:
         maps: by name.
-        offers: by number of a worker that answers: versions that it has open and that are not mounted yet.
+        offers: versions that a worker has open and that are not mounted yet, by the number of the worker. Only workers that
+            have joined are in it.
         started: whether any worker has ever joined.
     """
 
@@ -77,11 +86,20 @@ class Table:
     started: bool = False
 
     def is_mounted(self, key: Key) -> bool:
-        """Whether requests may ask it."""
+        """Return whether a version is mounted.
+
+        Args:
+            key: name and version.
+        """
         return key[0] in self.maps and any(each.key == key for each in self.maps[key[0]].versions)
 
     def wants(self, candidate: MapVersion, others: Collection[MapVersion] = ()) -> bool:
-        """Whether a version would stay if it were mounted now, beside ``others`` that are about to be mounted."""
+        """Return whether a version would stay mounted if it were mounted now.
+
+        Args:
+            candidate: the version.
+            others: versions that are about to be mounted as well.
+        """
         known = self.maps.get(candidate.name)
         versions = () if known is None else known.versions
         beside = [*versions, *(each for each in others if each.name == candidate.name)]
@@ -91,14 +109,14 @@ class Table:
 
 
 class ServingTable:
-    """The table of a service with a single process, and what a worker does with it.
+    """The table of a service with a single process. It defines the operations of a worker.
 
     Reading takes no lock. All changes are atomic.
     """
 
-    #: Whether other processes change it too.
+    #: Whether other processes change the table too.
     is_shared = False
-    #: Of this worker.
+    #: Number of this worker.
     number = 0
 
     def __init__(self) -> None:
@@ -109,15 +127,15 @@ class ServingTable:
         return self._table
 
     def join(self, opened: Collection[MapVersion], given_up: Collection[Key] = ()) -> frozenset[MapVersion]:
-        """Begin to answer, if this worker agrees with those that answer.
+        """Join the workers that answer, if this worker has every mounted version open.
 
         Args:
             opened: versions that this worker has open.
-            given_up: mounted versions that it tried to open in vain.
+            given_up: mounted versions that this worker failed to open.
 
         Returns:
-            Mounted versions that it has to open, or to give up, first. It has joined if there are none. A version that serves cannot be
-            given up while another worker answers.
+            Mounted versions that this worker must first open or give up. It has joined if there are none. It cannot give up a
+            serving version while another worker answers.
         """
         lacking: frozenset[MapVersion] = frozenset()
         keys = {each.key for each in opened}
@@ -137,7 +155,11 @@ class ServingTable:
         return lacking
 
     def offer(self, version: MapVersion) -> None:
-        """This worker has a version open. Nothing happens before it has joined."""
+        """Offer a version that this worker has open. It has no effect before the worker has joined.
+
+        Args:
+            version: to offer.
+        """
 
         def change(table: Table) -> Table:
             mine = table.offers.get(self.number)
@@ -146,7 +168,11 @@ class ServingTable:
         self._change(change)
 
     def choose(self, name: str, version: str) -> None:
-        """Let another mounted version of a map serve.
+        """Select the serving version of a map.
+
+        Args:
+            name: of the map.
+            version: a mounted version.
 
         Raises:
             UnknownMapError: no such map or version is mounted.
@@ -166,18 +192,19 @@ class ServingTable:
         self._change(change)
 
     def remove(self, keys: Collection[Key]) -> None:
-        """Take versions out, all in one change; if one of them served, the newest that is left does.
+        """Unmount versions in one change. If a serving version is removed, the newest remaining one serves.
 
-        Those that are not there do not matter.
+        Args:
+            keys: names and versions; unknown ones are ignored.
         """
         self._change(lambda table: reduce(_without, keys, table))
 
     def settle(self) -> None:
-        """Mount what waited only for workers that have ended."""
+        """Mount versions that waited only for workers that have ended."""
         self._change(lambda table: table)
 
     def others_offer(self) -> frozenset[MapVersion]:
-        """What other workers have open and this one has not."""
+        """Return the versions that other workers offer and this worker does not."""
         table = self.read()
         mine = {each.key for each in table.offers.get(self.number, ())}
         theirs = [each for number, offered in table.offers.items() if number != self.number for each in offered]
@@ -195,32 +222,30 @@ class ServingTable:
             yield
 
 
-#: Changes of tables in this process; they take microseconds.
+#: Guards changes of tables in this process. They take microseconds.
 _LOCK = threading.Lock()
 
 
 class SharedMemory:
-    """Memory and locks for the table of several workers. The supervisor makes it before it forks, and workers inherit it.
+    """Memory and locks for the table of several workers. The supervisor creates it before it forks, and workers inherit it.
 
-    No file has a name, so neither a full disk nor somebody who tidies up temporary folders can get in the way. The memory holds a
-    counter and two slots. A change is written into the slot that is not in use; then the counter, a single aligned word, says that
-    it holds. So a worker that is killed at any point leaves a whole table behind. Whoever reads compares the counter with the one of
-    its copy, and reads the slot, under the lock, only if they differ.
+    No file has a name, so a full disk or a cleanup of temporary folders does no harm. The memory holds a counter and two slots.
+    A writer fills the unused slot, then increments the counter, a single aligned word. So a worker that is killed at any point
+    leaves a complete table. A reader compares the counter with that of its copy. It reads the slot, under the lock, only if they
+    differ.
 
-    Locks are POSIX record locks of an empty file: byte 0 for the table, byte 1 + N as long as worker N lives. The system
+    The locks are POSIX record locks of an empty file. Byte 0 guards the table. Byte 1 + N is locked while worker N lives. The system
     releases them when a process ends.
     """
 
     def __init__(self) -> None:
-        self._memory = mmap.mmap(
-            -1, mmap.PAGESIZE + 2 * _MOST_BYTES
-        )  # shared; pages that nobody touches take no memory
+        self._memory = mmap.mmap(-1, mmap.PAGESIZE + 2 * _MOST_BYTES)  # shared; untouched pages take no memory
         self._words = memoryview(self._memory)[: mmap.PAGESIZE].cast("I")
         self._locks = tempfile.TemporaryFile()  # noqa: SIM115  # `close` does
         self._store(0, Table())
 
     def close(self) -> None:
-        """Let go of it; for the supervisor, after all workers have ended."""
+        """Release memory and locks. The supervisor calls this after all workers have ended."""
         self._words.release()
         self._memory.close()
         self._locks.close()
@@ -231,21 +256,24 @@ class SharedMemory:
         return self._words[0]
 
     def load(self) -> Table:
-        """The table; the caller holds the lock."""
+        """Read the table. The caller must hold the lock."""
         at, size = self._slot(self.counter), self._words[1 + self.counter % 2]
         return _from_json(self._memory[at : at + size])
 
     def store(self, table: Table) -> None:
-        """Replace the table; the caller holds the lock.
+        """Replace the table. The caller must hold the lock.
+
+        Args:
+            table: the new state.
 
         Raises:
-            BundleError: it is too large.
+            BundleError: the table is too large.
         """
         self._store((self.counter + 1) % 2**32, table)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """No other process is inside at the same time."""
+        """Exclude other processes inside the context."""
         fcntl.lockf(self._locks, fcntl.LOCK_EX, 1, 0)
         try:
             yield
@@ -253,11 +281,19 @@ class SharedMemory:
             fcntl.lockf(self._locks, fcntl.LOCK_UN, 1, 0)
 
     def live(self, number: int) -> None:
-        """This process is worker ``number`` until it ends."""
+        """Register this process as a worker until it ends.
+
+        Args:
+            number: of the worker.
+        """
         fcntl.lockf(self._locks, fcntl.LOCK_EX, 1, 1 + number)
 
     def lives(self, number: int) -> bool:
-        """Whether another process is that worker."""
+        """Return whether another process is that worker.
+
+        Args:
+            number: of the worker.
+        """
         try:
             fcntl.lockf(self._locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, 1 + number)
         except OSError:
@@ -283,11 +319,11 @@ class SharedMemory:
 
 
 class SharedServingTable(ServingTable):
-    """The table as one of several workers sees it.
+    """The table as seen by one of several workers. Create it in the process of the worker.
 
     Args:
         memory: inherited from the supervisor.
-        number: of this worker; it must be made in the worker's own process.
+        number: of this worker.
     """
 
     is_shared = True
@@ -297,7 +333,7 @@ class SharedServingTable(ServingTable):
         memory.live(number)
         with memory.locked():
             self._seen, self._table = memory.counter, memory.load()
-        # What the worker that had this number before offered is of no meaning any more.
+        # Drop the offers of an earlier worker with this number.
         self._change(lambda table: replace(table, offers={n: each for n, each in table.offers.items() if n != number}))
 
     def read(self) -> Table:
@@ -311,7 +347,7 @@ class SharedServingTable(ServingTable):
         count = self._memory.counter
         if count != self._seen:
             self._table = self._memory.load()
-            self._seen = count  # last: who sees the new number without the lock sees the new table
+            self._seen = count  # last: a thread that sees the new number without the lock must also see the new table
 
     def _change(self, change: Callable[[Table], Table]) -> None:
         with self._locked():
@@ -324,12 +360,12 @@ class SharedServingTable(ServingTable):
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        with _LOCK, self._memory.locked():  # record locks do not keep threads of one process apart
+        with _LOCK, self._memory.locked():  # record locks do not exclude threads of the same process
             yield
 
 
 def _settled(table: Table) -> Table:
-    """Mount what every worker that answers offers, and forget offers that came to an end."""
+    """Mount the versions that every answering worker offers, and drop obsolete offers."""
     if not table.offers:
         return table
     offered = [{each.key: each for each in offers} for offers in table.offers.values()]
@@ -363,7 +399,7 @@ def _without(table: Table, key: Key) -> Table:
 
 
 def _kept(versions: Collection[MapVersion], serving: str | None) -> tuple[MapVersion, ...]:
-    """The newest first; of too many the oldest that do not serve are left out."""
+    """Keep the newest versions, newest first. The serving version always stays."""
     kept = sorted(versions, key=_rank, reverse=True)
     while len(kept) > MOST_VERSIONS:
         kept.remove([each for each in kept if each.version != serving][-1])
@@ -371,7 +407,7 @@ def _kept(versions: Collection[MapVersion], serving: str | None) -> tuple[MapVer
 
 
 def _rank(version: MapVersion) -> tuple[float, str]:
-    """The hash decides between versions of one moment, so that all workers order them alike."""
+    """Sort key by time. The hash breaks ties, so that all workers use the same order."""
     return version.made_at, version.version
 
 

@@ -1,4 +1,7 @@
-"""Settings of a service: defaults < file (TOML) < environment ``STREETFIX_*`` < flags. Made once, in the command line."""
+"""Settings of a service.
+
+Later sources override earlier ones: defaults, TOML file, environment ``STREETFIX_*``, flags. The command line loads them once.
+"""
 
 import os
 import tomllib
@@ -29,7 +32,7 @@ class Limits(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    # gRPC takes the length of a message in 32 bits.
+    # gRPC stores the length of a message in 32 bits.
     max_request_bytes: int = Field(40 * 2**20, ge=1024, le=2**31 - 1, description="whole body of a request")
     max_message_bytes: int = Field(
         16 * 2**20, ge=1024, le=2**31 - 1,
@@ -40,7 +43,7 @@ class Limits(BaseModel):
 
     @property
     def message_bytes(self) -> int:
-        """Of the largest gRPC message: no face takes more than a request may have."""
+        """Size of the largest gRPC message: the lower of both limits, in bytes."""
         return min(self.max_message_bytes, self.max_request_bytes)
 
 
@@ -169,25 +172,29 @@ class Settings(BaseSettings):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is reached from this machine alone."""
+    """Return whether only this machine can reach an address.
+
+    Args:
+        host: name or IP address. Names other than ``localhost`` do not count as loopback.
+    """
     if host == "localhost":
         return True
     try:
         return ip_address(host).is_loopback
-    except ValueError:  # a name, which may be anything
+    except ValueError:  # a name may resolve to any address
         return False
 
 
 def load_settings(config: Path | None = None, **flags: object) -> Settings:
-    """Settings from a file, the environment above it, and flags that are not None above both.
+    """Load the settings: the environment overrides the file, and flags override both.
 
     Args:
-        config: TOML; else the file that ``STREETFIX_CONFIG`` names, if any.
-        flags: by name.
+        config: TOML file; None takes the file that ``STREETFIX_CONFIG`` names, if any.
+        flags: values by the name of the setting; None means not given.
 
     Raises:
-        RequestError: the file cannot be read, a value makes no sense, or a variable ``STREETFIX_*`` or a line of the file
-            is no setting; its name is in the message.
+        RequestError: the file cannot be read, or a value is invalid; or a variable ``STREETFIX_*`` or a line of the file is
+            unknown. The message names it.
     """
     require_known(os.environ, Settings)
     given: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
@@ -227,7 +234,7 @@ def _with_file(path: Path | None) -> type[Settings]:
     file = path
 
     class FromFile(Settings):
-        """Looks into the file after the environment."""
+        """Settings with the file as the lowest source above the defaults."""
 
         @classmethod
         def settings_customise_sources(
@@ -235,8 +242,8 @@ def _with_file(path: Path | None) -> type[Settings]:
             env_settings: PydanticBaseSettingsSource, dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
             file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
         ) -> tuple[PydanticBaseSettingsSource, ...]:  # fmt: skip
-            """In the order of their weight."""
-            with file.open("rb"):  # a missing file would be passed over in silence
+            """Return the sources, the strongest first."""
+            with file.open("rb"):  # pydantic-settings would ignore a missing file silently
                 return init_settings, env_settings, TomlConfigSettingsSource(settings_cls, file)
 
     return FromFile

@@ -1,4 +1,4 @@
-"""A robot that drives: its last frames, kept as long as its stream lives."""
+"""Localization of a moving robot from its last frames. A stream keeps them until it ends."""
 
 from collections import deque
 from dataclasses import replace
@@ -13,36 +13,44 @@ from service.localization.frames import Frame
 from service.localization.localizer import Localizer
 from service.runtime.engine import EncodedQuery, Engine, Located
 
-#: Frames that an answer rests on at most; in a street of repeating blocks five tell (decision log).
+#: Maximum number of frames that an answer uses. Five frames resolve a street of repeating blocks (decision log).
 MOST_FRAMES = 5
 
 
 class Stream:
-    """Frames of one robot; not safe to call from several threads at once."""
+    """Frames of one robot. It is not thread-safe.
+
+    Args:
+        engine: localizes the frames.
+    """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._localizer: Localizer | None = None
         self._name: str | None = None
-        self._frames: deque[Frame] = deque(maxlen=MOST_FRAMES - 1)  # the newest first, against the newest
+        self._frames: deque[Frame] = deque(maxlen=MOST_FRAMES - 1)  # newest first; poses are relative to the newest
 
     def localize(
         self, encoded: EncodedQuery, T_previous_camera: Float64[NDArray[np.float64], "4 4"] | None
     ) -> tuple[Located, int]:
-        """Answer the next frame together with those before it; the answer, and how many frames it rests on.
+        """Localize the next frame together with the frames before it.
 
         Args:
             encoded: the frame.
-            T_previous_camera: odometry: coordinates of this camera to the one before; None forgets the frames before.
+            T_previous_camera: odometry, from this camera's frame to the previous camera's frame, metres. None drops the frames
+                before.
+
+        Returns:
+            The answer, and the number of frames that it uses.
 
         Raises:
-            RequestError: another map is asked than before, or as for a single query.
+            RequestError: the frame names another map than the frames before; or as for a single query.
         """
-        before, self._frames = self._frames, deque(maxlen=MOST_FRAMES - 1)  # whatever fails here begins the stream anew
+        before, self._frames = self._frames, deque(maxlen=MOST_FRAMES - 1)  # any failure below restarts the stream
         last, localizer = self._localizer, self._localizer_for(encoded)
         if (
             localizer is not last
-        ):  # the first frame, or another version of the map serves now: what was looked up is not of it
+        ):  # the first frame, or another map version serves now: the kept frames were retrieved from the old one
             before.clear()
         frame, decode_ms = self._engine.look_up(localizer, encoded)
         kept: list[Frame] = []
@@ -54,7 +62,7 @@ class Stream:
         return located, 1 + len(kept)
 
     def forget(self) -> None:
-        """Begin anew: the next frame's odometry would lead to a frame that is not there."""
+        """Drop all frames. After a failed frame the next odometry refers to a frame that the stream does not have."""
         self._frames.clear()
 
     def _localizer_for(self, encoded: EncodedQuery) -> Localizer:
@@ -66,13 +74,13 @@ class Stream:
                 "open another stream for another map", field="map",
             )  # fmt: skip
         self._localizer = self._engine.registry.get(self._name)
-        if self._name is None:  # the only map now; others may come
+        if self._name is None:  # it is the only map now, but others may be mounted later
             self._name = self._localizer.bundle.name
         return self._localizer
 
 
 def _closed(T: Transform) -> Transform:
-    """The nearest rotation again: products of many odometry steps drift off it."""
+    """Project the rotation onto SO(3) by SVD, because products of many odometry steps drift away from it."""
     u, _, vt = np.linalg.svd(T[:3, :3])
     found = T.copy()
     found[:3, :3] = u @ vt

@@ -1,6 +1,7 @@
-"""One thread for each native pool: whole requests run side by side, and inner pools only get in their way.
+"""Limit each native thread pool to one thread.
 
-Measured (November 2026, two cores, four requests at a time): 155 requests/s so, 94 with the libraries' defaults.
+The service runs whole requests in parallel. Threads inside a request would compete with them for the same cores.
+Measured (November 2026, two cores, four requests at a time): 155 requests/s with one thread, 94 with the defaults.
 """
 
 import math
@@ -11,13 +12,19 @@ _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_
 
 
 def limit_pools_before_import() -> None:
-    """Say so in the environment; works only before NumPy and FAISS are imported. What the operator set, stays."""
+    """Limit the native pools by environment variables.
+
+    This works only before NumPy and FAISS are imported. It keeps variables that the operator has set.
+    """
     for name in _POOLS:
         os.environ.setdefault(name, "1")
 
 
 def limit_pools() -> None:
-    """Limit the pools that can be told at run time; call it in every worker, as OpenMP counts for each thread."""
+    """Limit the OpenCV and FAISS pools at run time.
+
+    Call it in every worker thread, because OpenMP keeps its limit per thread.
+    """
     import cv2
 
     from service.maps.index import search_with_one_thread
@@ -27,27 +34,37 @@ def limit_pools() -> None:
 
 
 def usable_cores(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
-    """Cores that this process may run on, no more than its container's quota of processor time allows."""
+    """Count the cores that this process may use.
+
+    A quota of processor time, as of a container, limits the count. The count is at least 1.
+
+    Args:
+        cgroup: folder of the control groups.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = cpu_quota(cgroup)
     return cores if quota is None else max(1, min(cores, math.ceil(quota)))
 
 
 def cpu_quota(cgroup: Path) -> float | None:
-    """Processors' worth of time that a control group may use (version 2, else 1); None where it is not limited."""
+    """Read the CPU quota of a control group, in cores; None if it has no limit.
+
+    Args:
+        cgroup: folder of the control groups, version 2 or else version 1.
+    """
     for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):
         try:
             words = " ".join((cgroup / name).read_text() for name in names).split()
             if words[0] in ("max", "-1"):
                 return None
             return float(words[0]) / float(words[1])
-        except (OSError, ValueError, IndexError, ZeroDivisionError):  # another version, or no control groups here
+        except (OSError, ValueError, IndexError, ZeroDivisionError):  # the other version, or no control groups at all
             continue
     return None
 
 
 def pools() -> dict[str, int]:
-    """Threads of each native pool, as they are set now in this process."""
+    """Return the current number of threads of each native pool in this process."""
     import cv2
     import faiss
 

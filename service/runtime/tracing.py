@@ -1,6 +1,7 @@
-"""Spans of requests and of their stages, for OpenTelemetry; made by hand, since instrumentation of frameworks costs a third of a request.
+"""OpenTelemetry spans of requests and their stages.
 
-Nothing of OpenTelemetry is imported unless an endpoint is set.
+The service creates its spans itself, because automatic instrumentation of the frameworks costs a third of a request.
+It imports OpenTelemetry only if an endpoint is set.
 """
 
 import time
@@ -17,14 +18,26 @@ _STAGES = ("decode", "fuse", "encode", "search", "register")
 
 
 class RequestSpan:
-    """One request's span; without a tracer it does nothing."""
+    """The span of one request. Without a tracer it does nothing.
+
+    Args:
+        tracer: creates the spans of the stages; None records nothing.
+        span: of the request; None records nothing.
+    """
 
     def __init__(self, tracer: "Tracer | None" = None, span: "Span | None" = None) -> None:
         self._tracer = tracer
         self._span = span
 
     def stages(self, timings: Timings) -> None:
-        """Tell the stages of an answer that was just made, one after the other up to now; a request may have several answers."""
+        """Record a child span for each stage of an answer.
+
+        The spans follow each other. The first one starts ``total_ms`` before now, so call this right after the answer.
+        Call it once per answer if a request has several.
+
+        Args:
+            timings: of the answer.
+        """
         if self._span is None or self._tracer is None or not self._span.is_recording():
             return
         from opentelemetry.trace import set_span_in_context
@@ -37,7 +50,13 @@ class RequestSpan:
             child.end(end_time=at_ns)
 
     def end(self, method: str, code: str, *, failed: bool) -> None:
-        """It is answered, or refused."""
+        """End the span of a request that was answered or refused.
+
+        Args:
+            method: operation or call; it becomes the name of the span.
+            code: status code, or the code of a problem.
+            failed: mark the span as an error.
+        """
         if self._span is None:
             return
         self._span.update_name(method)
@@ -50,7 +69,11 @@ class RequestSpan:
 
 
 class Tracing:
-    """Makes spans; ``open`` sends them to an OpenTelemetry collector."""
+    """Creates the spans of requests. Use ``open`` to send them to an OpenTelemetry collector.
+
+    Args:
+        tracer: of OpenTelemetry; None traces nothing.
+    """
 
     def __init__(self, tracer: "Tracer | None" = None) -> None:
         self._tracer = tracer
@@ -61,8 +84,8 @@ class Tracing:
 
         Args:
             endpoint: of the collector, as ``http://127.0.0.1:4318/v1/traces``; None traces nothing.
-            share: of the requests that come without a trace of their own; whether the others are traced says their caller.
-            exporter: instead of OTLP.
+            share: 0 to 1, of the requests without a trace context that are traced. For the others the caller decides.
+            exporter: used instead of OTLP; None exports by OTLP.
 
         Raises:
             ExtraMissingError: the extra is not installed.
@@ -86,7 +109,12 @@ class Tracing:
         return cls(provider.get_tracer("streetfix"))
 
     def begin(self, face: str, traceparent: str | None) -> RequestSpan:
-        """A request has come; ``traceparent`` is its W3C trace context, if it has one."""
+        """Begin the span of a request.
+
+        Args:
+            face: request handler, ``rest`` or ``grpc``.
+            traceparent: W3C trace context of the request; None if it has none.
+        """
         if self._tracer is None:
             return _NOTHING
         from opentelemetry.trace import SpanKind

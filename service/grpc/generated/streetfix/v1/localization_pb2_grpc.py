@@ -26,7 +26,7 @@ if _version_not_supported:
 
 
 class LocalizationServiceStub:
-    """Says where pictures were taken.
+    """Localizes images against a LiDAR map.
     """
 
     def __init__(self, channel):
@@ -73,54 +73,54 @@ class LocalizationServiceStub:
 
 
 class LocalizationServiceServicer:
-    """Says where pictures were taken.
+    """Localizes images against a LiDAR map.
     """
 
     def Localize(self, request, context):
-        """Localizes one pair of pictures. An answer that is not LOCALIZED is still an answer, but it has no pose.
+        """Localizes one image pair. An answer that is not LOCALIZED is still an answer, but it has no pose.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def LocalizeBatch(self, request, context):
-        """Localizes several pairs, each on its own; one that fails does not fail the others.
+        """Localizes several image pairs, each on its own. A pair that fails does not make the others fail.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def LocalizeSequence(self, request, context):
-        """Localizes frames of a drive, or the cameras of a rig at one instant, as one.
+        """Localizes frames of a traversal, or the cameras of a rig at one instant, as one.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def LocalizeStream(self, request_iterator, context):
-        """Localizes a robot that drives: a frame with the odometry to the one before it in, an answer out. The last frames are
-        kept as long as the stream lives, and no longer.
+        """Localizes a moving robot. Each request is a frame with the odometry to the frame before. Each response is an answer. The
+        service keeps the last frames as long as the stream lives, and no longer.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ListMaps(self, request, context):
-        """All mounted maps.
+        """Lists all mounted maps.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetStreets(self, request, context):
-        """The streets of a map.
+        """Gets the streets of a map.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetCoverage(self, request, context):
-        """Where the maps can answer.
+        """Gets the area where the maps can answer.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -173,7 +173,7 @@ def add_LocalizationServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class LocalizationService:
-    """Says where pictures were taken.
+    """Localizes images against a LiDAR map.
     """
 
     @staticmethod
