@@ -1,6 +1,6 @@
-"""The dataset folder: what ``simulate`` and ``import`` write, and ``build-map`` and ``evaluate`` read.
+"""The dataset folder: ``simulate`` and ``import`` write it, ``build-map`` and ``evaluate`` read it.
 
-Frames are read one at a time; nothing here loads a whole drive.
+Frames are read one at a time. No function loads a whole traversal.
 """
 
 import json
@@ -23,8 +23,11 @@ from service.imaging.view_grid import ViewGrid
 from service.localization.decoding import DepthFormat, decoded_query
 from service.localization.query import Query
 
+#: Version of the folder's format.
 FORMAT = 1
-Transforms = NDArray[np.float64]  # (n, 4, 4)
+#: Homogeneous transforms (n, 4, 4), metres.
+Transforms = NDArray[np.float64]
+#: File endings of colour images.
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 
 
@@ -33,7 +36,16 @@ class _Model(BaseModel):
 
 
 class LidarSensor(_Model):
-    """A LiDAR of the survey."""
+    """A LiDAR of the survey.
+
+    Attributes:
+        name: name of the sensor.
+        channels: number of beams; None: unknown.
+        top_deg: elevation of the highest beam, degrees; None: unknown.
+        bottom_deg: elevation of the lowest beam, degrees; None: unknown.
+        max_range_m: largest range, metres; None: unknown.
+        T_vehicle_sensor: pose (4, 4) in the vehicle frame, metres; None: unknown.
+    """
 
     name: str
     channels: int | None = None
@@ -44,7 +56,14 @@ class LidarSensor(_Model):
 
 
 class DepthSpec(_Model):
-    """How a depth picture's numbers become metres: value * ``scale_m`` is z, range or disparity."""
+    """How the numbers of a depth image become metres: value * ``scale_m`` is z, range or disparity.
+
+    Attributes:
+        scale_m: metres per stored unit; for disparity, pixels per stored unit.
+        kind: stored quantity.
+        max_range_m: larger depths count as not measured, metres; None: no limit.
+        baseline_m: baseline of the stereo rig, metres; None: unknown or no stereo.
+    """
 
     scale_m: float = 0.001
     kind: Literal["z", "range", "disparity"] = "z"
@@ -53,7 +72,19 @@ class DepthSpec(_Model):
 
 
 class CameraSensor(_Model):
-    """A rectified camera and its depth."""
+    """A rectified camera and its depth.
+
+    Attributes:
+        name: name of the sensor.
+        width: image width, pixels.
+        height: image height, pixels.
+        fx: focal length along the rows, pixels.
+        fy: focal length along the columns, pixels.
+        cx: column of the principal point, pixels.
+        cy: row of the principal point, pixels.
+        depth: format of its depth images.
+        T_vehicle_sensor: pose (4, 4) in the vehicle frame, metres; None: unknown.
+    """
 
     name: str
     width: int
@@ -66,19 +97,34 @@ class CameraSensor(_Model):
     T_vehicle_sensor: list[list[float]] | None = None
 
     def pinhole(self) -> PinholeCamera:
-        """Its intrinsics."""
+        """Return the intrinsics."""
         return PinholeCamera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
 
 class Sensors(_Model):
-    """All sensors of a dataset."""
+    """All sensors of a dataset.
+
+    Attributes:
+        lidars: LiDARs of the survey.
+        cameras: cameras of the queries. The first is the default.
+    """
 
     lidars: list[LidarSensor] = []
     cameras: list[CameraSensor] = []
 
 
 class DatasetDescription(_Model):
-    """``dataset.json``."""
+    """Content of ``dataset.json``.
+
+    Attributes:
+        format: version of the folder's format.
+        name: name of the dataset.
+        source: origin of the data.
+        sensors: all sensors.
+        georeference: position of the map frame on the Earth; None: unknown.
+        conditions: weather and light of the survey and the queries.
+        seed: seed of a simulation; None: not simulated.
+    """
 
     format: int = FORMAT
     name: str
@@ -91,7 +137,16 @@ class DatasetDescription(_Model):
 
 @dataclass(frozen=True, slots=True)
 class QueryFrame:
-    """One query of a set: its number, picture pair and truth with its timestamp in seconds (None where unknown)."""
+    """One query of a query set.
+
+    Attributes:
+        number: number in the query set.
+        rgb_path: colour image.
+        depth_path: depth image.
+        camera: camera of both images.
+        T_map_camera: ground truth (4, 4), optical frame to map frame, metres; None: unknown.
+        stamp_s: timestamp of the ground truth, seconds; None: unknown.
+    """
 
     number: int
     rgb_path: Path
@@ -101,7 +156,7 @@ class QueryFrame:
     stamp_s: float | None
 
     def rgb(self) -> NDArray[np.uint8]:
-        """The colour picture (H, W, 3).
+        """Return the colour image (H, W, 3).
 
         Raises:
             DatasetError: the file vanished or is damaged.
@@ -111,7 +166,7 @@ class QueryFrame:
             return decode_rgb(data, limits=ImageLimits())
 
     def depth_m(self) -> NDArray[np.float32]:
-        """Z (H, W), metres, 0 where nothing was measured.
+        """Return the depth (H, W), z in metres; 0 where nothing was measured.
 
         Raises:
             DatasetError: the file vanished or is damaged.
@@ -124,10 +179,13 @@ class QueryFrame:
             )  # fmt: skip
 
     def query(self, grid: ViewGrid) -> Query:
-        """The query that a service makes of these pictures for a map with this view grid, all options at their defaults.
+        """Return the query that the service makes of these images, with default options.
+
+        Args:
+            grid: view grid of the map.
 
         Raises:
-            DatasetError: a picture vanished or is damaged.
+            DatasetError: an image vanished or is damaged.
         """
         spec = self.camera.depth
         how = DepthFormat(
@@ -138,7 +196,7 @@ class QueryFrame:
             return decoded_query(rgb, depth, self.camera.pinhole(), how, grid=grid)
 
     def request(self) -> dict[str, Any]:
-        """The parts of a request to the service that follow from the camera, as ``streetfix localize --camera`` takes them."""
+        """Return the camera and depth parts of a request to the service, as ``streetfix localize --camera`` takes them."""
         return {
             "camera": self.camera.model_dump(include={"width", "height", "fx", "fy", "cx", "cy"}),
             "depth": self.camera.depth.model_dump(exclude_none=True),
@@ -149,10 +207,14 @@ class Dataset:
     """An opened dataset folder.
 
     Args:
-        folder: with ``dataset.json``.
+        folder: folder that contains ``dataset.json``.
+
+    Attributes:
+        folder: the dataset folder.
+        description: content of ``dataset.json``.
 
     Raises:
-        DatasetError: the folder, its description or a pose file is missing or broken.
+        DatasetError: ``dataset.json`` is missing, damaged or of another format.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -176,11 +238,15 @@ class Dataset:
 
     @property
     def name(self) -> str:
-        """Name of the dataset."""
+        """Return the name of the dataset."""
         return self.description.name
 
     def streets(self) -> dict[str, Any] | None:
-        """The GeoJSON of the streets, or None."""
+        """Return the GeoJSON of the streets, or None if the dataset has none.
+
+        Raises:
+            DatasetError: the file vanished or is not JSON.
+        """
         path = self.folder / "streets.geojson"
         if not path.exists():
             return None
@@ -191,15 +257,32 @@ class Dataset:
         return loaded
 
     def survey_poses(self) -> Transforms:
-        """T_map_lidar of every scan, (n, 4, 4)."""
+        """Return T_map_lidar of every scan (n, 4, 4), metres.
+
+        Raises:
+            DatasetError: the pose file is missing or damaged.
+        """
         return self.survey_trajectory()[1]
 
     def survey_trajectory(self) -> tuple[NDArray[np.float64], Transforms]:
-        """Time (n), seconds, and T_map_lidar (n, 4, 4) of every scan."""
+        """Return the time (n,) in seconds and T_map_lidar (n, 4, 4) in metres of every scan.
+
+        Raises:
+            DatasetError: the pose file is missing or damaged.
+        """
         return read_tum(self.folder / "survey" / "poses.txt")
 
     def scan(self, number: int) -> NDArray[np.float32]:
-        """Scan ``number``: (n, 4) x, y, z (m, LiDAR frame) and intensity, 0 where a sensor has none or a nonsensical one."""
+        """Return a scan (n, 4): x, y, z in the LiDAR frame (m) and intensity.
+
+        Points that are not finite are left out. An intensity that is negative or not finite becomes 0.
+
+        Args:
+            number: number of the scan.
+
+        Raises:
+            DatasetError: the file is missing, truncated or cannot be read.
+        """
         path = scan_path(self.folder, number)
         if not path.is_file():
             raise DatasetError(f"{path} is missing, but survey/poses.txt has a line for it", field=str(path.name))
@@ -214,14 +297,28 @@ class Dataset:
         return finite
 
     def query_sets(self, *, with_truth: bool = False) -> list[str]:
-        """Names of the query sets, sorted."""
+        """Return the names of the query sets, sorted.
+
+        Args:
+            with_truth: only query sets with ground truth.
+
+        Raises:
+            DatasetError: the folder cannot be read.
+        """
         root = self.folder / "queries"
         with reading(root):
             names = sorted(p.name for p in root.iterdir() if (p / "rgb").is_dir()) if root.is_dir() else []
         return [n for n in names if not with_truth or (root / n / "poses.txt").exists()]
 
     def queries(self, name: str) -> Iterator[QueryFrame]:
-        """The frames of a query set, one at a time."""
+        """Yield the frames of a query set, one at a time.
+
+        Args:
+            name: name of the query set.
+
+        Raises:
+            DatasetError: the query set or the camera is unknown, or a file is missing, damaged or contradicts another file.
+        """
         folder = query_folder(self.folder, name)
         if not (folder / "rgb").is_dir():
             known = ", ".join(self.query_sets()) or "none"
@@ -255,7 +352,7 @@ class Dataset:
 
 @contextmanager
 def _decoding(*paths: Path) -> Iterator[None]:
-    """What is wrong with pictures, said of their files; a request's field would say nothing here."""
+    """Name the files in errors of decoding. The decoder itself names a field of a request, which does not apply here."""
     try:
         yield
     except StreetfixError as error:
@@ -263,7 +360,7 @@ def _decoding(*paths: Path) -> Iterator[None]:
 
 
 def _camera_names(folder: Path, count: int) -> list[str] | None:
-    """Names in ``cameras.txt`` (a line a query), or None where all frames are of the first camera."""
+    """Return the names in ``cameras.txt`` (one line per query), or None if all frames are of the first camera."""
     path = folder / "cameras.txt"
     if not path.exists():
         return None
@@ -274,24 +371,45 @@ def _camera_names(folder: Path, count: int) -> list[str] | None:
 
 
 def scan_path(folder: Path, number: int) -> Path:
-    """Where scan ``number`` lies."""
+    """Return the path of a scan.
+
+    Args:
+        folder: dataset folder.
+        number: number of the scan.
+    """
     return folder / "survey" / "scans" / f"{number:06d}.bin"
 
 
 def query_folder(folder: Path, name: str) -> Path:
-    """Where a query set lies."""
+    """Return the folder of a query set.
+
+    Args:
+        folder: dataset folder.
+        name: name of the query set.
+    """
     return folder / "queries" / name
 
 
 def write_description(folder: Path, description: DatasetDescription) -> None:
-    """Write ``dataset.json``; last of all, since its presence says that the dataset is whole."""
+    """Write ``dataset.json``. Call this last: the file marks the dataset as complete.
+
+    Args:
+        folder: dataset folder.
+        description: content of the file.
+    """
     part = folder / "dataset.json.part"
     part.write_text(description.model_dump_json(indent=2) + "\n")
     part.rename(folder / "dataset.json")
 
 
 def write_tum(path: Path, timestamps: NDArray[np.float64], transforms: Transforms) -> None:
-    """Write poses in TUM format (timestamp x y z qx qy qz qw), renamed when whole."""
+    """Write poses in TUM format (timestamp x y z qx qy qz qw). The file gets its name when it is complete.
+
+    Args:
+        path: file to write. Missing parent folders are created.
+        timestamps: times (n,), seconds.
+        transforms: poses (n, 4, 4), metres.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     with part.open("w") as file:
@@ -302,10 +420,13 @@ def write_tum(path: Path, timestamps: NDArray[np.float64], transforms: Transform
 
 
 def read_tum(path: Path) -> tuple[NDArray[np.float64], Transforms]:
-    """Timestamps (n) and transforms (n, 4, 4) of a TUM file.
+    """Return the timestamps (n,) in seconds and the transforms (n, 4, 4) in metres of a TUM file.
+
+    Args:
+        path: file to read.
 
     Raises:
-        DatasetError: the file is missing, or a line is no pose.
+        DatasetError: the file is missing, or a line is not a pose.
     """
     if not path.is_file():
         raise DatasetError(f"{path} is missing", field=path.name)

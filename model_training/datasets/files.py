@@ -1,4 +1,4 @@
-"""Files of recordings and datasets, which lie on disks that fill up, fail and are unplugged while a command reads them."""
+"""Files of recordings and datasets. A disk may fill up, fail or be unplugged while a command reads them."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,17 +13,22 @@ from numpy.typing import NDArray
 from service.errors import DatasetError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 
-ROW_BYTES = 16  # of a scan: x, y, z and intensity, float32
+#: Bytes of one row of a scan: x, y, z and intensity as float32.
+ROW_BYTES = 16
 
+#: Result of a function that reads arrays.
 T = TypeVar("T")
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """What the operating system says of a file, said of that file.
+    """Convert errors of the operating system inside the ``with`` block to errors that name the file.
+
+    Args:
+        path: file that the block reads.
 
     Raises:
-        DatasetError: the file vanished, or cannot be read.
+        DatasetError: the file vanished or cannot be read.
     """
     try:
         yield
@@ -32,7 +37,12 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def unreadable(path: Path, error: OSError) -> DatasetError:
-    """The error for a file that vanished or cannot be read."""
+    """Return the error for a file that vanished or cannot be read.
+
+    Args:
+        path: the file.
+        error: error of the operating system.
+    """
     if isinstance(error, FileNotFoundError):
         what = "it is missing, or vanished while it was wanted; bring it back, leave the folder as it is meanwhile, and start again"
     else:
@@ -41,30 +51,40 @@ def unreadable(path: Path, error: OSError) -> DatasetError:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a file.
+    """Return the content of a file.
+
+    Args:
+        path: file to read.
 
     Raises:
-        DatasetError: it vanished, or cannot be read.
+        DatasetError: the file vanished or cannot be read.
     """
     with reading(path):
         return path.read_bytes()
 
 
 def size_of(path: Path) -> int:
-    """Bytes of a file.
+    """Return the size of a file, bytes.
+
+    Args:
+        path: the file.
 
     Raises:
-        DatasetError: it vanished, or cannot be looked at.
+        DatasetError: the file vanished or cannot be accessed.
     """
     with reading(path):
         return path.stat().st_size
 
 
 def read_rows(path: Path, size: int) -> Float32[NDArray[np.float32], "N 4"]:
-    """Rows of a scan whose size is known.
+    """Read the rows of a scan whose size is known: x, y, z (m) and intensity.
+
+    Args:
+        path: file of the scan.
+        size: size of the file, bytes.
 
     Raises:
-        DatasetError: it vanished, cannot be read, or became shorter.
+        DatasetError: the file vanished, cannot be read, or became shorter.
     """
     with reading(path):
         values = np.fromfile(path, np.float32, count=size // 4)
@@ -77,15 +97,15 @@ def read_rows(path: Path, size: int) -> Float32[NDArray[np.float32], "N 4"]:
 
 
 def read_arrays(path: Path, read: Callable[[], T], *, remedy: str) -> T:
-    """What NumPy reads of a ``.npy`` or ``.npz`` file.
+    """Return the arrays that NumPy reads from a ``.npy`` or ``.npz`` file.
 
     Args:
-        path: that ``read`` reads.
-        read: gives the arrays.
-        remedy: for a file that is damaged.
+        path: file that ``read`` reads; errors name it.
+        read: function that reads the arrays.
+        remedy: advice for a damaged file, part of the error message.
 
     Raises:
-        DatasetError: the file vanished, cannot be read or is damaged, as one that was written in part.
+        DatasetError: the file vanished, cannot be read or is damaged, for example only partly written.
     """
     with reading(path):
         try:

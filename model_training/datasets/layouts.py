@@ -1,5 +1,5 @@
-"""Names in recordings' layouts that both who writes and who reads them must know."""
+"""File names in recordings' layouts that both the writer and the reader need."""
 
-#: A file in a drive's folder of KITTI's raw layout: each scan was measured at one moment by a sensor whose angles are right, as a
-#: simulated one's. KITTI's own drives have no such file.
+#: Marker file in a traversal's folder of KITTI's raw layout. It says that each scan was measured at one moment and that the beam angles
+#: are right, as in a simulation. KITTI's own traversals do not have it.
 SCANS_AT_REST = "scans_at_rest.txt"

@@ -1,4 +1,4 @@
-"""A folder that is there when it is whole, and not before."""
+"""Write a folder that exists only when it is complete."""
 
 import shutil
 from collections.abc import Iterator
@@ -10,10 +10,13 @@ from service.errors import DatasetError
 
 @contextmanager
 def whole_or_not_at_all(out: Path) -> Iterator[Path]:
-    """Give a folder beside ``out`` to write into, which takes its name when all went well, and goes when not.
+    """Yield a temporary folder beside ``out``. It is renamed to ``out`` on success and removed on an error.
+
+    Args:
+        out: folder to create.
 
     Raises:
-        DatasetError: ``out`` is there and not empty.
+        DatasetError: ``out`` exists and is not an empty folder.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not empty; name another folder, or remove it first", field="out")

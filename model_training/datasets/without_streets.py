@@ -1,4 +1,4 @@
-"""A dataset whose survey left some streets out: what is asked there is asked outside the map."""
+"""A dataset whose survey lacks some streets. Queries on these streets are out-of-map queries."""
 
 from pathlib import Path
 
@@ -10,12 +10,18 @@ from model_training.datasets.dataset import Dataset, Transforms
 
 
 class WithoutStreets(Dataset):
-    """The dataset of a folder, less the scans of every ``each``-th street.
+    """The dataset of a folder without the scans of every ``each``-th street.
 
     Args:
-        folder: of a dataset with streets.
-        each: every which street is left out.
-        first: the first one left out.
+        folder: folder of a dataset with streets.
+        each: interval of the removed streets in the sorted list of names.
+        first: index of the first removed street.
+
+    Attributes:
+        removed: names of the removed streets.
+
+    Raises:
+        DatasetError: ``dataset.json``, the streets or the poses are missing or damaged.
     """
 
     def __init__(self, folder: Path, *, each: int = 3, first: int = 0) -> None:
@@ -32,14 +38,30 @@ class WithoutStreets(Dataset):
         self._kept = np.flatnonzero(~shapely.contains(shapely.union_all(shapes), points))
 
     def survey_poses(self) -> Transforms:
-        """T_map_lidar of the scans that are left."""
+        """Return T_map_lidar of the remaining scans (n, 4, 4), metres.
+
+        Raises:
+            DatasetError: the pose file is missing or damaged.
+        """
         return super().survey_poses()[self._kept]
 
     def scan(self, number: int) -> NDArray[np.float32]:
-        """Scan ``number`` of those that are left."""
+        """Return a scan (n, 4): x, y, z in the LiDAR frame (m) and intensity.
+
+        Args:
+            number: number of the scan among the remaining scans.
+
+        Raises:
+            DatasetError: the file is missing, truncated or cannot be read.
+        """
         return super().scan(int(self._kept[number]))
 
     def is_outside(self, xy: NDArray[np.float64], *, away_m: float = 30.0) -> NDArray[np.bool_]:
-        """Whether positions (n, 2) are further than that from every scan that is left."""
+        """Return whether each position (n,) is outside the map: farther than a distance from every remaining scan.
+
+        Args:
+            xy: positions (n, 2), map frame, metres.
+            away_m: the distance, metres.
+        """
         apart = np.linalg.norm(xy[:, None] - self.survey_poses()[None, :, :2, 3], axis=2)
         return np.asarray(apart.min(axis=1) > away_m)

@@ -1,4 +1,7 @@
-"""A dataset in KITTI's raw layout: numbered scans and pictures, depth as its depth benchmark has it, poses in a TUM file."""
+"""Write a dataset in KITTI's raw layout.
+
+Scans and images are numbered. Depth has the format of KITTI's depth benchmark. Poses are in a TUM file.
+"""
 
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -13,25 +16,26 @@ from model_training.datasets.whole_folder import whole_or_not_at_all
 from model_training.exporting.moments import Moment, T_vehicle_camera, T_vehicle_lidar, moments, the_camera
 from service.geometry.rigid import Transform, inverse
 
+#: Names of the day's folder, of the drive's folder in it, and of the file of poses in that.
 DAY, DRIVE, POSES = "2000_01_01", "2000_01_01_drive_0001_sync", "poses.txt"
-#: Metres x 256: KITTI's own step of depth, 4 mm.
+#: KITTI stores depth as metres x 256: steps of 4 mm.
 _STEPS_PER_M = 256
 
 
 def write_kitti_raw(dataset: Dataset, queries: str | None, out: Path, *, report: Callable[[int, int], None]) -> int:
-    """Write survey and a query set; ``import kitti-raw OUT/DAY --poses .../poses.txt --depth stored`` reads it.
+    """Write survey and query set; ``import kitti-raw OUT/DAY --poses .../poses.txt --depth stored`` reads them.
 
     Args:
-        dataset: to read; times count from the year 1970 and are written as such.
-        queries: the set whose pictures go in, of one camera; None for none.
-        out: folder to write; it appears when it is whole.
-        report: told the moments done and all.
+        dataset: to read; its times are written as seconds since 1970.
+        queries: name of the query set to write, of one camera; None writes no images.
+        out: folder to write; it appears only when it is complete.
+        report: called with the moments done and all moments.
 
     Returns:
-        How many moments were written.
+        Number of moments that were written.
 
     Raises:
-        DatasetError: ``out`` is taken, or the dataset cannot be told as a drive.
+        DatasetError: ``out`` already exists, or the dataset cannot be written as one traversal.
     """
     camera = None if queries is None else the_camera(dataset, queries)
     total = len(dataset.survey_poses()) + (0 if queries is None else sum(1 for _ in dataset.queries(queries)))
@@ -68,7 +72,7 @@ def _write(drive: Path, number: int, moment: Moment) -> None:
 
 
 def _write_calibration(day: Path, T_vehicle_scan: Transform, camera: CameraSensor | None) -> None:
-    """Camera 0 is camera 2; the rectification turns nothing."""
+    """Write the calibration. Cameras 0 and 2 have the same frame; rectification is the identity."""
     T_camera_lidar = np.eye(4) if camera is None else inverse(T_vehicle_camera(camera)) @ T_vehicle_scan
     K = np.eye(3) if camera is None else camera.pinhole().matrix
     (day / "calib_velo_to_cam.txt").write_text(_line("R", T_camera_lidar[:3, :3]) + _line("T", T_camera_lidar[:3, 3]))

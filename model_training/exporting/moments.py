@@ -1,4 +1,4 @@
-"""A dataset as one drive in time: its survey first, then a query set, as a recorder on the vehicle would have met them."""
+"""Order a dataset in time as one traversal: first its survey, then a query set, as if a vehicle had recorded them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,15 +11,22 @@ from model_training.datasets.dataset import CameraSensor, Dataset, QueryFrame
 from service.errors import DatasetError
 from service.geometry.rigid import R_BODY_OPTICAL, Transform, inverse, transform_from
 
-#: Between the survey's last scan and the first picture, where their own times would overlap.
+#: Time between the survey's last scan and the first image if their own times would overlap, seconds.
 PAUSE_S = 10.0
-#: Where a camera stands that the dataset does not mount: at the vehicle's origin, looking ahead.
+#: Default mounting of a camera: at the vehicle's origin, looking ahead (T_vehicle_camera, optical frame).
 _AHEAD: Transform = transform_from(R_BODY_OPTICAL, np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A scan or a picture pair at a time; never both."""
+    """A scan or an image pair at one time; never both.
+
+    Attributes:
+        stamp_s: time, seconds.
+        T_map_vehicle: pose of the vehicle.
+        points: x y z (m, LiDAR frame) and intensity; None for an image pair.
+        frame: image pair; None for a scan.
+    """
 
     stamp_s: float
     T_map_vehicle: Transform
@@ -28,22 +35,34 @@ class Moment:
 
 
 def T_vehicle_lidar(dataset: Dataset) -> Transform:
-    """Where the first LiDAR stands; the vehicle's own frame where the dataset does not say."""
+    """Return the mounting of the first LiDAR (4, 4); the identity if the dataset does not give one.
+
+    Args:
+        dataset: to read.
+    """
     lidars = dataset.description.sensors.lidars
     mounted = lidars[0].T_vehicle_sensor if lidars else None
     return np.eye(4) if mounted is None else np.array(mounted, np.float64)
 
 
 def T_vehicle_camera(camera: CameraSensor) -> Transform:
-    """Where a camera stands."""
+    """Return the mounting of a camera (4, 4), optical frame; looking ahead if the dataset does not give one.
+
+    Args:
+        camera: of the dataset.
+    """
     return _AHEAD if camera.T_vehicle_sensor is None else np.array(camera.T_vehicle_sensor, np.float64)
 
 
 def the_camera(dataset: Dataset, queries: str) -> CameraSensor:
-    """The one camera of a query set.
+    """Return the one camera of a query set.
+
+    Args:
+        dataset: to read.
+        queries: name of the query set.
 
     Raises:
-        DatasetError: there are several, which one topic cannot hold.
+        DatasetError: the set has no camera, or several: one topic holds only one.
     """
     cameras = {frame.camera.name: frame.camera for frame in dataset.queries(queries)}
     if len(cameras) != 1:
@@ -55,10 +74,14 @@ def the_camera(dataset: Dataset, queries: str) -> CameraSensor:
 
 
 def moments(dataset: Dataset, queries: str | None) -> Iterator[Moment]:
-    """Scans in their order, then the picture pairs of a query set, shifted in time to come after them.
+    """Yield the scans in order, then the image pairs of a query set, shifted in time so that they follow.
+
+    Args:
+        dataset: to read.
+        queries: name of the query set; None for none.
 
     Raises:
-        DatasetError: a picture of the set has no pose.
+        DatasetError: an image pair has no pose.
     """
     stamps, poses = dataset.survey_trajectory()
     T_lidar_vehicle = inverse(T_vehicle_lidar(dataset))

@@ -1,4 +1,4 @@
-"""A dataset as a bag, to be looked at in RViz or Foxglove, or played to another program."""
+"""Write a dataset as a ROS bag, to view it in RViz or Foxglove or to play it to another program."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +16,9 @@ from service.imaging.depth_formats import read_depth_values
 from service.imaging.picture_headers import ImageLimits
 
 BagFormat = Literal["mcap", "sqlite3", "bag"]
+#: Names of the frames.
 VEHICLE, LIDAR, CAMERA, MAP = "base_link", "lidar", "camera", "map"
+#: Message type of each topic.
 TOPICS = {
     "/points": "sensor_msgs/msg/PointCloud2", "/camera/color/image_raw": "sensor_msgs/msg/Image",
     "/camera/depth/image_raw": "sensor_msgs/msg/Image", "/camera/color/camera_info": "sensor_msgs/msg/CameraInfo",
@@ -32,16 +34,16 @@ def write_bag(
 
     Args:
         dataset: to read.
-        queries: the set whose pictures go in, of one camera; None for none.
-        out: the bag: a folder (``mcap``, ``sqlite3``; ROS 2) or a file (``bag``; ROS 1).
-        kind: of bag.
-        report: told the moments done and all.
+        queries: name of the query set to write, of one camera; None writes no images.
+        out: the bag to write: a folder (``mcap``, ``sqlite3``; ROS 2) or a file (``bag``; ROS 1).
+        kind: format of the bag.
+        report: called with the moments done and all moments.
 
     Returns:
-        How many moments were written.
+        Number of moments that were written.
 
     Raises:
-        DatasetError: ``out`` is there already, or the dataset cannot be told as a drive.
+        DatasetError: ``out`` already exists or has an unsuitable name, or the dataset cannot be written as one traversal.
     """
     if out.exists():
         raise DatasetError(f"{out} is there already; name another", field="out")
@@ -67,12 +69,12 @@ def write_bag(
 
 @contextmanager
 def _writing(out: Path, kind: BagFormat) -> Iterator[tuple[dict[str, Any], Send]]:
-    """The types of the messages, and a function that writes one."""
+    """Yield the message types, and a function that writes a message."""
     from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
-    if kind == "bag":  # the package's own ROS 1 types do not have it
+    if kind == "bag":  # the package's ROS 1 types lack this type
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TOPICS["/tf_static"]))
     with _whole(out) as part:
         writer: Any
@@ -93,7 +95,7 @@ def _writing(out: Path, kind: BagFormat) -> Iterator[tuple[dict[str, Any], Send]
 
 @contextmanager
 def _whole(out: Path) -> Iterator[Path]:
-    """A name in a folder beside ``out`` that becomes it when all is written; the folder goes in any case."""
+    """Yield a temporary path beside ``out``; rename it when all is written. The temporary folder is always removed."""
     import shutil
 
     part = out.with_name(f".{out.name}.part")
@@ -101,21 +103,21 @@ def _whole(out: Path) -> Iterator[Path]:
         shutil.rmtree(part)
     part.mkdir(parents=True)
     try:
-        yield part / out.name  # under its own name, which a ROS 2 bag's files bear too
+        yield part / out.name  # the final name, because the files of a ROS 2 bag contain it
         (part / out.name).rename(out)
     finally:
         shutil.rmtree(part)
 
 
 class _Messages:
-    """Makes the messages of a moment."""
+    """Make the messages of a moment."""
 
     def __init__(self, types: dict[str, Any], T_vehicle_lidar: Transform, camera: CameraSensor | None) -> None:
         self._types, self._T_vehicle_lidar, self._camera = types, T_vehicle_lidar, camera
         self._sequence = 0
 
     def of(self, moment: Moment) -> Iterator[tuple[str, Any]]:
-        """Topics and messages; the pose first."""
+        """Topics and messages of a moment; the pose comes first."""
         yield "/odometry", self._odometry(moment)
         if moment.points is not None:
             yield "/points", self._cloud(moment.stamp_s, moment.points)
@@ -126,14 +128,14 @@ class _Messages:
             yield "/camera/depth/image_raw", self._depth(moment)
 
     def mountings(self, stamp_s: float) -> Any:
-        """``/tf_static``."""
+        """The message of ``/tf_static``."""
         edges = [self._edge(stamp_s, LIDAR, self._T_vehicle_lidar)]
         if self._camera is not None:
             edges.append(self._edge(stamp_s, CAMERA, T_vehicle_camera(self._camera)))
         return self._make("tf2_msgs/msg/TFMessage", transforms=edges)
 
     def _depth(self, moment: Moment) -> Any:
-        """Whole millimetres as they are; other steps as metres, since 16UC1 has none but millimetres (REP-118)."""
+        """Depth as 16UC1 if it is in whole millimetres, otherwise as 32FC1 in metres (REP-118)."""
         assert moment.frame is not None  # noqa: S101
         spec = moment.frame.camera.depth
         values = read_depth_values(read_bytes(moment.frame.depth_path), encoding=None, limits=ImageLimits())

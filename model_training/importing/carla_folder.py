@@ -1,7 +1,7 @@
-"""CARLA recordings on disk: what ``save_to_disk`` writes (PLY, PNG, 24-bit depth PNG), with poses and mountings beside it.
+"""CARLA recordings on disk, as ``save_to_disk`` writes them: PLY, PNG and 24-bit depth PNG, with poses and mountings.
 
-``recording.json`` tells where sensors are mounted and the camera's field of view, ``poses.csv`` where the vehicle was in each
-frame, both in CARLA's own convention; ``streetfix record carla`` writes them.
+``recording.json`` holds the mountings of the sensors and the camera's field of view. ``poses.csv`` holds the vehicle's pose
+in each frame. Both use CARLA's own convention. ``streetfix record carla`` writes both files.
 """
 
 import csv
@@ -35,7 +35,16 @@ class _Model(BaseModel):
 
 
 class Mounting(_Model):
-    """A ``carla.Transform`` against the vehicle: metres and degrees, left-handed."""
+    """A ``carla.Transform`` relative to the vehicle, in CARLA's left-handed frame.
+
+    Attributes:
+        x: forward, metres.
+        y: to the right, metres.
+        z: up, metres.
+        roll: degrees.
+        pitch: degrees.
+        yaw: degrees.
+    """
 
     x: float = 0.0
     y: float = 0.0
@@ -45,12 +54,19 @@ class Mounting(_Model):
     yaw: float = 0.0
 
     def T_vehicle_sensor(self) -> Transform:
-        """In our convention."""
+        """Convert the mounting to a right-handed transform of a body: x forward, y left, z up."""
         return T_from_carla(self.x, self.y, self.z, self.roll, self.pitch, self.yaw)
 
 
 class CarlaCamera(_Model):
-    """RGB and depth camera, mounted as one."""
+    """An RGB and a depth camera with the same mounting.
+
+    Attributes:
+        width: pixels.
+        height: pixels.
+        fov_deg: horizontal field of view from edge to edge, degrees.
+        mounting: on the vehicle.
+    """
 
     width: int = Field(gt=0)
     height: int = Field(gt=0)
@@ -58,13 +74,21 @@ class CarlaCamera(_Model):
     mounting: Mounting = Mounting()
 
     def pinhole(self) -> PinholeCamera:
-        """CARLA's field of view is horizontal and reaches from edge to edge."""
+        """Return the intrinsics. CARLA's field of view is horizontal and reaches from edge to edge."""
         focal = self.width / (2.0 * np.tan(np.deg2rad(self.fov_deg) / 2))
         return PinholeCamera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
 
 
 class CarlaLidar(_Model):
-    """The ray-cast LiDAR."""
+    """The ray-cast LiDAR.
+
+    Attributes:
+        channels: number of beams.
+        upper_fov_deg: elevation of the highest beam, degrees.
+        lower_fov_deg: elevation of the lowest beam, degrees.
+        range_m: greatest range, metres.
+        mounting: on the vehicle.
+    """
 
     channels: int = 32
     upper_fov_deg: float = 10.0
@@ -74,7 +98,13 @@ class CarlaLidar(_Model):
 
 
 class CarlaRecording(_Model):
-    """``recording.json``."""
+    """Content of ``recording.json``.
+
+    Attributes:
+        town: name of CARLA's map.
+        lidar: the LiDAR.
+        camera: the camera; None without images.
+    """
 
     town: str = ""
     lidar: CarlaLidar
@@ -83,7 +113,16 @@ class CarlaRecording(_Model):
 
 @dataclass(frozen=True, slots=True)
 class CarlaFolder:
-    """A recording; ``vehicle`` is the actor's origin, on the ground."""
+    """A CARLA recording. The vehicle frame is at the actor's origin, on the ground.
+
+    Attributes:
+        path: folder of the recording.
+        told: content of ``recording.json``.
+        frames: names of the frames, in order.
+        poses: T_map_vehicle at the frames.
+        kind: name of the format.
+        georeference: always None.
+    """
 
     path: Path
     told: CarlaRecording
@@ -103,20 +142,24 @@ class CarlaFolder:
 
     @property
     def notes(self) -> Notes:
-        """How many there are."""
+        """Number of frames, and the town."""
         town = f" of {self.told.town}" if self.told.town else ""
         return Notes((f"{len(self.frames)} frames{town}",), {"path": self.path.name, "town": self.told.town})
 
     def count(self) -> int:
-        """A scan a frame, and a picture where there is a camera."""
+        """Count one scan per frame, and one image per frame if there is a camera."""
         return len(self.frames) * (2 if self.told.camera else 1)
 
     def trajectory(self) -> Trajectory | None:
-        """T_map_vehicle: CARLA's world, mirrored to be right-handed, as its OpenDRIVE is."""
+        """Return T_map_vehicle. The map frame is CARLA's world, mirrored to be right-handed, as in its OpenDRIVE file."""
         return self.poses
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """Frame by frame."""
+        """Yield scan and image of each frame.
+
+        Args:
+            pictures: yield images too.
+        """
         for name, stamp_s in zip(self.frames, self.poses.stamps_s, strict=True):
             scan = self.path / "lidar" / f"{name}.ply"
             points = read_cloud(scan) if scan.is_file() else "the file is missing"
@@ -147,6 +190,9 @@ class CarlaFolder:
 def open_carla(source: Path) -> CarlaFolder:
     """Open a recording.
 
+    Args:
+        source: folder of the recording.
+
     Raises:
         DatasetError: ``recording.json`` or ``poses.csv`` is missing or broken.
     """
@@ -167,10 +213,16 @@ def open_carla(source: Path) -> CarlaFolder:
 
 
 def write_recording(out: Path, recording: CarlaRecording) -> None:
-    """Write ``recording.json``."""
+    """Write ``recording.json``.
+
+    Args:
+        out: folder of the recording.
+        recording: mountings and camera.
+    """
     (out / "recording.json").write_text(json.dumps(recording.model_dump(mode="json"), indent=1) + "\n")
 
 
+#: Columns of ``poses.csv``: seconds, metres and degrees, in CARLA's convention.
 POSE_COLUMNS = ("frame", "timestamp", "x", "y", "z", "roll", "pitch", "yaw")
 
 

@@ -1,6 +1,6 @@
-"""Record a drive from a running CARLA: RGB, depth and LiDAR of one vehicle, frame by frame in synchronous mode.
+"""Record a traversal in a running CARLA: RGB, depth and LiDAR of one vehicle, frame by frame in synchronous mode.
 
-The files are those that ``carla_folder`` reads. Only this module talks to a server; it needs the package ``carla``.
+``carla_folder`` reads the files. Only this module talks to a server. It needs the package ``carla``.
 """
 
 import csv
@@ -27,16 +27,17 @@ from service.errors import DatasetError
 
 @dataclass(frozen=True, slots=True)
 class RecordSettings:
-    """What is recorded.
+    """Settings of a recording.
 
     Attributes:
-        town: loaded before; empty takes the world as it is.
-        weather: a name of ``carla.WeatherParameters``, such as ``ClearNoon``; empty leaves it.
-        frames: so many are kept.
-        step_s: between them; the simulation's own step.
-        seed: of the traffic manager and the place of the vehicle.
-        timeout_s: of the server's answers.
-        lidar: the LiDAR; camera: RGB and depth.
+        town: map to load before; empty keeps the current world.
+        weather: a name of ``carla.WeatherParameters``, such as ``ClearNoon``; empty keeps the current weather.
+        frames: number of frames.
+        step_s: time between frames, seconds; also the step of the simulation.
+        seed: seed of the traffic manager and of the vehicle's start.
+        timeout_s: greatest time for an answer of the server, seconds.
+        lidar: the LiDAR.
+        camera: RGB and depth camera.
     """
 
     town: str = ""
@@ -52,11 +53,11 @@ class RecordSettings:
 
 
 class MomentWriter:
-    """Writes moments as they come; what was written is readable at any time.
+    """Write moments as they come. What is written can be read at any time.
 
     Args:
         out: a new folder.
-        recording: mountings and the camera.
+        recording: mountings and camera.
 
     Raises:
         DatasetError: ``out`` is not empty.
@@ -73,11 +74,11 @@ class MomentWriter:
             csv.writer(file).writerow(POSE_COLUMNS)
 
     def write(self, frame: int, stamp_s: float, transform: Any, *, lidar: Any, rgb: Any, depth: Any) -> None:
-        """Write one moment; its pose comes last, so that a frame with a pose is whole.
+        """Write one moment. The pose comes last, so a frame with a pose is complete.
 
         Args:
-            frame: CARLA's number of it.
-            stamp_s: simulated seconds.
+            frame: CARLA's number of the frame.
+            stamp_s: simulated time, seconds.
             transform: ``carla.Transform`` of the vehicle.
             lidar: ``carla.LidarMeasurement``.
             rgb: ``carla.Image`` of the RGB camera.
@@ -95,22 +96,22 @@ class MomentWriter:
 
 
 def record(host: str, port: int, out: Path, settings: RecordSettings, *, report: Callable[[int, int], None]) -> int:
-    """Drive a vehicle by autopilot and record it.
+    """Let the autopilot drive a vehicle, and record it.
 
-    The world's settings are put back and the actors taken away at the end, also after Ctrl-C; what was recorded by then stays.
+    At the end, also after Ctrl-C, the world gets its settings back and the actors are removed. What was recorded stays.
 
     Args:
-        host: of the server.
+        host: name or address of the server.
         port: of the server.
         out: a new folder.
-        settings: what is recorded.
-        report: told the frames done and all.
+        settings: of the recording.
+        report: called with the frames done and all frames.
 
     Returns:
-        Frames recorded.
+        Number of recorded frames.
 
     Raises:
-        DatasetError: the server does not answer, or stops to, or a name is not known to it; or ``out`` is not empty.
+        DatasetError: the server does not answer, stops answering, or does not know a name; or ``out`` is not empty.
     """
     import carla
 
@@ -125,7 +126,7 @@ def record(host: str, port: int, out: Path, settings: RecordSettings, *, report:
     client.set_timeout(settings.timeout_s)
     try:
         return _recorded(carla, client, out, settings, told)
-    except RuntimeError as error:  # whatever the client meets, a time-out among it
+    except RuntimeError as error:  # all errors of the client, time-outs included
         told_by = f"CARLA at {host}:{port} does not do its part ({error})"
         remedy = f"{done} frames are in {out}; start it again" if done else "start it, or name another --host or --town"
         raise DatasetError(f"{told_by}; {remedy}", field="host") from error
@@ -202,7 +203,12 @@ def _sensor(
 
 
 def attributes(kind: str, settings: RecordSettings) -> dict[str, str]:
-    """Attributes of a sensor's blueprint, as CARLA's reference of sensors names them; a LiDAR turns once a frame."""
+    """Return the attributes of a sensor's blueprint, named as in CARLA's reference. A LiDAR turns once per frame.
+
+    Args:
+        kind: ``lidar``, ``rgb`` or ``depth``.
+        settings: of the recording.
+    """
     if kind == "lidar":
         lidar = settings.lidar
         return {
@@ -215,7 +221,7 @@ def attributes(kind: str, settings: RecordSettings) -> dict[str, str]:
 
 
 def _of_frame(waiting: "queue.Queue[Any]", frame: int, timeout_s: float) -> Any:
-    """What a sensor says of a frame; older data are of frames before the recording."""
+    """Wait for the data of a frame. Older data belong to frames before the recording."""
     while True:
         try:
             data = waiting.get(timeout=timeout_s)
@@ -233,7 +239,7 @@ def _of_frame(waiting: "queue.Queue[Any]", frame: int, timeout_s: float) -> Any:
 
 
 def _write_ply(path: Path, points: np.ndarray) -> None:
-    """Binary PLY with the properties that CARLA's own ``save_to_disk`` writes."""
+    """Write a binary PLY with the properties of CARLA's own ``save_to_disk``."""
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
     header += "".join(f"property float32 {name}\n" for name in ("x", "y", "z", "I")) + "end_header\n"
     path.write_bytes(header.encode() + np.ascontiguousarray(points, "<f4").tobytes())

@@ -1,4 +1,4 @@
-"""One scan in a file of its own: PCD, PLY, LAS, LAZ, or KITTI's rows of float32."""
+"""Read one scan from its own file: PCD, PLY, LAS, LAZ, or KITTI's rows of float32."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,21 +13,24 @@ from model_training.importing.scan_file import read_scan
 
 Points = Float32[NDArray[np.float32], "N 4"]
 _INTENSITY = ("intensity", "Intensity", "I", "i", "reflectivity", "scalar_Intensity", "scalar_intensity")
-#: No return comes from further away: such points are a map's, whose coordinates float32 does not hold.
+#: Greatest coordinate of a scan, metres. Larger ones belong to a map, and float32 is too coarse for them.
 _FARTHEST_M = 20_000.0
-#: Bytes of a file that are read at all.
+#: Greatest size of a file that is read.
 MAX_BYTES = 1 << 30
 
 
 def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
-    """Points x y z (as the file has them, metres) and intensity, or why the file is no scan.
+    """Read the points of a scan, or say why the file is none.
 
     Args:
-        path: its suffix says the format.
-        max_points: more is refused.
+        path: of the file; its suffix gives the format.
+        max_points: a larger scan is refused.
+
+    Returns:
+        x y z in metres, as in the file, and intensity (N, 4); or the reason.
 
     Raises:
-        DatasetError: the file vanished, or cannot be read.
+        DatasetError: the file is missing or cannot be read.
     """
     if path.suffix.lower() == ".bin":
         return read_scan(path, max_points=max_points)
@@ -38,10 +41,10 @@ def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
     except ModuleNotFoundError:
         raise
     except OSError as error:
-        if error.errno is not None:  # of the system; a package's own complaint of the content has no number
+        if error.errno is not None:  # the system's error; a package's error about the content has no errno
             raise unreadable(path, error) from error
         return f"it cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
-    except Exception as error:  # three packages, each with errors of its own, and whatever damage makes NumPy raise
+    except Exception as error:  # three packages and NumPy raise errors without a common base on damaged files
         return f"it cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
     if isinstance(columns, str):
         return columns
@@ -58,7 +61,7 @@ def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
 def _pcd(path: Path, max_points: int) -> Points | str:
     from pypcd4.pypcd4 import PointCloud
 
-    del max_points  # its bytes, which were counted, are nearly those in memory
+    del max_points  # the size of the file was checked, and it is close to the size in memory
     cloud = PointCloud.from_path(path)
     return _columns(cloud.fields, lambda name: cloud.numpy((name,))[:, 0])
 
@@ -75,7 +78,7 @@ def _las(path: Path, max_points: int) -> Points | str:
     import laspy
 
     with laspy.open(path) as file:
-        if file.header.point_count > max_points:  # LAZ is packed: its bytes say little
+        if file.header.point_count > max_points:  # LAZ is compressed: its size does not bound the points
             return f"more than {max_points} points"
         cloud = file.read()
     xyz = np.asarray(cloud.xyz)
@@ -93,4 +96,5 @@ def _columns(names: Sequence[str], column: Callable[[str], Any]) -> Points | str
 
 
 _READERS: dict[str, Callable[[Path, int], Points | str]] = {".pcd": _pcd, ".ply": _ply, ".las": _las, ".laz": _las}
+#: Suffixes of the formats that ``read_cloud`` reads.
 SUFFIXES = (".bin", *_READERS)

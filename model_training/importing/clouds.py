@@ -1,4 +1,4 @@
-"""A folder of scans, a file each, with one TUM file of poses: what many tools can write."""
+"""A folder of scans, one file each, with one TUM file of poses. Many tools can write this."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,21 +13,24 @@ from model_training.importing.recording import Event, Notes, RecordedScan, Unusa
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 
-#: Files of poses that are looked for beside the scans.
+#: Names of the file of poses beside the scans.
 POSES = ("poses.txt", "trajectory.txt")
-#: Between scans whose times nobody tells.
+#: Time between scans without times, seconds.
 STEP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Clouds:
-    """Scans in the LiDAR's frame, which is the vehicle's, in the order of their names.
+    """Scans in the LiDAR frame, in the order of their names. The vehicle frame is the LiDAR frame.
 
     Attributes:
         path: the folder.
         files: the scans.
-        stamps_s: of each: that of its pose, or counted.
-        poses: T_map_lidar, a line a scan; None where there is no file.
+        stamps_s: time of each scan, seconds: that of its pose, or ``STEP_S`` times its number.
+        poses: T_map_lidar, one per scan; None without a file of poses.
+        kind: name of the format.
+        lidar: the LiDAR.
+        georeference: always None.
     """
 
     path: Path
@@ -40,20 +43,24 @@ class Clouds:
 
     @property
     def notes(self) -> Notes:
-        """How many there are."""
+        """Number and formats of the scans."""
         kinds = sorted({path.suffix for path in self.files})
         return Notes((f"{len(self.files)} scans ({', '.join(kinds)})",), {"path": self.path.name})
 
     def count(self) -> int:
-        """Scans."""
+        """Count the scans."""
         return len(self.files)
 
     def trajectory(self) -> Trajectory | None:
-        """As the file has it."""
+        """Return T_map_lidar from the file of poses, or None."""
         return self.poses
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """File by file; there are no pictures."""
+        """Yield the scans, file by file. There are no images.
+
+        Args:
+            pictures: has no effect.
+        """
         del pictures
         for path, stamp_s in zip(self.files, self.stamps_s, strict=True):
             points = read_cloud(path)
@@ -61,14 +68,14 @@ class Clouds:
 
 
 def open_clouds(source: Path, poses: Path | None = None) -> Clouds:
-    """Open a folder.
+    """Open a folder of scans.
 
     Args:
         source: the folder.
-        poses: TUM file, a line a scan; by default one of ``POSES`` beside the scans.
+        poses: TUM file with one line per scan; by default one of ``POSES`` beside the scans.
 
     Raises:
-        DatasetError: there is no scan in it, or poses and scans do not go together.
+        DatasetError: the folder has no scan, or the numbers of poses and scans differ.
     """
     files = tuple(sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES)) if source.is_dir() else ()
     if not files:

@@ -1,4 +1,4 @@
-"""A scan out of a depth picture, for recordings without a LiDAR: its map sees only where its camera looked."""
+"""Make a scan from a depth image, for recordings without a LiDAR. The map then shows only what the camera saw."""
 
 import numpy as np
 from jaxtyping import Float32
@@ -7,15 +7,18 @@ from numpy.typing import NDArray
 from model_training.importing.recording import RecordedPicture, RecordedScan
 from service.geometry.rigid import transform_points
 
-#: Each so many pixels of a row and of a column make a point.
+#: One of this many pixels per row and per column becomes a point.
 EVERY_PX = 4
 
 
 def scan_from_depth(picture: RecordedPicture) -> RecordedScan | None:
-    """Points of a rectified picture in the vehicle's frame with grey levels for intensity; None where it has no depth.
+    """Convert a rectified image pair to a scan in the vehicle frame; its intensity is the grey level, 0..1.
 
     Args:
-        picture: with depth.
+        picture: rectified image with depth.
+
+    Returns:
+        The scan; None if no pixel has depth.
     """
     if picture.depth is None:
         return None

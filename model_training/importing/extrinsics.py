@@ -1,4 +1,4 @@
-"""Mountings that a recording does not tell, in a JSON file."""
+"""Read mountings and intrinsics that a recording does not contain, from a JSON file."""
 
 import json
 from dataclasses import dataclass
@@ -15,17 +15,25 @@ _KEYS = ("T_vehicle_lidar", "T_vehicle_camera")
 
 @dataclass(frozen=True, slots=True)
 class Extrinsics:
-    """Where sensors stand on the vehicle; None where the recording tells."""
+    """Mountings of the sensors on the vehicle. None means that the recording contains it.
+
+    Attributes:
+        T_vehicle_lidar: of the LiDAR (4, 4).
+        T_vehicle_camera: of the camera's optical frame (4, 4).
+    """
 
     T_vehicle_lidar: Transform | None = None
     T_vehicle_camera: Transform | None = None
 
 
 def read_extrinsics(path: Path) -> Extrinsics:
-    """Read ``{"T_vehicle_lidar": 4x4, "T_vehicle_camera": 4x4}``; the camera's frame is its optical one.
+    """Read ``{"T_vehicle_lidar": 4x4, "T_vehicle_camera": 4x4}``; the camera's frame is its optical frame.
+
+    Args:
+        path: of the JSON file.
 
     Raises:
-        DatasetError: the file is missing, not JSON, or a matrix in it is no rigid transform.
+        DatasetError: the file is missing or no JSON, or a matrix in it is no rigid transform.
     """
     try:
         loaded = json.loads(path.read_text())
@@ -37,10 +45,13 @@ def read_extrinsics(path: Path) -> Extrinsics:
 
 
 def read_camera(path: Path) -> PinholeCamera:
-    """Read intrinsics: ``{"width", "height", "fx", "fy", "cx", "cy", "distortion": []}``, or a request's ``camera``.
+    """Read intrinsics: ``{"width", "height", "fx", "fy", "cx", "cy", "distortion": []}``, or the ``camera`` of a request.
+
+    Args:
+        path: of the JSON file; all values in pixels.
 
     Raises:
-        DatasetError: the file is missing, or a number in it is missing or makes no sense.
+        DatasetError: the file is missing, or a number in it is missing or invalid.
     """
     try:
         loaded = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""Which formats there are, and how each is opened; a format's packages are imported when it is."""
+"""The formats of recordings, and how each is opened. The packages of a format are imported only when it is opened."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,17 +16,17 @@ DepthFrom = Literal["recorded", "stored", "sgbm", "lidar"]
 
 @dataclass(frozen=True, slots=True)
 class OpenSettings:
-    """What a reader is told; each takes what concerns it.
+    """Settings of a reader. Each reader uses those that concern it.
 
     Attributes:
-        depth: what a picture's depth comes from.
-        topics: of a bag, by role.
-        extrinsics: mountings that the recording does not tell.
-        camera: intrinsics that the recording does not tell.
-        rectified: whether a bag's pictures are rectified already; None believes the topic's name.
-        poses: TUM file of the poses, which scans in files of their own have their times from.
-        pictures: whether they will be asked for.
-        vertical_correction: turn the points of KITTI's HDL-64 up by the error of its angles; None does so where there is one.
+        depth: source of an image's depth.
+        topics: topics of a bag, by role.
+        extrinsics: mountings that the recording does not contain.
+        camera: intrinsics that the recording does not contain.
+        rectified: whether the images of a bag are rectified already; None decides by the topic's name.
+        poses: TUM file of poses; scans in their own files take their times from it.
+        pictures: whether images will be read.
+        vertical_correction: correct the vertical angle of KITTI's HDL-64; False does not.
     """
 
     depth: DepthFrom = "recorded"
@@ -40,20 +40,26 @@ class OpenSettings:
 
     @property
     def kitti_vertical_deg(self) -> float:
-        """How much KITTI's points are turned up."""
+        """Rotation upwards of KITTI's points, degrees."""
         return 0.0 if self.vertical_correction is False else KITTI_VERTICAL_DEG
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A format: its reader, the depths that it can give, and which of the settings concern it beside these."""
+    """A format.
+
+    Attributes:
+        open: its reader.
+        depths: sources of depth that it offers.
+        takes: settings that concern only some formats, and this one.
+    """
 
     open: Callable[[Path, OpenSettings], Recording]
     depths: tuple[DepthFrom, ...]
     takes: frozenset[str] = frozenset()
 
 
-#: Settings that concern some formats only, and what the command line calls them.
+#: Settings that concern only some formats, and their options on the command line.
 _OPTIONS = {
     "topics": "topic",
     "extrinsics": "extrinsics",
@@ -72,7 +78,7 @@ def open_recording(kind: str, source: Path, settings: OpenSettings) -> Recording
         settings: for the reader.
 
     Raises:
-        DatasetError: the kind is not known, or the reader cannot open it.
+        DatasetError: the kind is unknown, a setting does not apply to it, or the reader cannot open the source.
     """
     if kind not in KINDS:
         raise DatasetError(f"kind: {kind!r} is not known; there is: {', '.join(sorted(KINDS))}", field="kind")
@@ -108,7 +114,7 @@ def _kitti_odometry(source: Path, settings: OpenSettings) -> Recording:
 def _kitti_360(source: Path, settings: OpenSettings) -> Recording:
     from model_training.importing.kitti_360 import open_kitti_360
 
-    # Nothing is recorded beside its pictures, so the usual depth is that of the stereo pair.
+    # The layout has no stored depth, so the default is stereo-matched depth.
     return open_kitti_360(source, depth="none" if settings.depth == "lidar" else "sgbm")
 
 
@@ -153,6 +159,7 @@ def _kitti_depth(depth: DepthFrom) -> Literal["none", "stored", "sgbm"]:
 
 
 _KITTI: tuple[DepthFrom, ...] = ("recorded", "stored", "sgbm", "lidar")
+#: All formats by name.
 KINDS: dict[str, Kind] = {
     "kitti-raw": Kind(_kitti_raw, _KITTI, frozenset({"vertical_correction"})),
     "kitti-odometry": Kind(_kitti_odometry, _KITTI, frozenset({"vertical_correction"})),

@@ -1,7 +1,8 @@
-"""KITTI-360's layout: ``data_2d_raw``, ``data_3d_raw`` and ``data_poses`` side by side, a folder a drive in each, and ``calibration``.
+"""KITTI-360's layout: ``data_2d_raw``, ``data_3d_raw``, ``data_poses`` and ``calibration`` side by side.
 
-Liao et al., KITTI-360, TPAMI 2022. Pictures are those of the rectified perspective pair, ``image_00`` and ``image_01``. Poses are given for
-the moments at which the vehicle moved; scans are not compensated for its motion.
+Each of the first three has one folder per drive. Source: Liao et al., KITTI-360, TPAMI 2022.
+Images are those of the rectified perspective pair, ``image_00`` and ``image_01``. Poses exist only for times at which the
+vehicle moved. Scans are not compensated for the vehicle's motion.
 """
 
 from pathlib import Path
@@ -22,16 +23,18 @@ _PARTS = ("data_3d_raw", "data_2d_raw", "data_poses")
 
 
 def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
-    """Open a drive. A scan's stamp is the moment when the laser faces ahead, and its points' times follow from their azimuths.
+    """Open a drive.
+
+    The stamp of a scan is the time at which the laser faces forward. The times of its points follow from their azimuths.
 
     Args:
-        source: the drive's folder in one of ``data_3d_raw``, ``data_2d_raw`` and ``data_poses``.
-        depth: what a picture's depth comes from; depth stored beside the pictures does not occur in this layout.
+        source: the drive's folder in ``data_3d_raw``, ``data_2d_raw`` or ``data_poses``.
+        depth: source of an image's depth; this layout has no stored depth.
 
     Raises:
-        DatasetError: there is no scan or no calibration, or a file of them is broken.
+        DatasetError: there is no scan or no calibration, or one of their files is broken.
     """
-    source = source.absolute()  # a link to the drive's folder is not followed: the other trees lie beside the link
+    source = source.absolute()  # do not resolve a link to the drive's folder: the other trees lie beside the link
     root, name = source.parent.parent, source.name
     scans_of = root / "data_3d_raw" / name / "velodyne_points"
     pictures = root / "data_2d_raw" / name
@@ -52,7 +55,7 @@ def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
 
 
 def _calibration(folder: Path) -> KittiCalibration:
-    """Of the left perspective camera."""
+    """Calibration of the left perspective camera."""
     path = folder / "perspective.txt"
     found = read_matrices(
         path, {"P_rect_00": (3, 4), "P_rect_01": (3, 4), "R_rect_00": (3, 3)}, optional=frozenset({"P_rect_01"})
@@ -62,14 +65,14 @@ def _calibration(folder: Path) -> KittiCalibration:
 
 
 def _mounting(folder: Path) -> Transform:
-    """T_pose_lidar: poses are those of the inertial system."""
+    """T_pose_lidar: the poses are those of the inertial system."""
     path = folder / "calib_cam_to_pose.txt"
     rows = read_matrices(path, {"image_00": (3, 4)})["image_00"]
     return _rigid(rows, f"{path}: image_00", path.name) @ inverse(_T_lidar_cam0(folder))
 
 
 def _T_lidar_cam0(folder: Path) -> Transform:
-    """Of the left camera before rectification."""
+    """Pose of the left camera before rectification."""
     path = folder / "calib_cam_to_velo.txt"
     try:
         rows = np.array(read_bytes(path).decode("ascii").split(), np.float64).reshape(3, 4)
@@ -81,7 +84,7 @@ def _T_lidar_cam0(folder: Path) -> Transform:
 
 
 def _rigid(rows: NDArray[np.float64], where: str, field: str) -> Transform:
-    """Rows (3, 4) as a transform.
+    """Convert rows (3, 4) to a transform.
 
     Raises:
         DatasetError: they are not finite, or their first three columns are no rotation.
@@ -93,7 +96,7 @@ def _rigid(rows: NDArray[np.float64], where: str, field: str) -> Transform:
 
 
 def _poses(path: Path, stamps: dict[int, float], calibration: Path) -> Trajectory | None:
-    """T_map_lidar at those moments that have a frame here; None if there is no such moment."""
+    """T_map_lidar at the times that have a frame; None if there is no such time."""
     if not path.is_file():
         return None
     T_pose_lidar = _mounting(calibration)

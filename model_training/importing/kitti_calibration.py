@@ -1,4 +1,4 @@
-"""KITTI's calibration, in the layouts that its benchmarks came in: the left colour camera, the right one, and the LiDAR."""
+"""KITTI's calibration in the layouts of its benchmarks: left and right colour camera, and LiDAR."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,12 +16,16 @@ _OBJECT = {"P2": (3, 4), "P3": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 
 
 @dataclass(frozen=True, slots=True)
 class KittiCalibration:
-    """The left colour camera (2), its distance to the right one (3), and where the LiDAR stands.
+    """Left colour camera (2), its baseline to the right one (3), and the mounting of the LiDAR.
 
     Attributes:
-        fx: pixels, as are fy, cx and cy.
-        focal_baseline_px_m: fx times the baseline of cameras 2 and 3: z is this over the disparity; None where the right one is not told.
-        T_camera_lidar: takes LiDAR coordinates to the optical frame of camera 2, the offset in P2 included.
+        fx: pixels.
+        fy: pixels.
+        cx: pixels.
+        cy: pixels.
+        focal_baseline_px_m: fx times the baseline of cameras 2 and 3, pixels times metres: z is this over the disparity. None
+            if the right camera is not calibrated.
+        T_camera_lidar: maps points from the LiDAR frame to the optical frame of camera 2, with the offset in P2 (4, 4).
     """
 
     fx: float
@@ -33,12 +37,15 @@ class KittiCalibration:
 
     @property
     def baseline_m(self) -> float | None:
-        """Distance of cameras 2 and 3, metres; None where the right one is not told."""
+        """Distance of cameras 2 and 3, metres; None if the right camera is not calibrated."""
         return None if self.focal_baseline_px_m is None else self.focal_baseline_px_m / self.fx
 
 
 def read_calibration(path: Path) -> KittiCalibration:
-    """Read a frame's calibration of the object layout: ``calib/NNNNNN.txt`` with P2, P3, R0_rect and Tr_velo_to_cam.
+    """Read the calibration of a frame in the object layout: P2, P3, R0_rect and Tr_velo_to_cam.
+
+    Args:
+        path: the file ``calib/NNNNNN.txt``.
 
     Raises:
         DatasetError: the file is missing, or a matrix in it is missing, broken or impossible.
@@ -50,16 +57,16 @@ def read_calibration(path: Path) -> KittiCalibration:
 
 
 def calibration_from(path: Path, *, P2: Matrix, P3: Matrix | None, R0: Matrix, Tr: Matrix) -> KittiCalibration:
-    """Put the matrices together.
+    """Combine the matrices of a calibration.
 
-    P2 is K [I | t], so t = K^-1 times its last column takes the rectified frame of camera 0 to that of camera 2.
+    P2 is K [I | t]. So t = K^-1 times its last column maps the rectified frame of camera 0 to the frame of camera 2.
 
     Args:
-        path: where they were read, for messages.
-        P2: (3, 4) projection of the left colour camera, from the rectified frame of camera 0.
-        P3: (3, 4) of the right one.
-        R0: (3, 3) rectification of camera 0.
-        Tr: (3, 4) from the LiDAR to camera 0 before rectification.
+        path: of the file, for errors.
+        P2: projection of the left camera, from the rectified frame of camera 0 (3, 4).
+        P3: the same of the right camera (3, 4); None if it is not calibrated.
+        R0: rectification of camera 0 (3, 3).
+        Tr: maps points from the LiDAR frame to camera 0 before rectification (3, 4).
 
     Raises:
         DatasetError: they are no rigid mounting, or no stereo pair.
@@ -84,12 +91,15 @@ def calibration_from(path: Path, *, P2: Matrix, P3: Matrix | None, R0: Matrix, T
 def read_matrices(
     path: Path, shapes: Mapping[str, tuple[int, ...]], *, optional: frozenset[str] = frozenset()
 ) -> dict[str, Matrix]:
-    """Read ``KEY: numbers`` lines.
+    """Read lines of the form ``KEY: numbers``.
 
     Args:
         path: of the file.
-        shapes: the keys wanted, each with its shape.
-        optional: those that may be missing; they are then missing in the result too.
+        shapes: wanted keys, each with its shape.
+        optional: keys that may be missing; they are then missing in the result too.
+
+    Returns:
+        A matrix per key, of the wanted shape.
 
     Raises:
         DatasetError: the file is missing, or a matrix in it is missing or broken.

@@ -1,4 +1,4 @@
-"""The files of a frame in KITTI's object layout, read with every doubt."""
+"""Read and check the files of a frame in KITTI's object layout."""
 
 from pathlib import Path
 
@@ -15,10 +15,14 @@ _LIMITS = ImageLimits()
 
 
 def copy_scan(path: Path, to: Path) -> None:
-    """Copy a scan (float32 x y z intensity), checked.
+    """Copy a scan (float32 x y z intensity) after a check.
+
+    Args:
+        path: of the scan.
+        to: file to write.
 
     Raises:
-        DatasetError: it is empty or cut off, or a number in it is not finite.
+        DatasetError: the scan is empty or cut off, or a number in it is not finite.
     """
     size = size_of(path)
     if size == 0 or size % ROW_BYTES:
@@ -31,7 +35,10 @@ def copy_scan(path: Path, to: Path) -> None:
 
 
 def read_rgb(path: Path) -> UInt8[NDArray[np.uint8], "H W 3"]:
-    """Read a colour picture.
+    """Read a colour image.
+
+    Args:
+        path: of the image.
 
     Raises:
         DatasetError: it is damaged.
@@ -43,11 +50,11 @@ def read_rgb(path: Path) -> UInt8[NDArray[np.uint8], "H W 3"]:
 
 
 def read_stored_depth(path: Path, size: tuple[int, ...]) -> UInt16[NDArray[np.uint16], "H W"]:
-    """Read the depth that lies beside a picture: metres x 256, 0 where nothing was measured.
+    """Read the depth stored beside an image: metres x 256, 0 where nothing was measured.
 
     Args:
         path: 16-bit PNG.
-        size: (height, width) of its left picture.
+        size: (height, width) of the left image.
 
     Raises:
         DatasetError: it is missing or damaged, or has another size.
@@ -64,5 +71,10 @@ def read_stored_depth(path: Path, size: tuple[int, ...]) -> UInt16[NDArray[np.ui
 
 
 def damaged(path: Path, why: str) -> DatasetError:
-    """The error for a file of a recording that cannot be used."""
+    """Make the error for a file of a recording that cannot be used.
+
+    Args:
+        path: of the file.
+        why: the reason.
+    """
     return DatasetError(f"{path}: {why}; take the file from the recording again, or remove the frame", field=path.name)

@@ -1,7 +1,7 @@
-"""Import of KITTI's object layout: single frames, each its own place.
+"""Import KITTI's object layout: single frames, each at its own place.
 
-A frame with a scan is a place of the map; with a right picture it is a query too, in the set ``frames`` if the map has
-its place and in ``elsewhere`` if it has not. Frames of other years have other cameras, so every query names its own.
+A frame with a scan is a place of the map. A frame with a right image is a query too: in the set ``frames`` if the map has
+its place, otherwise in the set ``elsewhere``. Frames of other years have other cameras, so every query names its camera.
 """
 
 import shutil
@@ -35,9 +35,9 @@ from service.geometry.rigid import Transform, inverse, transform_from
 DepthSource = Literal["stored", "sgbm"]
 Progress = Callable[[int, int], None]
 
-#: Every frame is another place; nothing that a robot sees reaches from one to the next.
+#: Distance between the places of frames, metres: larger than any range, so that no place sees another.
 PLACE_SPACING_M = 1000.0
-#: KITTI's own step of stored depth; up to 256 m in 16 bits.
+#: Step of KITTI's stored depth, metres; 16 bits reach 256 m.
 DEPTH_SCALE_M = 1 / 256
 _KINDS, _SUFFIXES = ("image_2", "image_3", "velodyne"), (".png", ".jpg", ".bin")
 _HDL64 = LidarSensor(
@@ -47,7 +47,15 @@ _HDL64 = LidarSensor(
 
 @dataclass(frozen=True, slots=True)
 class KittiObjectSummary:
-    """What was imported; ``skipped`` names each frame that is of no use, with the reason."""
+    """What was imported.
+
+    Attributes:
+        places: number of map places.
+        frames: number of queries whose place is in the map.
+        elsewhere: number of out-of-map queries.
+        cameras: number of different cameras.
+        skipped: every frame that was left out, with the reason.
+    """
 
     places: int
     frames: int
@@ -58,7 +66,7 @@ class KittiObjectSummary:
 
 @dataclass(slots=True)
 class _QuerySet:
-    """What is gathered of a query set while it is written."""
+    """A query set while it is written."""
 
     names: list[str] = field(default_factory=list)
     cameras: list[str] = field(default_factory=list)
@@ -71,13 +79,13 @@ def import_kitti_object(
     """Import a folder of KITTI's object layout as a dataset.
 
     Args:
-        source: the folder ``training``, or the one that holds it.
-        out: the dataset to write; it appears when it is whole.
-        depth: ``stored`` takes ``gt_depth`` (16 bits, metres x 256), ``sgbm`` matches the left and right picture.
+        source: the folder ``training``, or the folder that holds it.
+        out: the dataset to write; it appears only when it is complete.
+        depth: ``stored`` takes ``gt_depth`` (16 bits, metres x 256); ``sgbm`` matches the left and right image.
         progress: called with the frames done and all frames.
 
     Raises:
-        DatasetError: nothing to import, ``out`` is taken, or a file is missing or damaged.
+        DatasetError: there is nothing to import, ``out`` already exists, or a file is missing or damaged.
     """
     training = source / "training" if (source / "training").is_dir() else source
     names = sorted({p.stem for kind in _KINDS for p in (training / kind).glob("*") if p.suffix in _SUFFIXES})
@@ -97,7 +105,7 @@ def import_kitti_object(
 
 
 class _Importer:
-    """Takes frame after frame into a dataset folder."""
+    """Add frame after frame to a dataset folder."""
 
     def __init__(self, training: Path, out: Path, depth: DepthSource) -> None:
         self._training = training
@@ -109,7 +117,7 @@ class _Importer:
         self._skipped: list[str] = []
 
     def add(self, name: str) -> None:
-        """Take one frame for what it is."""
+        """Add one frame as a place, a query, or both."""
         scan = self._training / "velodyne" / f"{name}.bin"
         has_scan, right = scan.is_file(), self._picture("image_3", name)
         stored = self._training / "gt_depth" / f"{name}.png"
@@ -155,7 +163,7 @@ class _Importer:
         )
 
     def _source(self) -> dict[str, Any]:
-        """Where the dataset comes from: for ``dataset.json``."""
+        """Origin of the dataset, for ``dataset.json``."""
         source: dict[str, Any] = {"kind": "kitti-object", "depth": self._depth, "places": self._places}
         source["queries"] = {name: queries.names for name, queries in self._sets.items() if queries.names}
         if self._depth == "sgbm":
@@ -184,7 +192,7 @@ class _Importer:
             queries.poses.append(T_map_lidar @ inverse(calibration.T_camera_lidar))
 
     def _camera_name(self, calibration: KittiCalibration, height: int, width: int) -> str:
-        """Name of the camera with these intrinsics and this mounting, a new one where none is like it."""
+        """Name of the camera with these intrinsics and this mounting; adds the camera if it is new."""
         camera = CameraSensor(
             name=f"image_2-{len(self._cameras)}",
             width=width,
@@ -210,7 +218,7 @@ class _Importer:
 
 
 def _write_poses(path: Path, poses: list[Transform]) -> None:
-    """Single frames have no time; their number stands for it, seconds."""
+    """Write poses. Single frames have no time, so their number serves as seconds."""
     write_tum(path, np.arange(len(poses), dtype=np.float64), np.stack(poses))
 
 

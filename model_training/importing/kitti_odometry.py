@@ -1,6 +1,6 @@
 """KITTI's odometry layout: ``sequences/NN/{velodyne,image_2,image_3,calib.txt,times.txt}`` and ``poses/NN.txt``.
 
-Where there is no colour pair, the grey one is taken (``image_0``, ``image_1``).
+Without a colour pair the grey pair is used (``image_0``, ``image_1``).
 """
 
 from pathlib import Path
@@ -15,20 +15,20 @@ from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError
 from service.geometry.rigid import inverse, transform_from
 
-#: Left and right camera: the colour pair before the grey one.
+#: Left and right camera: the colour pair is preferred to the grey one.
 _PAIRS = (("2", "3"), ("0", "1"))
 
 
 def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float = KITTI_VERTICAL_DEG) -> KittiSequence:
-    """Open a sequence. Its scans are compensated for the vehicle's motion already, so points get no times.
+    """Open a sequence. Its scans are already compensated for the vehicle's motion, so points get no times.
 
     Args:
         source: its folder, ``.../sequences/NN``.
-        depth: what a picture's depth comes from.
-        vertical_deg: how much every point is turned up.
+        depth: source of an image's depth.
+        vertical_deg: rotation upwards of every point, degrees.
 
     Raises:
-        DatasetError: a scan, calibration or time is missing or broken.
+        DatasetError: a scan, the calibration or a time is missing or broken.
     """
     scans = numbered(source / "velodyne", (".bin",))
     if not scans:
@@ -54,7 +54,7 @@ def _calibration(path: Path, left: str, right: str) -> tuple[KittiCalibration, n
 
 
 def _times(path: Path, last: int) -> list[float]:
-    """Seconds of every frame; at the usual rate where the file is missing."""
+    """Seconds of every frame; at ``RATE_HZ`` if the file is missing."""
     if not path.is_file():
         return [n / RATE_HZ for n in range(last + 1)]
     try:
@@ -67,7 +67,7 @@ def _times(path: Path, last: int) -> list[float]:
 
 
 def _poses(path: Path, stamps: list[float], T_lidar_cam0: np.ndarray) -> Trajectory | None:
-    """T_map_lidar: the map is the LiDAR's frame at the first moment, so that it is level and z is up, unlike camera 0's."""
+    """T_map_lidar. The map frame is the LiDAR frame of the first scan: it is level and z is up, unlike camera 0's frame."""
     if not path.is_file():
         return None
     poses, times = [], []

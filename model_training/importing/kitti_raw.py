@@ -1,8 +1,7 @@
 """KITTI's raw layout: ``DATE/DATE_drive_NNNN_sync/{velodyne_points,image_02,image_03,oxts}`` and the day's calibration.
 
-A drive's files are numbered alike; what was left out of an extract may be missing. Where there is no colour pair, the grey one is
-taken (``image_00``, ``image_01``). Depth that lies beside is that of KITTI's
-depth benchmark, ``proj_depth/groundtruth/image_02``.
+All files of one frame have the same number. An extract may lack some files. Without a colour pair the grey pair is used
+(``image_00``, ``image_01``). Stored depth is that of KITTI's depth benchmark, ``proj_depth/groundtruth/image_02``.
 """
 
 from pathlib import Path
@@ -22,19 +21,20 @@ from service.errors import DatasetError
 from service.geometry.rigid import Transform, transform_from
 
 _PICTURES = (".png", ".jpg")
-#: Left and right camera: the colour pair before the grey one.
+#: Left and right camera: the colour pair is preferred to the grey one.
 _PAIRS = (("02", "03"), ("00", "01"))
 
 
 def open_kitti_raw(source: Path, *, depth: KittiDepth, vertical_deg: float = KITTI_VERTICAL_DEG) -> KittiSequence:
-    """Open a drive. A scan's stamp is the moment when the laser faces ahead, and its points' times follow from their azimuths.
+    """Open a drive.
 
-    A drive that ``streetfix convert`` wrote holds scans of one moment each; the file ``SCANS_AT_REST`` in it says so.
+    The stamp of a scan is the time at which the laser faces forward. The times of its points follow from their azimuths.
+    In a drive that ``streetfix convert`` wrote, each scan was measured at one time. The file ``SCANS_AT_REST`` marks that.
 
     Args:
-        source: the drive's folder, or the day's with a single drive in it.
-        depth: what a picture's depth comes from.
-        vertical_deg: how much every point is turned up.
+        source: the drive's folder, or the day's folder with a single drive in it.
+        depth: source of an image's depth.
+        vertical_deg: rotation upwards of every point, degrees.
 
     Raises:
         DatasetError: there is no drive, no scan, or no calibration.
@@ -82,10 +82,10 @@ def _calibration(drive: Path, left: str, right: str) -> KittiCalibration:
 
 
 def _calibration_file(drive: Path, name: str) -> Path:
-    """One of the day's calibration files: inside the drive's folder or next to it, there or in a folder ``calib``.
+    """Find a calibration file of the day: in the drive's folder, beside it, or in a folder ``calib`` in either.
 
     Raises:
-        DatasetError: it lies in none of them.
+        DatasetError: it is in none of them.
     """
     places = [drive, drive / "calib", drive.parent, drive.parent / "calib"]
     found = next((folder / name for folder in places if (folder / name).is_file()), None)
@@ -98,13 +98,13 @@ def _calibration_file(drive: Path, name: str) -> Path:
 
 
 def _rigid(path: Path) -> Transform:
-    """A file with R and T."""
+    """Read a transform from a file with R and T."""
     found = read_matrices(path, {"R": (3, 3), "T": (3,)})
     return transform_from(found["R"], found["T"])
 
 
 def _poses(drive: Path) -> tuple[Trajectory | None, dict[str, Any] | None]:
-    """T_map_lidar from the inertial system, where it was recorded."""
+    """T_map_lidar and georeference from the inertial system, if it was recorded."""
     files = numbered(drive / "oxts" / "data", (".txt",))
     if not files:
         return None, None

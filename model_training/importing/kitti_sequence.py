@@ -1,4 +1,4 @@
-"""What KITTI's raw and odometry layouts have in common: numbered frames of a rig that is calibrated once."""
+"""Common part of KITTI's raw, odometry and 360 layouts: numbered frames of a rig with one calibration."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,10 +21,11 @@ from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import inverse
 
-#: KITTI's own step of stored depth; up to 256 m in 16 bits.
+#: Step of KITTI's stored depth, metres; 16 bits reach 256 m.
 STORED_SCALE_M = 1 / 256
-#: Frames a second, where the recording names no times.
+#: Frames per second if the recording has no times.
 RATE_HZ = 10.0
+#: KITTI's LiDAR. The vehicle frame is its frame.
 HDL64 = LidarSensor(
     name="hdl-64", channels=64, top_deg=2.0, bottom_deg=-24.8, max_range_m=120.0, T_vehicle_sensor=np.eye(4).tolist()
 )
@@ -33,7 +34,16 @@ KittiDepth = Literal["none", "stored", "sgbm"]
 
 @dataclass(frozen=True, slots=True)
 class KittiFrame:
-    """The files of one moment; each may be missing."""
+    """The files of one moment; None for a file that is missing.
+
+    Attributes:
+        name: number of the frame.
+        stamp_s: time, seconds.
+        scan: the scan.
+        left: left image.
+        right: right image.
+        stored: stored depth of the left image.
+    """
 
     name: str
     stamp_s: float
@@ -45,18 +55,20 @@ class KittiFrame:
 
 @dataclass(frozen=True, slots=True)
 class KittiSequence:
-    """A drive; ``vehicle`` is the LiDAR's frame.
+    """A KITTI drive. The vehicle frame is the LiDAR frame.
 
     Attributes:
-        kind: ``kitti-raw`` or ``kitti-odometry``.
-        path: where it lies.
-        frames: in time order.
+        kind: ``kitti-raw``, ``kitti-odometry`` or ``kitti-360``.
+        path: folder of the drive.
+        frames: in order of time.
         calibration: of all frames.
-        depth: what a picture's depth comes from; ``none`` leaves it to who takes the recording.
+        depth: source of an image's depth; ``none`` yields images without depth.
         poses: T_map_lidar, or None.
-        georeference: of the poses.
-        turn_s: time of one turn of the LiDAR; points' times then follow from their azimuths. None: the scans are compensated already.
-        vertical_deg: how much every point is turned up.
+        georeference: of the map's origin, or None.
+        lidar: the LiDAR.
+        turn_s: time of one turn of the LiDAR, seconds: the times of points follow from their azimuths. None if the scans are
+            already compensated.
+        vertical_deg: rotation upwards of every point, degrees.
     """
 
     kind: str
@@ -72,7 +84,7 @@ class KittiSequence:
 
     @property
     def notes(self) -> Notes:
-        """What there is of each."""
+        """Numbers of scans and images, and how times and angles of points are treated."""
         scans, left, right = (
             sum(getattr(frame, kind) is not None for frame in self.frames) for kind in ("scan", "left", "right")
         )
@@ -94,18 +106,21 @@ class KittiSequence:
         return Notes((counted, times + turned), source)
 
     def count(self) -> int:
-        """Scans and left pictures."""
+        """Count the scans and the left images."""
         return sum((frame.scan is not None) + (frame.left is not None) for frame in self.frames)
 
     def trajectory(self) -> Trajectory | None:
-        """As the recording has it."""
+        """Return T_map_lidar as the recording gives it, or None."""
         return self.poses
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """Frame by frame.
+        """Yield scan and image of each frame.
+
+        Args:
+            pictures: yield images too.
 
         Raises:
-            DatasetError: stereo is wanted and the right camera is not calibrated.
+            DatasetError: depth ``sgbm`` is wanted, and the right camera is not calibrated.
         """
         if pictures and self.depth == "sgbm" and self.calibration.focal_baseline_px_m is None:
             raise DatasetError(
@@ -148,7 +163,7 @@ class KittiSequence:
     def _matched(self, picture: RecordedPicture, right: NDArray[np.uint8]) -> RecordedPicture | Unusable:
         if right.shape != picture.rgb.shape:
             return Unusable("picture", picture.name, "its right picture has another size")
-        assert self.calibration.focal_baseline_px_m is not None  # noqa: S101  # or ``events`` had said so
+        assert self.calibration.focal_baseline_px_m is not None  # noqa: S101  # ``events`` checked this
         depth_m: Float32[NDArray[np.float32], "H W"] = depth_from_stereo(
             picture.rgb, right, focal_baseline_px_m=self.calibration.focal_baseline_px_m
         )
@@ -156,7 +171,7 @@ class KittiSequence:
 
 
 def _without_names(message: str, files: tuple[Path | None, ...]) -> str:
-    """A message about a file in words that are the same for all files like it, so that they are counted as one."""
+    """Remove file names from a message, so that equal errors of several files count as one."""
     for path in files:
         if path is not None:
             message = message.replace(f"{path}: ", f"{path.parent.name}: ")
@@ -164,7 +179,12 @@ def _without_names(message: str, files: tuple[Path | None, ...]) -> str:
 
 
 def numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Files of a folder by their number; others are not the recording's."""
+    """Return the files of a folder by their number; other files are ignored.
+
+    Args:
+        folder: need not exist.
+        suffixes: of the wanted files.
+    """
     if not folder.is_dir():
         return {}
     return {

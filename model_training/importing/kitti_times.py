@@ -1,4 +1,4 @@
-"""Times of a recording in KITTI's raw layouts: a line a frame, those that an extract leaves out among them."""
+"""Times of a recording in KITTI's raw layouts: one line per frame, also for frames that an extract leaves out."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,9 +12,12 @@ from service.errors import DatasetError
 
 
 def turn_of(times: Path) -> float:
-    """Time of one turn of the LiDAR (s), by the stamps of all scans of the recording.
+    """Return the time of one turn of the LiDAR, seconds, from the stamps of all scans of the recording.
 
     An extract has fewer scans than lines. A scan that was not recorded may have a blank line.
+
+    Args:
+        times: the file ``timestamps.txt``; if it is missing, the result is 1 / ``RATE_HZ``.
     """
     lines = times.read_bytes().rstrip().splitlines() if times.is_file() else []
     stamps = stamps_of(times, [number for number, line in enumerate(lines) if line.strip()]) or {}
@@ -22,7 +25,11 @@ def turn_of(times: Path) -> float:
 
 
 def stamps_of(path: Path, numbers: list[int]) -> dict[int, float] | None:
-    """Seconds by a frame's number, or None where no times were recorded.
+    """Read the times of frames, seconds by the frame's number; None if the file is missing.
+
+    Args:
+        path: the file ``timestamps.txt``.
+        numbers: of the frames, rising.
 
     Raises:
         DatasetError: a line is no time, or there are fewer lines than frames.

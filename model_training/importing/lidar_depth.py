@@ -1,7 +1,7 @@
-"""Depth of a camera from the scan that was taken with its picture: a robot whose depth comes from its LiDAR.
+"""Make the depth image of a camera from the scan recorded at the same time, for a robot whose depth comes from its LiDAR.
 
-Between the beams depth is interpolated on triangles of neighbouring points: the inverse of z is linear in the picture on any
-plane, so walls and ground come out exactly. Triangles across an edge of depth, or across a gap in the scan, stay empty.
+Between the beams depth is interpolated on triangles of neighbouring points. On any plane the inverse of z is linear in
+the image, so walls and ground are exact. Triangles across a depth edge or a gap in the scan stay empty (decision 0055).
 """
 
 import numpy as np
@@ -12,12 +12,14 @@ from scipy.spatial import Delaunay, QhullError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform, transform_points
 
+#: Least z of a point that is used, metres.
 NEAR_M = 0.5
-#: Points of one surface: further apart in z than this they belong to two.
+#: Greatest ratio of z between the corners of a triangle on one surface.
 SURFACE_RATIO = 1.2
-#: A point this much farther than the nearest around it is hidden from the camera, which does not stand where the LiDAR does.
+#: A point is hidden if its z exceeds the least z around it by this ratio; and size of that neighbourhood, pixels.
+#: Camera and LiDAR stand at different positions, so the camera does not see all points.
 HIDDEN_RATIO, HIDDEN_REACH_PX = 1.15, 5
-#: A triangle with a longer side than so many times the usual one spans a gap.
+#: A triangle spans a gap if its longest side exceeds the median longest side by this ratio.
 GAP_RATIO = 3.0
 
 Pixels = Float64[NDArray[np.float64], "N 2"]
@@ -26,15 +28,15 @@ Pixels = Float64[NDArray[np.float64], "N 2"]
 def depth_from_scan(
     points: Float64[NDArray[np.float64], "N 3"], T_camera_lidar: Transform, camera: PinholeCamera
 ) -> Float32[NDArray[np.float32], "H W"]:
-    """Depth of a scan in a rectified camera.
+    """Interpolate the depth of a scan in a rectified camera.
 
     Args:
         points: metres, LiDAR frame.
-        T_camera_lidar: takes them to the optical frame.
+        T_camera_lidar: maps points from the LiDAR frame to the optical frame (4, 4).
         camera: without distortion.
 
     Returns:
-        z in metres; 0 outside the scan, in its gaps and across edges of depth.
+        z, metres; 0 outside the scan, in its gaps and across depth edges.
     """
     depth_m = np.zeros((camera.height, camera.width), np.float32)
     uv, z_m = visible_points(points, T_camera_lidar, camera)
@@ -42,7 +44,7 @@ def depth_from_scan(
         return depth_m
     try:
         triangulation = Delaunay(uv)
-    except QhullError:  # all on one line of the picture: there is no surface between them
+    except QhullError:  # all points lie on one line of the image, so there is no surface between them
         return depth_m
     corners = triangulation.simplices
     z = z_m[corners]
@@ -63,7 +65,16 @@ def depth_from_scan(
 def visible_points(
     points: Float64[NDArray[np.float64], "N 3"], T_camera_lidar: Transform, camera: PinholeCamera
 ) -> tuple[Pixels, NDArray[np.float64]]:
-    """Pixels (u, v) and z of the points that the camera sees, one a pixel: the nearest."""
+    """Project the points that the camera sees: the nearest point per pixel, without hidden ones.
+
+    Args:
+        points: metres, LiDAR frame.
+        T_camera_lidar: maps points from the LiDAR frame to the optical frame (4, 4).
+        camera: without distortion.
+
+    Returns:
+        Pixel coordinates u, v (N, 2), and z (N,), metres.
+    """
     seen = transform_points(T_camera_lidar, points)
     seen = seen[seen[:, 2] > NEAR_M]
     u = seen[:, 0] / seen[:, 2] * camera.fx + camera.cx
@@ -81,7 +92,10 @@ def visible_points(
 def _nearest_around(
     u: NDArray[np.float64], v: NDArray[np.float64], z: NDArray[np.float64], camera: PinholeCamera
 ) -> NDArray[np.float64]:
-    """The smallest z near each point, beside it and above it: ground gets nearer further down, and hides nothing."""
+    """The least z in a window around each point that is wider than high.
+
+    Ground is nearer further down in the image but hides nothing, so the window is low.
+    """
     from scipy.ndimage import minimum_filter
 
     nearest = np.full((camera.height, camera.width), np.inf)

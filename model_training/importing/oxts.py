@@ -14,13 +14,19 @@ from service.geometry.rigid import rotation_x, rotation_y, rotation_z, transform
 
 
 def read_oxts(files: Sequence[Path]) -> tuple[Float64[NDArray[np.float64], "N 4 4"], dict[str, Any]]:
-    """T_map_imu of every packet, and the georeference of the map: east, north, up at the first packet.
+    """Read T_map_imu of every packet, and the georeference of the map frame.
 
-    Yaw is zero to the east and counter-clockwise; roll and pitch turn about the axes forward and left (KITTI's own
-    description of the format).
+    The map frame is east, north, up at the first packet. Yaw is 0 to the east and counter-clockwise. Roll and pitch rotate
+    about the forward and the left axis (KITTI's description of the format).
+
+    Args:
+        files: packets in order of time, at least one.
+
+    Returns:
+        Poses (N, 4, 4), and the georeference of the map's origin as in ``dataset.json``.
 
     Raises:
-        DatasetError: a packet is cut off or no place on the Earth, naming the file.
+        DatasetError: a packet is cut off or no place on the Earth; the error names the file.
     """
     rows = [_packet(path) for path in files]
     latitude_deg, longitude_deg, height_m = (float(x) for x in rows[0][:3])

@@ -1,4 +1,4 @@
-"""Poses that lie beside a recording, in a TUM file of their own."""
+"""Read poses from a TUM file beside a recording."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from service.geometry.rigid import Transform
 
 
 def read_pose_file(path: Path, *, T_vehicle_posed: Transform | None = None) -> Trajectory:
-    """T_map_vehicle from a TUM file (timestamp x y z qx qy qz qw).
+    """Read T_map_vehicle from a TUM file (timestamp x y z qx qy qz qw).
 
     Args:
         path: of the file.
-        T_vehicle_posed: what the poses are of, where it is not the vehicle: a LiDAR or a camera on it.
+        T_vehicle_posed: mounting of what the poses belong to, such as a LiDAR or a camera (4, 4). None for the vehicle.
 
     Raises:
-        DatasetError: the file is missing or broken, or time does not rise in it.
+        DatasetError: the file is missing or broken, or its times do not rise.
     """
     stamps_s, T = read_tum(path)
     trajectory = Trajectory(stamps_s, T, str(path))

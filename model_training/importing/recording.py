@@ -1,7 +1,7 @@
-"""What every reader of a recording gives: scans and picture pairs in time order, and where the vehicle was.
+"""Common result of all readers: scans and image pairs in order of time, and the vehicle's trajectory.
 
-A reader converts its format's conventions and no more: frames are REP-103's, times are seconds, depth is z in metres. What
-cannot be used is given too, as ``Unusable``, so that good frames are kept and the others are counted.
+A reader only converts the conventions of its format. Frames follow REP-103, times are seconds, depth is z in metres.
+It also yields unusable frames, as ``Unusable``. So good frames are kept and the others are counted.
 """
 
 from collections.abc import Iterator
@@ -27,10 +27,10 @@ class RecordedScan:
     """One turn of the LiDAR.
 
     Attributes:
-        name: what the recording calls it, for messages.
-        stamp_s: when; the points are in the LiDAR's frame at that moment unless ``offsets_s`` says otherwise.
+        name: name in the recording, for messages.
+        stamp_s: time, seconds. Points are in the LiDAR frame at this time unless ``offsets_s`` is given.
         points: x y z (m, LiDAR frame) and intensity.
-        offsets_s: when each point was measured, against ``stamp_s``; None where the recording does not say.
+        offsets_s: time of each point relative to ``stamp_s``, seconds; None if the recording does not contain it.
     """
 
     name: str
@@ -41,19 +41,20 @@ class RecordedScan:
 
 @dataclass(frozen=True, slots=True)
 class RecordedPicture:
-    """A colour picture with the depth of the same camera at the same moment.
+    """A colour image with the depth of the same camera at the same time.
 
     Attributes:
-        name: what the recording calls it.
-        stamp_s: when.
-        rgb: sRGB, as recorded, before rectification.
-        camera: intrinsics and distortion of both.
-        depth: whole numbers of ``depth_scale_m`` or metres, z; 0 or NaN where nothing was measured; None where the recording has none.
-        depth_scale_m: metres of one step of a depth of whole numbers.
-        T_vehicle_camera: takes the optical frame to the vehicle's.
-        file: the file that ``rgb`` was read from, to be copied as it is where nothing has to be rectified.
-        lens: what ``camera.distortion`` are the coefficients of: OpenCV's pinhole models, or its fisheye's.
-        baseline_m: of the stereo rig that the depth was matched from, metres; None where it comes from elsewhere.
+        name: name in the recording.
+        stamp_s: time, seconds.
+        rgb: sRGB as recorded, before rectification.
+        camera: intrinsics and distortion of colour and depth.
+        T_vehicle_camera: mounting of the optical frame (4, 4).
+        depth: z, as integers in units of ``depth_scale_m`` or as metres; 0 or NaN where nothing was measured. None if the
+            recording has none.
+        depth_scale_m: metres per step of an integer depth.
+        file: file of ``rgb``. It is copied unchanged if no rectification is needed.
+        lens: model of ``camera.distortion``: OpenCV's pinhole models, or its fisheye model.
+        baseline_m: baseline of the stereo rig that the depth was matched from, metres; None for other depth.
     """
 
     name: str
@@ -70,7 +71,13 @@ class RecordedPicture:
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """A frame that cannot be used: ``kind`` is ``scan`` or ``picture``; ``why`` says so in words that are the same for all like it."""
+    """A frame that cannot be used.
+
+    Attributes:
+        kind: such as ``scan`` or ``picture``.
+        name: of the frame.
+        why: the reason; the same text for all frames with that reason.
+    """
 
     kind: str
     name: str
@@ -82,36 +89,45 @@ Event = RecordedScan | RecordedPicture | Unusable
 
 @dataclass(frozen=True, slots=True)
 class Notes:
-    """What a reader found and guessed: printed, and kept in ``dataset.json``."""
+    """What a reader found and assumed; printed, and kept in ``dataset.json``.
+
+    Attributes:
+        lines: for people.
+        source: for ``dataset.json``.
+    """
 
     lines: tuple[str, ...] = ()
     source: dict[str, Any] = field(default_factory=dict)
 
 
 class Recording(Protocol):
-    """A recording that was opened: what is in it is known, nothing is read yet."""
+    """An opened recording. Its content is known, but its frames are not read yet."""
 
     @property
     def kind(self) -> str:
-        """Name of the format, as the command line has it."""
+        """Name of the format on the command line."""
 
     @property
     def lidar(self) -> LidarSensor:
-        """The LiDAR; ``T_vehicle_sensor`` is where it stands."""
+        """The LiDAR; ``T_vehicle_sensor`` is its mounting."""
 
     @property
     def notes(self) -> Notes:
-        """What was found and guessed."""
+        """What the reader found and assumed."""
 
     @property
     def georeference(self) -> dict[str, Any] | None:
-        """Where on the Earth the origin of the given poses lies, or None."""
+        """Georeference of the map frame of the recording's poses, or None."""
 
     def count(self) -> int:
-        """Scans and pictures together, for a progress bar."""
+        """Count scans and images together, for a progress bar."""
 
     def trajectory(self) -> Trajectory | None:
-        """T_map_vehicle over time as the recording gives it, or None where it gives none."""
+        """Return T_map_vehicle over time as the recording gives it, or None."""
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """Scans, and pictures where wanted, in time order, one at a time."""
+        """Yield scans, and images if wanted, in order of time, one at a time.
+
+        Args:
+            pictures: yield images too.
+        """

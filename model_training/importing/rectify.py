@@ -1,4 +1,4 @@
-"""Lens distortion taken out on import, so that every picture of a dataset is a pinhole's."""
+"""Remove lens distortion on import, so that every image of a dataset is a pinhole image."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -14,16 +14,22 @@ from service.geometry.camera import PinholeCamera
 
 @dataclass(frozen=True, slots=True)
 class _Maps:
-    """Where each pixel of the rectified picture lies in the recorded one."""
+    """Pixel of the recorded image for each pixel of the rectified image."""
 
     u: NDArray[np.float32]
     v: NDArray[np.float32]
 
 
 def rectified(picture: RecordedPicture) -> RecordedPicture:
-    """The same picture pair as a pinhole with the same matrix would have taken it (OpenCV's distortion models).
+    """Rectify an image pair with OpenCV's distortion models; the camera matrix stays the same.
 
-    Colour is interpolated; depth takes the nearest value, since between two surfaces there is none.
+    Colour is interpolated. Depth takes the nearest value, because a mean of two surfaces is no surface.
+
+    Args:
+        picture: recorded image pair.
+
+    Returns:
+        The image pair without distortion; the same object if it has none.
     """
     camera = picture.camera
     if not any(camera.distortion):

@@ -1,4 +1,4 @@
-"""RGB-D recordings in folders: TUM's layout and Open3D's. They have no LiDAR; their scans are made of their depth."""
+"""RGB-D recordings in folders: TUM's and Open3D's layouts. They have no LiDAR, so scans are made from their depth."""
 
 import json
 from collections.abc import Iterator
@@ -22,11 +22,11 @@ from service.geometry.rigid import R_BODY_OPTICAL, Transform, transform_from
 from service.imaging.depth_formats import read_depth_values
 from service.imaging.picture_headers import ImageLimits
 
-#: Depth of TUM's files: 5000 steps a metre; Open3D's own tools write millimetres.
+#: Depth step, metres: TUM's files have 5000 steps per metre; Open3D's tools write millimetres.
 TUM_SCALE_M, OPEN3D_SCALE_M = 1 / 5000, 0.001
-#: Colour and depth of TUM's sequences are stamped apart.
+#: Greatest time between colour and depth of a pair, seconds; TUM's sequences have separate stamps.
 PAIR_TOLERANCE_S = 0.02
-#: Frames a second of a folder without times.
+#: Frames per second of a folder without times.
 RATE_HZ = 30.0
 _AHEAD: Transform = transform_from(R_BODY_OPTICAL, np.zeros(3))
 _LIMITS = ImageLimits()
@@ -34,7 +34,13 @@ _LIMITS = ImageLimits()
 
 @dataclass(frozen=True, slots=True)
 class RgbdFrame:
-    """Files of one moment."""
+    """Files of one moment.
+
+    Attributes:
+        stamp_s: time, seconds.
+        rgb: colour image.
+        depth: depth image.
+    """
 
     stamp_s: float
     rgb: Path
@@ -43,7 +49,18 @@ class RgbdFrame:
 
 @dataclass(frozen=True, slots=True)
 class RgbdFolder:
-    """A recording of one RGB-D camera; ``vehicle`` is the camera's body: x ahead, z up."""
+    """A recording of one RGB-D camera. The vehicle frame is the camera's body: x forward, z up.
+
+    Attributes:
+        kind: ``tum-rgbd`` or ``open3d``.
+        path: folder of the recording.
+        frames: in order of time.
+        camera: intrinsics.
+        scale_m: metres per step of an integer depth.
+        poses: T_map_vehicle, or None.
+        lidar: stands for the depth camera.
+        georeference: always None.
+    """
 
     kind: str
     path: Path
@@ -58,20 +75,24 @@ class RgbdFolder:
 
     @property
     def notes(self) -> Notes:
-        """How many there are."""
+        """Number of frames."""
         line = f"{len(self.frames)} RGB-D frames; scans are made of their depth, so the map sees only where the camera looked"
         return Notes((line,), {"path": self.path.name})
 
     def count(self) -> int:
-        """A scan and a picture a frame."""
+        """Count one scan and one image per frame."""
         return 2 * len(self.frames)
 
     def trajectory(self) -> Trajectory | None:
-        """As the recording has it."""
+        """Return T_map_vehicle as the recording gives it, or None."""
         return self.poses
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """Frame by frame: its scan, then its picture pair."""
+        """Yield the scan of each frame, then its image pair.
+
+        Args:
+            pictures: yield image pairs too.
+        """
         for frame in self.frames:
             picture = self._picture(frame)
             if isinstance(picture, Unusable):
@@ -107,14 +128,14 @@ class RgbdFolder:
 
 
 def open_tum_rgbd(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
-    """Open TUM's layout: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt`` (T_world_camera) and the pictures that they name.
+    """Open TUM's layout: ``rgb.txt``, ``depth.txt``, ``groundtruth.txt`` (T_world_camera) and the images that they name.
 
     Args:
         source: the folder.
-        camera: intrinsics, which the layout does not tell.
+        camera: intrinsics; the layout does not contain them.
 
     Raises:
-        DatasetError: a list is missing or broken, no colour has a depth, or there is no camera.
+        DatasetError: a list is missing or broken, no colour image has a depth image, or there is no camera.
     """
     colour, depth = (_listed(source / name) for name in ("rgb.txt", "depth.txt"))
     stamps = np.array([stamp for stamp, _ in depth])
@@ -139,14 +160,14 @@ def open_tum_rgbd(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
 
 
 def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
-    """Open a folder as Open3D's reconstruction reads it: ``color``, ``depth``, ``camera_intrinsic.json``, ``trajectory.log``.
+    """Open a folder of Open3D's reconstruction: ``color``, ``depth``, ``camera_intrinsic.json``, ``trajectory.log``.
 
     Args:
         source: the folder.
-        camera: intrinsics; by default those of the JSON.
+        camera: intrinsics; by default those of the JSON file.
 
     Raises:
-        DatasetError: pictures, camera or a pose are missing or broken.
+        DatasetError: images, camera or a pose are missing or broken.
     """
     folder = next((source / name for name in ("color", "rgb", "image") if (source / name).is_dir()), source / "color")
     colour, depth = (
@@ -174,7 +195,7 @@ def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
 
 
 def _listed(path: Path) -> list[tuple[float, Path]]:
-    """Times and files of TUM's lists."""
+    """Read times and files of one of TUM's lists."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; TUM's layout has it beside the pictures", field=path.name)
     found = []
@@ -198,14 +219,14 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
 def _open3d_camera(path: Path) -> PinholeCamera:
     try:
         loaded = json.loads(path.read_text())
-        K = np.array(loaded["intrinsic_matrix"], np.float64).reshape(3, 3).T  # column after column
+        K = np.array(loaded["intrinsic_matrix"], np.float64).reshape(3, 3).T  # stored column by column
         return PinholeCamera(int(loaded["width"]), int(loaded["height"]), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: no camera of Open3D: {error}", field=path.name) from error
 
 
 def _open3d_poses(path: Path) -> Trajectory:
-    """T_world_camera: a line of three whole numbers, then four rows, a frame."""
+    """Read T_world_camera: per frame a line of three integers, then four rows of the matrix."""
     lines = [line for line in read_bytes(path).decode(errors="replace").splitlines() if line.strip()]
     stamps, poses = [], []
     for start in range(0, len(lines), 5):

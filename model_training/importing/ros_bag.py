@@ -1,4 +1,4 @@
-"""ROS 1 bags and ROS 2 bags (SQLite and MCAP) as a recording, without ROS."""
+"""Read ROS 1 bags and ROS 2 bags (SQLite and MCAP) as a recording, without ROS."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +15,7 @@ from model_training.importing.ros_reader import Damage, opened
 from model_training.importing.ros_topics import ROLES
 from model_training.importing.trajectory import Trajectory
 
-#: Depth and colour of one camera bear the same stamp, or nearly.
+#: Greatest time between depth and colour of a pair, seconds. One camera gives both nearly the same stamp.
 PAIR_TOLERANCE_S = 0.02
 _WITHOUT_DEPTH = f"no depth within {PAIR_TOLERANCE_S:g} s of it"
 
@@ -24,8 +24,12 @@ class RosBag:
     """A bag as a recording.
 
     Args:
-        path: a ``.bag`` file, a ROS 2 bag's folder, or one of its files.
-        settings: what is told of it.
+        path: a ``.bag`` file, the folder of a ROS 2 bag, or one of its files.
+        settings: of the reader.
+
+    Attributes:
+        kind: name of the format.
+        georeference: always None.
 
     Raises:
         DatasetError: it cannot be opened, has no scan, or lacks intrinsics or a mounting.
@@ -43,23 +47,27 @@ class RosBag:
 
     @property
     def notes(self) -> Notes:
-        """Topics, and what poses are of."""
+        """Topics, and the frame of the poses."""
         topics = self._content.topics
         names = {role: None if (topic := getattr(topics, role)) is None else topic.name for role in ROLES}
         lines = (*topics.lines(), *self._content.remarks)
         return Notes(lines, {"path": self._path.name, "topics": names, "vehicle": self._content.vehicle})
 
     def count(self) -> int:
-        """Scans and colour pictures."""
+        """Count scans and colour images."""
         topics = self._content.topics
         return topics.scan.count + (topics.color.count if topics.color else 0)
 
     def trajectory(self) -> Trajectory | None:
-        """T_map_vehicle of the topic of poses."""
+        """Return T_map_vehicle from the topic of poses, or None."""
         return self._content.poses
 
     def events(self, *, pictures: bool = True) -> Iterator[Event]:
-        """Messages in the bag's order; one that ends early gives what came before."""
+        """Yield scans and images in the bag's order. A damaged bag yields what can be read.
+
+        Args:
+            pictures: yield images too.
+        """
         roles = self._roles(pictures and self._content.camera is not None)
         pairing = Pairing(PAIR_TOLERANCE_S)
         with opened(self._path) as bag:
@@ -98,7 +106,7 @@ class RosBag:
 
     def _picture(self, pair: Pair) -> Event:
         camera, topic = self._content.camera, self._content.topics.color
-        assert camera is not None  # noqa: S101  # no colour is read without
+        assert camera is not None  # noqa: S101  # colour is read only with a camera
         assert topic is not None  # noqa: S101
         name = f"{topic.name} at {pair.stamp_s:.6f}"
         rgb = colour_of(pair.color)

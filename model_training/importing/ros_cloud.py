@@ -1,4 +1,4 @@
-"""``sensor_msgs/PointCloud2`` of any field layout."""
+"""Read ``sensor_msgs/PointCloud2`` of any field layout."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,22 +7,30 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
-#: sensor_msgs/PointField: the numbers of its datatypes.
+#: Datatypes of sensor_msgs/PointField by number.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-#: What drivers call the strength of a return, and the time of a point, the most usual first.
+#: Names that drivers use for intensity and for the time of a point, the most common first.
 _INTENSITY = ("intensity", "intensities", "reflectivity", "i")
 _TIME = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset")
-#: Later than this a time is one since 1970, not since the scan's stamp.
+#: A larger time counts from 1970, not from the scan's stamp; seconds.
 _ABSOLUTE_S = 1e6
 
 
 def points_of_cloud(
     message: Any, *, stamp_s: float, max_points: int
 ) -> tuple[Float32[NDArray[np.float32], "N 4"], Float64[NDArray[np.float64], " N"] | None] | str:
-    """Points x y z intensity and their times against the stamp, or why the message is no scan.
+    """Read the points of a message and their times, or say why the message is no scan.
 
-    Whole numbers of time are nanoseconds (Ouster, Livox), floating ones seconds (Velodyne, Hesai); a time that is one since 1970
-    is taken against the stamp.
+    Integer times are nanoseconds (Ouster, Livox), floating-point times are seconds (Velodyne, Hesai). A time since 1970 is
+    converted to a time relative to the stamp.
+
+    Args:
+        message: sensor_msgs/PointCloud2, of ROS 1 or 2.
+        stamp_s: stamp of the message, seconds.
+        max_points: a larger scan is refused.
+
+    Returns:
+        x y z and intensity (N, 4), and times relative to the stamp, seconds (N,), or None without times; or the reason.
     """
     count = int(message.width) * int(message.height)
     if count == 0:
@@ -50,7 +58,7 @@ def points_of_cloud(
 
 
 def _rows(message: Any, used: Sequence[Any]) -> NDArray[Any] | str:
-    """The message's bytes as records of the fields that are used, (height, width), without padding copied."""
+    """View the message's bytes as records of the used fields (height, width), without a copy of the padding."""
     order = ">" if message.is_bigendian else "<"
     step, row_step = int(message.point_step), int(message.row_step)
     ends = [field.offset + int(_TYPES[field.datatype][1]) * max(1, field.count) for field in used]
@@ -72,6 +80,6 @@ def _rows(message: Any, used: Sequence[Any]) -> NDArray[Any] | str:
 
 def _offsets(times: NDArray[Any], stamp_s: float) -> Float64[NDArray[np.float64], " N"]:
     seconds = times.astype(np.float64) * (1e-9 if times.dtype.kind in "iu" else 1.0)
-    if np.abs(seconds).max(initial=0.0) > 1e15:  # nanoseconds since 1970, written as a floating number
+    if np.abs(seconds).max(initial=0.0) > 1e15:  # nanoseconds since 1970 as a floating-point number
         seconds = seconds * 1e-9
     return seconds - stamp_s if np.abs(seconds).max(initial=0.0) > _ABSOLUTE_S else seconds

@@ -1,4 +1,4 @@
-"""What is in a ROS bag: its topics, the poses, and where LiDAR and camera stand. Scans and pictures are left for later."""
+"""Find out what a ROS bag contains: topics, poses, and mountings of LiDAR and camera. Scans and images are read later."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -22,16 +22,16 @@ _TF = POSE_TYPES[-1]
 
 @dataclass(frozen=True, slots=True)
 class BagSettings:
-    """What is told of a bag.
+    """Settings of the reader of a bag.
 
     Attributes:
         topics: by role: scan, color, depth, info, poses.
-        extrinsics: mountings that the bag does not tell.
-        camera: intrinsics, where the bag has no CameraInfo.
-        rectified: whether pictures are rectified already; None believes the topic's name.
-        want_pictures: False asks neither for intrinsics nor for the camera's mounting.
+        extrinsics: mountings that the bag does not contain.
+        camera: intrinsics, if the bag has no CameraInfo.
+        rectified: whether the images are rectified already; None decides by the topic's name.
+        want_pictures: False needs neither intrinsics nor the camera's mounting.
         want_depth: False pairs no depth with colour.
-        max_points: of a scan.
+        max_points: a larger scan is refused.
     """
 
     topics: Mapping[str, str] = field(default_factory=dict)
@@ -45,7 +45,13 @@ class BagSettings:
 
 @dataclass(frozen=True, slots=True)
 class BagCamera:
-    """The camera of the colour topic."""
+    """The camera of the colour topic.
+
+    Attributes:
+        pinhole: intrinsics and distortion.
+        lens: model of the distortion.
+        T_vehicle_camera: mounting of the optical frame (4, 4).
+    """
 
     pinhole: PinholeCamera
     lens: Lens
@@ -54,16 +60,16 @@ class BagCamera:
 
 @dataclass(frozen=True, slots=True)
 class BagContent:
-    """A bag's content.
+    """Content of a bag.
 
     Attributes:
         topics: of each role.
-        scan_frame: of the LiDAR.
-        vehicle: what the poses are of, for people.
-        poses: T_map_vehicle; None where the bag has none.
-        T_vehicle_lidar: takes the scan's frame to the vehicle's.
-        camera: None where there are no pictures, or none are wanted.
-        remarks: what was assumed and left out, a line each.
+        scan_frame: frame of the LiDAR.
+        vehicle: frame that the poses belong to, for people.
+        poses: T_map_vehicle; None if the bag has none.
+        T_vehicle_lidar: maps points from the scan's frame to the vehicle frame (4, 4).
+        camera: None if there are no images, or none are wanted.
+        remarks: what was assumed and left out, one line each.
     """
 
     topics: Topics
@@ -78,8 +84,12 @@ class BagContent:
 def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
     """Look through a bag.
 
+    Args:
+        bag: opened.
+        settings: of the reader.
+
     Raises:
-        DatasetError: there is no scan in it, a topic that was told does not fit, or intrinsics or a mounting are missing.
+        DatasetError: the bag has no scan, a given topic does not fit, or intrinsics or a mounting are missing.
     """
     topics = topics_of(bag.topics(), settings.topics, source=bag.name)
     scan_frame = bag.first(topics.scan.name).header.frame_id.lstrip("/")
@@ -104,7 +114,7 @@ def content_of(bag: BagReader, settings: BagSettings) -> BagContent:
 
 
 def _poses(bag: BagReader, topics: Topics, remarks: list[str]) -> tuple[FrameTree, Trajectory | None, str]:
-    """All of ``/tf``, and the poses of a topic with the frame that they are of; '' where it does not say."""
+    """Read all of ``/tf``, and the poses of a topic with their frame; '' if the topic does not name the frame."""
     tree, topic = FrameTree(), topics.poses
     stamps: list[float] = []
     poses: list[Transform] = []
@@ -137,14 +147,17 @@ def _poses(bag: BagReader, topics: Topics, remarks: list[str]) -> tuple[FrameTre
 
 
 def _pose(message: Any) -> Transform | None:
-    """Of an Odometry, PoseStamped or PoseWithCovarianceStamped; None where it is no pose."""
+    """Pose of an Odometry, PoseStamped or PoseWithCovarianceStamped message; None if it is invalid."""
     return transform_of(message.pose.pose if hasattr(message.pose, "pose") else message.pose)
 
 
 def _poses_by_tf(
     name: str, tree: FrameTree, scan_frame: str, T_vehicle_lidar: Transform | None
 ) -> tuple[Trajectory | None, str]:
-    """Poses by ``/tf``, and what they are of: the LiDAR, or where it is not in the tree but told, the frame that moves."""
+    """Poses from ``/tf``, and their frame.
+
+    The frame is the LiDAR's. If ``/tf`` lacks the LiDAR and its mounting is given, it is the frame that moves.
+    """
     found = tree.moving(scan_frame, name=f"{name}, /tf")
     if found is not None and T_vehicle_lidar is None:
         return found[1], scan_frame
@@ -158,7 +171,7 @@ def _poses_by_tf(
 def _camera(
     bag: BagReader, topics: Topics, settings: BagSettings, tree: FrameTree, vehicle: str, scan_frame: str, T_vehicle_lidar: Transform
 ) -> BagCamera | None:  # fmt: skip
-    """The camera of the colour topic, where there is one."""
+    """The camera of the colour topic, if there is one."""
     if topics.color is None:
         return None
     if topics.info is None and settings.camera is None:
@@ -171,7 +184,7 @@ def _camera(
     if settings.camera is not None:
         pinhole, frame = settings.camera, bag.first(topics.color.name).header.frame_id
     else:
-        assert topics.info is not None  # noqa: S101  # or the error above
+        assert topics.info is not None  # noqa: S101  # otherwise the error above was raised
         message = bag.first(topics.info.name)
         is_rectified = is_rectified_by_name(topics.color.name) if settings.rectified is None else settings.rectified
         found = camera_of(message, is_rectified=is_rectified)
@@ -183,7 +196,7 @@ def _camera(
     T = settings.extrinsics.T_vehicle_camera
     if T is None and vehicle and (known := tree.fixed(vehicle, frame)) is not None:
         T = known
-    if T is None:  # by way of the LiDAR, whose own mounting may have been told
+    if T is None:  # use the LiDAR as an intermediate frame: --extrinsics may give its mounting
         T = T_vehicle_lidar @ _mounting(bag.name, tree, scan_frame, frame, "T_vehicle_camera")
     return BagCamera(pinhole, lens, T)
 

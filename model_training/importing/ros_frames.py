@@ -1,4 +1,4 @@
-"""The tree of frames that ``/tf`` and ``/tf_static`` tell."""
+"""The tree of frames from ``/tf`` and ``/tf_static``."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,9 +10,13 @@ from service.geometry.rigid import Transform, inverse, rotation_from_quaternion_
 
 
 def transform_of(message: Any) -> Transform | None:
-    """A geometry_msgs Transform (translation, rotation) or Pose (position, orientation) as a matrix.
+    """Convert a geometry_msgs Transform (translation, rotation) or Pose (position, orientation) to a matrix (4, 4).
 
-    None where a number is none or the quaternion is zero, as localisers send it before they know anything.
+    Args:
+        message: of ROS 1 or 2.
+
+    Returns:
+        The matrix. None if a number is not finite or the quaternion is zero; localisers send that before they have a pose.
     """
     at = message.translation if hasattr(message, "translation") else message.position
     turned = message.rotation if hasattr(message, "rotation") else message.orientation
@@ -24,14 +28,18 @@ def transform_of(message: Any) -> Transform | None:
 
 
 def stamp_of(header: Any) -> float:
-    """Seconds of a std_msgs Header, of ROS 1 or 2."""
+    """Return the time of a std_msgs Header, seconds.
+
+    Args:
+        header: of ROS 1 or 2.
+    """
     stamp = header.stamp
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
 @dataclass(slots=True)
 class FrameTree:
-    """Edges from parent to child; an edge that was told more than once over time moves."""
+    """Edges from parent to child frames. An edge with several times moves."""
 
     _stamps: dict[str, list[float]] = field(default_factory=dict)
     _poses: dict[str, list[Transform]] = field(default_factory=dict)
@@ -39,7 +47,15 @@ class FrameTree:
     _static: set[str] = field(default_factory=set)
 
     def add(self, message: Any, *, static: bool) -> bool:
-        """Take one TransformStamped, and say whether: of a moving edge times must rise, and poses are to be numbers."""
+        """Add one TransformStamped.
+
+        Args:
+            message: geometry_msgs/TransformStamped.
+            static: it comes from ``/tf_static``.
+
+        Returns:
+            False if it was left out: its numbers are invalid, or its time is not later than the edge's last time.
+        """
         child, parent = _name(message.child_frame_id), _name(message.header.frame_id)
         stamp_s, T = 0.0 if static else stamp_of(message.header), transform_of(message.transform)
         if T is None:
@@ -56,14 +72,23 @@ class FrameTree:
         return True
 
     def chain(self, frame: str) -> list[str]:
-        """The frame and all above it, to the root."""
+        """Return a frame and all frames above it, up to the root.
+
+        Args:
+            frame: name of the frame.
+        """
         chain = [_name(frame)]
         while chain[-1] in self._parent and self._parent[chain[-1]] not in chain:
             chain.append(self._parent[chain[-1]])
         return chain
 
     def fixed(self, target: str, source: str) -> Transform | None:
-        """T_target_source by edges that do not move, or None where they do not join the two."""
+        """Return T_target_source from edges that do not move; None if they do not connect the two frames.
+
+        Args:
+            target: name of the frame that points are mapped to.
+            source: name of the frame that points are mapped from.
+        """
         above_target, above_source = self.chain(target), self.chain(source)
         shared = next((name for name in above_source if name in above_target), None)
         if shared is None:
@@ -74,7 +99,14 @@ class FrameTree:
         return inverse(self._down(shared, above_target)) @ self._down(shared, above_source)
 
     def moving(self, source: str, *, name: str) -> tuple[str, Trajectory] | None:
-        """The root above a frame and T_root_source over time, at the times of its most frequent edge; None where nothing moves."""
+        """Return the root above a frame and T_root_source over time; None if no edge moves.
+
+        The times are those of the edge with the most times.
+
+        Args:
+            source: name of the frame.
+            name: name of the trajectory, for messages.
+        """
         chain = self.chain(source)
         edges = [edge for edge in chain[:-1] if edge not in self._static and len(self._stamps[edge]) > 1]
         if not edges:
@@ -91,7 +123,7 @@ class FrameTree:
         return chain[-1], Trajectory(stamps, T, name)
 
     def lowest_that_moves(self) -> str | None:
-        """The moving frame with the most edges above it: of map, odom and base_link the last; None where nothing moves."""
+        """Return the moving frame with the most edges above it, such as base_link below map and odom; None if none moves."""
         moving = [name for name in self._stamps if name not in self._static and len(self._stamps[name]) > 1]
         return max(moving, key=lambda name: len(self.chain(name)), default=None)
 
@@ -103,5 +135,5 @@ class FrameTree:
 
 
 def _name(frame: str) -> str:
-    """ROS 1 wrote some names with a slash before them."""
+    """Remove the leading slash that some ROS 1 names have."""
     return frame.lstrip("/")

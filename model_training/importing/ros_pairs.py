@@ -1,17 +1,23 @@
-"""Colour and depth of one camera brought together by their stamps, a few waiting at a time."""
+"""Pair colour and depth images of one camera by their stamps. Only a few images wait at a time."""
 
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-#: Messages of a kind that wait for their other half; later ones push out the oldest, which then counts as alone.
+#: Greatest number of waiting messages per kind. A further message removes the oldest, which then stays unpaired.
 MOST_WAITING = 30
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Undecoded messages of the same moment."""
+    """Undecoded messages of the same moment.
+
+    Attributes:
+        stamp_s: time of the colour image, seconds.
+        color: message of the colour image.
+        depth: message of the depth image, or None.
+    """
 
     stamp_s: float
     color: Any
@@ -20,17 +26,22 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Alone:
-    """A message without its other half."""
+    """A message without a partner.
+
+    Attributes:
+        stamp_s: time, seconds.
+        role: ``color``.
+    """
 
     stamp_s: float
     role: str
 
 
 class Pairing:
-    """Gives each colour picture the depth that is nearest to it in time.
+    """Pair each colour image with the depth image nearest in time.
 
     Args:
-        tolerance_s: further apart they are not of one moment.
+        tolerance_s: greatest time between the two, seconds.
     """
 
     def __init__(self, tolerance_s: float) -> None:
@@ -39,7 +50,13 @@ class Pairing:
         self._depth: deque[tuple[float, Any]] = deque()
 
     def add(self, role: str, stamp_s: float, message: Any) -> Iterator[Pair | Alone]:
-        """Take a message of ``color`` or ``depth``; gives what it completes."""
+        """Add a message, and yield what it completes.
+
+        Args:
+            role: ``color`` or ``depth``.
+            stamp_s: time, seconds.
+            message: undecoded.
+        """
         (self._color if role == "color" else self._depth).append((stamp_s, message))
         yield from self._settled(at_end=False)
         if len(self._color) > MOST_WAITING:
@@ -48,11 +65,11 @@ class Pairing:
             self._depth.popleft()
 
     def finish(self) -> Iterator[Pair | Alone]:
-        """What was still waiting when the recording ended."""
+        """Yield what waits at the end of the recording."""
         yield from self._settled(at_end=True)
 
     def _settled(self, *, at_end: bool) -> Iterator[Pair | Alone]:
-        """Colours for which no nearer depth can come any more: a depth as late as they are, or later, is there."""
+        """Yield the colour images for which no nearer depth image can follow: a depth image at their time or later has arrived."""
         while self._color:
             stamp_s, message = self._color[0]
             if not at_end and (not self._depth or self._depth[-1][0] < stamp_s):

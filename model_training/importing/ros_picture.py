@@ -1,4 +1,4 @@
-"""``sensor_msgs/Image``, ``CompressedImage`` and ``CameraInfo``."""
+"""Read ``sensor_msgs/Image``, ``CompressedImage`` and ``CameraInfo``."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from service.geometry.camera import PinholeCamera
 from service.imaging.decode import ImageLimits, decode_rgb
 from service.imaging.ros_depth import read_ros_depth
 
-#: Channels there are, and those to take, by encoding; grey ones are repeated.
+#: By encoding: number of channels, and the channels for red, green and blue. Grey is repeated.
 _COLOUR = {
     "rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0)), "mono8": (1, (0, 0, 0)),
     "8UC1": (1, (0, 0, 0)), "8UC3": (3, (2, 1, 0)),
@@ -20,15 +20,19 @@ _COLOUR = {
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _PINHOLE_MODELS = ("", "plumb_bob", "rational_polynomial")
 _FISHEYE_MODELS = ("equidistant", "fisheye", "kannala_brandt4")
-#: How many coefficients OpenCV knows, by lens.
+#: Numbers of distortion coefficients that OpenCV accepts, by lens.
 _COEFFICIENTS: dict[Lens, tuple[int, ...]] = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
-#: What image_transport puts behind the name of a picture's topic.
+#: Suffixes that image_transport adds to the name of an image topic.
 _TRANSPORTS = ("compressed", "compressedDepth")
 _LIMITS = ImageLimits()
 
 
 def colour_of(message: Any) -> UInt8[NDArray[np.uint8], "H W 3"] | str:
-    """The sRGB picture of an Image or CompressedImage, or why it is none."""
+    """Decode the sRGB image of an Image or CompressedImage, or say why that fails.
+
+    Args:
+        message: of ROS 1 or 2.
+    """
     if hasattr(message, "format"):
         try:
             return decode_rgb(bytes(message.data), limits=_LIMITS)
@@ -42,7 +46,14 @@ def colour_of(message: Any) -> UInt8[NDArray[np.uint8], "H W 3"] | str:
 
 
 def depth_of(message: Any) -> Depth | str:
-    """Depth of an Image (16UC1: millimetres, 32FC1: metres; REP-118) or of a compressedDepth message, or why there is none."""
+    """Decode the depth of an Image (16UC1: millimetres, 32FC1: metres; REP-118) or compressedDepth message.
+
+    Args:
+        message: of ROS 1 or 2.
+
+    Returns:
+        Depth (H, W), uint16 in millimetres or float32 in metres; or the reason why there is none.
+    """
     if hasattr(message, "format"):
         if "compressedDepth" not in message.format:
             return f"unknown format {message.format[:40]!r} (known: compressedDepth)"
@@ -60,7 +71,11 @@ def depth_of(message: Any) -> Depth | str:
 
 
 def is_rectified_by_name(topic: str) -> bool:
-    """Whether a topic's name says that its pictures are rectified (``image_rect_color``, ``image_rect/compressed``)."""
+    """Check whether a topic's name says that its images are rectified (``image_rect_color``, ``image_rect/compressed``).
+
+    Args:
+        topic: name of the topic.
+    """
     parts = [part for part in topic.split("/") if part not in _TRANSPORTS]
     return "rect" in parts[-1] if parts else False
 
@@ -70,11 +85,11 @@ def _as_depth(values: NDArray[Any]) -> Depth:
 
 
 def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens] | str:
-    """Intrinsics of a CameraInfo, with the distortion to be taken out, or why it tells none.
+    """Read the intrinsics of a CameraInfo and the distortion to remove, or say why there are none.
 
     Args:
         message: sensor_msgs/CameraInfo, of ROS 1 or 2.
-        is_rectified: the pictures are already; then P holds for them instead of K and D.
+        is_rectified: the images are rectified already. Then P applies to them instead of K and D.
     """
     K = np.asarray(message.K if hasattr(message, "K") else message.k, np.float64).reshape(3, 3)
     P = np.asarray(message.P if hasattr(message, "P") else message.p, np.float64).reshape(3, 4)
@@ -98,7 +113,7 @@ def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens]
 
 
 def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any] | str:
-    """(H, W, channels) of an Image's bytes, in the machine's order, rows' padding left out."""
+    """Pixels (H, W, channels) of an Image, in native byte order, without the padding of the rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     size = np.dtype(dtype).itemsize
     if height < 1 or width < 1 or height * width > _LIMITS.max_pixels:

@@ -1,4 +1,4 @@
-"""A ROS bag opened by the package ``rosbags``, read message by message up to where it is damaged."""
+"""Open a ROS bag with the package ``rosbags``, and read its messages up to where it is damaged."""
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -17,7 +17,13 @@ _MEND = (
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message, and the topic that it came by."""
+    """A message and its topic.
+
+    Attributes:
+        topic: name of the topic.
+        msgtype: type of the message.
+        content: the decoded message.
+    """
 
     topic: str
     msgtype: str
@@ -26,7 +32,13 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """What could not be read: a single message, or (``is_end``) all from there on."""
+    """A part of a bag that could not be read.
+
+    Attributes:
+        topic: name of the topic; empty if it is unknown.
+        why: the reason.
+        is_end: everything from here on is unreadable, not only one message.
+    """
 
     topic: str
     why: str
@@ -35,24 +47,33 @@ class Damage:
 
 @dataclass(frozen=True, slots=True)
 class BagReader:
-    """An open bag; ``reader`` is the package's own."""
+    """An open bag.
+
+    Attributes:
+        name: of the bag.
+        reader: reader of the package ``rosbags``.
+    """
 
     name: str
     reader: Any
 
     def topics(self) -> list[Topic]:
-        """All that have one type."""
+        """Return all topics that have exactly one type."""
         told = self.reader.topics.items()
         return [Topic(name, info.msgtype, info.msgcount) for name, info in told if info.msgtype is not None]
 
     def messages(self, topics: Collection[str]) -> Iterator[Message | Damage]:
-        """Messages of some topics in the bag's order; what is damaged comes as such, and ends the reading where it must."""
+        """Yield the messages of some topics in the bag's order, and the damage between them.
+
+        Args:
+            topics: names of the topics.
+        """
         connections = [c for c in self.reader.connections if c.topic in topics]
         if not connections:
             return
         raw = self.reader.messages(connections=connections)
         while True:
-            # Damage makes the package, its codecs and SQLite raise errors that have no root in common.
+            # On damaged data the package, its codecs and SQLite raise errors without a common base class.
             try:
                 connection, _, data = next(raw)
             except StopIteration:
@@ -68,7 +89,10 @@ class BagReader:
             yield Message(connection.topic, connection.msgtype, content)
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic that can be read.
+        """Return the first readable message of a topic.
+
+        Args:
+            topic: name of the topic.
 
         Raises:
             DatasetError: there is none.
@@ -83,7 +107,10 @@ class BagReader:
 
 @contextmanager
 def opened(path: Path) -> Iterator[BagReader]:
-    """Open a ``.bag`` file, a ROS 2 bag's folder, or one of its files.
+    """Open a ``.bag`` file, the folder of a ROS 2 bag, or one of its files.
+
+    Args:
+        path: of the file or folder.
 
     Raises:
         DatasetError: it cannot be opened.
@@ -95,7 +122,7 @@ def opened(path: Path) -> Iterator[BagReader]:
     try:
         reader = AnyReader([path], default_typestore=store)
         reader.open()
-    except Exception as error:  # as above
+    except Exception as error:  # as above: no common base class
         raise DatasetError(
             f"{path}: it cannot be opened as a ROS bag ({_told(error)}); {_MEND}", field="source"
         ) from error

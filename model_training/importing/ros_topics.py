@@ -1,11 +1,13 @@
-"""Which topic of a bag is what: as told, or guessed from types and names."""
+"""Choose the topics of a bag by role: as given, or guessed from types and names."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from service.errors import DatasetError
 
+#: Roles that a topic can have.
 ROLES = ("scan", "color", "depth", "info", "poses")
+#: Types of messages with poses, the preferred one first.
 POSE_TYPES = (
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",
@@ -21,7 +23,13 @@ _TYPES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a bag."""
+    """A topic of a bag.
+
+    Attributes:
+        name: of the topic.
+        msgtype: type of its messages.
+        count: number of its messages.
+    """
 
     name: str
     msgtype: str
@@ -30,7 +38,16 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """The topic of each role; None where the bag has none."""
+    """The topic of each role; None if the bag has none.
+
+    Attributes:
+        scan: point clouds.
+        color: colour images.
+        depth: depth images.
+        info: intrinsics.
+        poses: poses.
+        guessed: roles whose topic was not given.
+    """
 
     scan: Topic
     color: Topic | None
@@ -40,7 +57,7 @@ class Topics:
     guessed: tuple[str, ...]
 
     def lines(self) -> tuple[str, ...]:
-        """A line a role, saying what was guessed."""
+        """Return one line per role. It says whether the topic was guessed."""
         lines = []
         for role in ROLES:
             topic: Topic | None = getattr(self, role)
@@ -56,9 +73,9 @@ def topics_of(available: list[Topic], told: Mapping[str, str], *, source: str) -
     """Choose the topics of a bag.
 
     Args:
-        available: all there are.
-        told: topics by role; what is not told is guessed.
-        source: of the bag, for messages.
+        available: all topics of the bag.
+        told: given topics by role; the others are guessed.
+        source: name of the bag, for errors.
 
     Raises:
         DatasetError: a role or topic is unknown or of another type, or there is no point cloud.
@@ -114,7 +131,7 @@ def _guess(role: str, available: list[Topic], chosen: Mapping[str, Topic]) -> To
 
 
 def _shared(one: str, other: str) -> int:
-    """How many first parts two names have in common: a camera's topics lie in one namespace."""
+    """Count the first parts that two names share: the topics of one camera lie in one namespace."""
     count = 0
     for a, b in zip(one.split("/"), other.split("/"), strict=False):
         if a != b:

@@ -1,4 +1,4 @@
-"""A scan in KITTI's layout: rows of four float32, x y z and intensity."""
+"""Read a scan in KITTI's layout: rows of four float32, x y z and intensity."""
 
 from pathlib import Path
 
@@ -10,14 +10,17 @@ from model_training.datasets.files import ROW_BYTES, read_rows, size_of
 
 
 def read_scan(path: Path, *, max_points: int = 5_000_000) -> Float32[NDArray[np.float32], "N 4"] | str:
-    """Points of a scan, or why the file is none; its size is looked at before it is read.
+    """Read the points of a scan, or say why the file is none. The size is checked before the file is read.
 
     Args:
         path: of the file.
-        max_points: more is refused.
+        max_points: a larger scan is refused.
+
+    Returns:
+        x y z and intensity (N, 4); or the reason.
 
     Raises:
-        DatasetError: the file vanished, or cannot be read: what is named in a recording is not simply left out.
+        DatasetError: the file is missing or cannot be read. A file that the recording names must not be skipped silently.
     """
     size = size_of(path)
     if size == 0:

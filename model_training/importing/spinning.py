@@ -1,33 +1,38 @@
-"""What a spinning LiDAR's points do not say themselves: when each was measured, and a known error of the beams' angles."""
+"""Complete the points of a spinning LiDAR: the time of each point, and a correction of the beams' vertical angle."""
 
 import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
-#: KITTI's HDL-64 tells everything so much too low; kiss-icp corrects it by as much.
+#: The beams of KITTI's HDL-64 are recorded this much too low, degrees. kiss-icp applies the same correction.
 KITTI_VERTICAL_DEG = 0.205
-#: A turn takes about so long; recorded times that say otherwise are those of something else.
+#: Plausible times of one turn, seconds. Recorded times outside of them do not belong to turns.
 SHORTEST_TURN_S, LONGEST_TURN_S = 0.04, 0.25
 
 Points = Float32[NDArray[np.float32], "N 4"]
 
 
 def times_by_azimuth(points: Points, *, period_s: float) -> Float64[NDArray[np.float64], " N"]:
-    """When each point was measured, seconds, against the moment when the laser faced ahead (x).
+    """Compute the time of each point relative to the time at which the laser faces forward (x), seconds (N,).
 
-    KITTI's HDL-64 turns clockwise as seen from above, and a file holds one turn from the rear (-half a period) over the left to the
-    front (0) and over the right back to the rear.
+    KITTI's HDL-64 rotates clockwise as seen from above. A file holds one turn: from the rear (minus half a period) over the
+    left to the front (0), and over the right back to the rear.
 
     Args:
-        points: of one turn, LiDAR frame, x ahead, y left.
-        period_s: of one turn.
+        points: of one turn, LiDAR frame, x forward, y left.
+        period_s: time of one turn, seconds.
     """
     azimuth = np.arctan2(points[:, 1].astype(np.float64), points[:, 0].astype(np.float64))
     return np.asarray(-azimuth / (2 * np.pi) * period_s)
 
 
 def raised(points: Points, angle_deg: float) -> Points:
-    """The points turned up by an angle about the horizontal axis across each one's own direction; ranges and azimuths stay."""
+    """Rotate every point upwards by an angle, in its own vertical plane. Ranges and azimuths stay.
+
+    Args:
+        points: x y z (m, LiDAR frame) and intensity.
+        angle_deg: degrees.
+    """
     if angle_deg == 0.0:
         return points
     angle = np.deg2rad(angle_deg)
@@ -42,11 +47,11 @@ def raised(points: Points, angle_deg: float) -> Points:
 
 
 def period_of(stamps_s: Float64[NDArray[np.float64], " N"], *, otherwise_s: float) -> float:
-    """Time of one turn from the stamps of consecutive scans: their median difference, if that is a turn's.
+    """Estimate the time of one turn: the median time between consecutive scans, if it is plausible.
 
     Args:
-        stamps_s: of scans, in order.
-        otherwise_s: where they do not tell.
+        stamps_s: times of scans, seconds, in order.
+        otherwise_s: result if the stamps give no plausible time, seconds.
     """
     steps = np.diff(stamps_s)
     if not len(steps):

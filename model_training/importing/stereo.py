@@ -1,7 +1,7 @@
-"""Depth from a rectified stereo pair by the matchers that robots run.
+"""Compute depth from a rectified stereo pair with the matchers that robots use.
 
-Semi-global matching (Hirschmüller, PAMI 2008; OpenCV's StereoSGBM), and block matching (Konolige, ISRR 1997; OpenCV's StereoBM) with the
-settings that ROS stereo_image_proc has by default.
+They are semi-global matching (Hirschmüller, PAMI 2008; OpenCV's StereoSGBM) and block matching (Konolige, ISRR 1997;
+OpenCV's StereoBM). Block matching has the default settings of ROS stereo_image_proc.
 """
 
 from dataclasses import asdict, dataclass
@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 
 Rgb = UInt8[NDArray[np.uint8], "H W 3"]
 
-#: StereoSGBM counts disparity in sixteenths of a pixel.
+#: Steps per pixel of OpenCV's integer disparity.
 _STEPS_PER_PIXEL = 16
 
 
 @dataclass(frozen=True, slots=True)
 class StereoMatching:
-    """Settings of a matcher; the defaults are those of the recordings' figures, penalties as OpenCV's manual advises.
+    """Settings of a matcher. The defaults are those of all reported figures; penalties follow OpenCV's manual.
 
     Attributes:
-        method: ``sgbm`` aggregates over eight directions (MODE_HH), ``sgbm_3way`` over three, ``bm`` compares blocks alone.
-        disparities: how many pixels are searched; with KITTI's cameras, 128 reach to within 3 m.
+        method: ``sgbm`` aggregates over eight directions (MODE_HH), ``sgbm_3way`` over three, ``bm`` only compares blocks.
+        disparities: searched disparities, pixels; with KITTI's cameras 128 reach to within 3 m.
         block: side of the matched block, pixels.
-        uniqueness: by how many percent the best match must beat the second.
-        speckle_pixels: smaller islands of disparity are dropped.
-        speckle_range: steps, in pixels, that end an island.
+        uniqueness: margin of the best match over the second, percent.
+        speckle_pixels: islands of disparity with fewer pixels are removed.
+        speckle_range: difference of disparity that ends an island, pixels.
     """
 
     method: Literal["sgbm", "sgbm_3way", "bm"] = "sgbm"
@@ -39,11 +39,15 @@ class StereoMatching:
     speckle_range: int = 2
 
     def description(self) -> dict[str, int | str]:
-        """For the record beside a dataset."""
+        """Return the settings for the description of a dataset."""
         return asdict(self)
 
     def matcher(self, channels: int) -> cv2.StereoMatcher:
-        """OpenCV's, for pictures of so many channels (block matching takes one)."""
+        """Make OpenCV's matcher.
+
+        Args:
+            channels: channels of the images; block matching takes one.
+        """
         if self.method == "bm":
             found = cv2.StereoBM.create(numDisparities=self.disparities, blockSize=self.block)
             found.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
@@ -66,27 +70,29 @@ class StereoMatching:
         )
 
 
+#: Semi-global matching with the settings of all reported figures.
 SEMI_GLOBAL = StereoMatching()
-#: Block matching as stereo_image_proc has it by default.
+#: Block matching with the default settings of stereo_image_proc.
 BLOCK_MATCHING = StereoMatching("bm", block=15, uniqueness=15, speckle_range=4)
 
 
 def depth_from_stereo(
     left: Rgb, right: Rgb, *, focal_baseline_px_m: float, matching: StereoMatching = SEMI_GLOBAL
 ) -> Float32[NDArray[np.float32], "H W"]:
-    """Match a rectified pair and turn the disparity of the left picture into depth.
+    """Match a rectified pair, and convert the disparity of the left image to depth.
+
+    OpenCV's matchers skip as many columns on the left as disparities are searched: a tenth of KITTI's images. Distant objects
+    there do have a match in the right image. So both images are padded on the left, and matches in the padding are dropped
+    (decision 0127).
 
     Args:
         left: sRGB.
-        right: sRGB, of the camera to the right.
+        right: sRGB, of the camera on the right.
         focal_baseline_px_m: fx times baseline, pixels times metres.
-        matching: settings.
+        matching: settings of the matcher.
 
     Returns:
         z of the left camera, metres; 0 where nothing was matched.
-
-    The matchers leave out as many columns on the left as disparities are searched, a tenth of KITTI's pictures, although what is far
-    away there has its match in the right picture. So both pictures are widened on the left, and what matches the added part is dropped.
     """
     added = matching.disparities
     pictures = [cv2.copyMakeBorder(each, 0, 0, added, 0, cv2.BORDER_REPLICATE) for each in (left, right)]

@@ -1,6 +1,6 @@
-"""Take a recording into a dataset folder: match times, remove motion and distortion, sort into survey and queries.
+"""Convert a recording to a dataset folder: match times, remove motion and distortion, split into survey and queries.
 
-One pass over the recording, a frame at a time; what cannot be used is counted by reason and the rest is kept.
+This takes one pass over the recording, one frame at a time. Unusable frames are counted by reason; the rest is kept.
 """
 
 from collections import deque
@@ -27,9 +27,9 @@ from service.geometry.rigid import Transform, inverse
 
 Report = Callable[[str, int, int], None]
 
-#: Scans that are kept while pictures wait for the one nearest to them.
+#: Scans that are kept while images wait for their nearest scan.
 _RECENT_SCANS = 3
-#: Decoded pictures that wait for a scan after them; then the oldest makes do with the scans before it.
+#: Greatest number of images that wait for a later scan. Beyond it the oldest image uses the earlier scans.
 _MOST_WAITING = 32
 
 
@@ -38,15 +38,15 @@ class TakeSettings:
     """How a recording becomes a dataset.
 
     Attributes:
-        queries: name of the query set that pictures go to; empty leaves pictures out.
-        depth: ``recorded`` as it comes, ``lidar`` from the scan nearest in time.
-        sync: how a pose is found for a frame's moment.
-        tolerance_s: how far a pose, or the scan of a depth, may be from a frame.
-        deskew: take the vehicle's motion out of scans that tell their points' times.
-        hold_out: each how many scans one is left out of the survey; 0 leaves none out. Pictures are then queries only if the
-            scan nearest to them was left out, so that no query's own moment is in the map; the others are counted.
-        hold_out_first: the first scan that is left out, counted from 0; None for the last of each group.
-        max_points: of a scan; more is refused before it is kept.
+        queries: name of the query set of the images; empty leaves images out.
+        depth: ``recorded`` keeps the recorded depth, ``lidar`` takes the scan nearest in time.
+        sync: how the pose at a frame's time is found.
+        tolerance_s: greatest time between a frame and its pose, or the scan of its depth, seconds.
+        deskew: remove the vehicle's motion from scans with point times.
+        hold_out: one of this many scans is left out of the survey; 0 leaves none out. Then an image becomes a query only if
+            its nearest scan was left out. So the map does not contain the time of a query. Other images are counted.
+        hold_out_first: number of the first scan that is left out, from 0; None for the last scan of each group.
+        max_points: a scan with more points is left out.
     """
 
     queries: str = "recorded"
@@ -59,10 +59,10 @@ class TakeSettings:
     max_points: int = 5_000_000
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense.
+        """Check the settings.
 
         Raises:
-            DatasetError: naming the option.
+            DatasetError: a setting is invalid; the error names it.
         """
         if self.hold_out == 1 or self.hold_out < 0:
             raise DatasetError("hold_out: 1 would leave no survey; give 0, or 2 and more", field="hold_out")
@@ -74,7 +74,11 @@ class TakeSettings:
             raise DatasetError(f"tolerance_s: {self.tolerance_s:g} is no time; give seconds", field="tolerance_s")
 
     def holds_out(self, number: int) -> bool:
-        """Whether a usable scan, counted from 0, is left out of the survey."""
+        """Check whether a usable scan is left out of the survey.
+
+        Args:
+            number: of the scan among the usable scans, from 0.
+        """
         if not self.hold_out:
             return False
         first = self.hold_out - 1 if self.hold_out_first is None else self.hold_out_first
@@ -83,9 +87,16 @@ class TakeSettings:
 
 @dataclass(frozen=True, slots=True)
 class TakeSummary:
-    """What came in, and what did not: ``dropped`` counts frames by kind and reason, with the first name of each.
+    """What was taken, and what was left out.
 
-    ``deskewed`` counts the scans that the vehicle's motion was taken out of.
+    Attributes:
+        scans: scans in the survey.
+        held_out: scans that were left out on purpose (``hold_out``).
+        pictures: image pairs in the query set.
+        points_without_numbers: points with coordinates that are not finite.
+        dropped: dropped frames by kind and reason, with the first name of each.
+        notes: what the reader found and assumed.
+        deskewed: scans from which the vehicle's motion was removed.
     """
 
     scans: int
@@ -104,13 +115,13 @@ def take(
 
     Args:
         recording: opened.
-        trajectory: T_map_vehicle, the recording's own or one that was found by odometry.
-        out: the dataset; it appears when it is whole.
+        trajectory: T_map_vehicle: the recording's own, or from odometry.
+        out: the dataset to write; it appears only when it is complete.
         settings: what goes where.
-        report: told after every frame.
+        report: called after every frame with the stage, the frames done and all frames.
 
     Raises:
-        DatasetError: nothing usable is left, or ``out`` is taken.
+        DatasetError: nothing usable is left, or ``out`` already exists.
     """
     with whole_or_not_at_all(out) as part:
         taking = _Taking(recording, trajectory, part, settings)
@@ -127,7 +138,7 @@ def take(
 
 
 class _Taking:
-    """A dataset while it comes in."""
+    """A dataset while it is written."""
 
     def __init__(self, recording: Recording, trajectory: Trajectory, out: Path, settings: TakeSettings) -> None:
         self.dropped = Dropped()
@@ -214,7 +225,7 @@ class _Taking:
             return "no finite points"
         if len(scan.points) > self._settings.max_points:
             return f"more than {self._settings.max_points} points"
-        if not scan.stamp_s > self._last_scan_s:  # nor is NaN
+        if not scan.stamp_s > self._last_scan_s:  # true for NaN too
             return "its time is not after the scan's before it"
         return None
 
@@ -222,12 +233,12 @@ class _Taking:
         return self._settings.depth == "lidar" or self._settings.hold_out > 0
 
     def _answer_waiting(self, *, until_s: float) -> None:
-        """Pictures wait until a scan after them came, so that the nearest of all is known."""
+        """Process the images up to a time. They wait for a later scan, so that their nearest scan is known."""
         while self._waiting and self._waiting[0].stamp_s <= until_s:
             self._answer(self._waiting.popleft())
 
     def _answer(self, picture: RecordedPicture) -> None:
-        """Take a picture with the scan nearest to it, or count why not."""
+        """Add an image with its nearest scan, or count why not."""
         if not self._recent:
             self.dropped.add("picture", picture.name, "no scan near it in time")
             return
@@ -258,7 +269,7 @@ class _Taking:
     def _lidar_depth(
         self, picture: RecordedPicture, stamp_s: float, points: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """The scan's points where they are in the camera's frame at the picture's moment."""
+        """Depth from the scan's points, moved to the camera frame at the time of the image."""
         T_then, T_now = self._trajectory.between(np.array([stamp_s, picture.stamp_s]))
         T_camera_lidar = inverse(T_now @ picture.T_vehicle_camera) @ T_then @ self._T_vehicle_lidar
         return depth_from_scan(points[:, :3].astype(np.float64), T_camera_lidar, picture.camera)
@@ -270,12 +281,22 @@ def _only(scan: RecordedScan, chosen: NDArray[np.bool_]) -> RecordedScan:
 
 
 def finite_points(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which points have numbers for coordinates; a cloud that is not dense marks what never came back by NaN."""
+    """Return which points have finite coordinates (N,). Clouds that are not dense mark missing returns by NaN.
+
+    Args:
+        points: x y z and more (N, 4).
+    """
     return np.asarray(np.isfinite(points[:, :3]).all(axis=1), np.bool_)
 
 
 def scans_of(recording: Recording) -> Iterator[RecordedScan]:
-    """The usable scans of a recording alone, without NaN points and without times of another clock: what odometry reads."""
+    """Yield the usable scans of a recording, as odometry needs them.
+
+    Points that are not finite are removed, and so are point times of another clock.
+
+    Args:
+        recording: opened.
+    """
     last_s = -np.inf
     for event in recording.events(pictures=False):
         if isinstance(event, RecordedScan) and event.stamp_s > last_s:

@@ -1,4 +1,4 @@
-"""Poses over time, asked at any moment between them."""
+"""Poses over time, with interpolation between them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from service.errors import DatasetError
 
 Sync = Literal["interpolate", "nearest"]
-#: Times are doubles since 1970, which are whole steps of a quarter of a microsecond.
+#: Tolerance of times, seconds. A double that counts seconds since 1970 has a resolution of a quarter of a microsecond.
 _SLACK_S = 1e-6
 Transforms = Float64[NDArray[np.float64], "N 4 4"]
 
@@ -21,12 +21,12 @@ class Trajectory:
     """T_map_vehicle at rising times.
 
     Attributes:
-        stamps_s: (n,) seconds, each later than the one before.
-        T_map_vehicle: (n, 4, 4).
-        name: the file or topic, for messages.
+        stamps_s: times (N,), seconds, rising.
+        T_map_vehicle: poses (N, 4, 4).
+        name: name of the file or topic, for errors.
 
     Raises:
-        DatasetError: there are no poses, one is no numbers, or time does not rise, naming the first such pose.
+        DatasetError: there are no poses, one is not finite, or the times do not rise; the error names the first such pose.
     """
 
     stamps_s: Float64[NDArray[np.float64], " N"]
@@ -34,7 +34,11 @@ class Trajectory:
     name: str
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be asked."""
+        """Check the poses.
+
+        Raises:
+            DatasetError: there are no poses, one is not finite, or the times do not rise.
+        """
         if not len(self.stamps_s):
             raise DatasetError(f"{self.name}: there is no pose in it; name another source of poses", field="poses")
         finite = np.isfinite(self.stamps_s) & np.isfinite(self.T_map_vehicle).all(axis=(1, 2))
@@ -53,13 +57,16 @@ class Trajectory:
             )
 
     def at(self, stamp_s: float, *, sync: Sync, tolerance_s: float) -> Float64[NDArray[np.float64], "4 4"] | str:
-        """The pose at a moment, or why there is none.
+        """Return the pose at a time, or the reason why there is none.
 
         Args:
-            stamp_s: the moment.
-            sync: ``interpolate`` between the poses before and after (position linearly, rotation by slerp), and never beyond the
-                first and last; ``nearest`` takes one, as is done with a single pose.
-            tolerance_s: how far the poses that are used may be from the moment.
+            stamp_s: the time, seconds.
+            sync: ``interpolate`` between the poses before and after (position linearly, rotation by slerp), never beyond the
+                first and last pose; ``nearest`` takes one pose. A trajectory of one pose always uses ``nearest``.
+            tolerance_s: greatest time between the used poses and ``stamp_s``, seconds.
+
+        Returns:
+            T_map_vehicle (4, 4), or the reason.
         """
         after = int(np.searchsorted(self.stamps_s, stamp_s))
         around = [k for k in (after - 1, after) if 0 <= k < len(self.stamps_s)]
@@ -75,14 +82,21 @@ class Trajectory:
         return np.asarray(self.between(np.array([stamp_s]))[0])
 
     def between(self, stamps_s: Float64[NDArray[np.float64], " M"]) -> Float64[NDArray[np.float64], "M 4 4"]:
-        """Interpolated poses; before the first and after the last pose it is that one."""
+        """Interpolate the poses. Before the first and after the last time, the first and the last pose apply.
+
+        Args:
+            stamps_s: times, seconds.
+
+        Returns:
+            T_map_vehicle (M, 4, 4).
+        """
         inside = np.clip(stamps_s, self.stamps_s[0], self.stamps_s[-1])
         T = np.tile(np.eye(4), (len(inside), 1, 1))
         if len(self.stamps_s) == 1:
             T[:] = self.T_map_vehicle[0]
             return T
         first = np.clip(np.searchsorted(self.stamps_s, inside, side="right") - 1, 0, len(self.stamps_s) - 2)
-        low, high = int(first.min()), int(first.max()) + 2  # a slerp over the poses around, not over the whole drive
+        low, high = int(first.min()), int(first.max()) + 2  # build the slerp only over the poses that are needed
         window = self.stamps_s[low:high]
         rotations = Rotation.from_matrix(self.T_map_vehicle[low:high, :3, :3])
         T[:, :3, :3] = Slerp(window, rotations)(inside).as_matrix()
@@ -91,7 +105,11 @@ class Trajectory:
         return T
 
     def moved_by(self, T_vehicle_sensor: Float64[NDArray[np.float64], "4 4"]) -> "Trajectory":
-        """The trajectory of ``vehicle`` from one of a sensor on it: these poses are T_map_sensor."""
+        """Convert the trajectory of a sensor on the vehicle to that of the vehicle.
+
+        Args:
+            T_vehicle_sensor: mounting of the sensor whose poses these are (4, 4).
+        """
         R, t = T_vehicle_sensor[:3, :3], T_vehicle_sensor[:3, 3]
         T_sensor_vehicle = np.eye(4)
         T_sensor_vehicle[:3, :3], T_sensor_vehicle[:3, 3] = R.T, -R.T @ t

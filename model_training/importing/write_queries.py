@@ -1,4 +1,4 @@
-"""A query set of a dataset, written pair after pair."""
+"""Write the query set of a dataset, pair by pair."""
 
 import shutil
 from pathlib import Path
@@ -17,12 +17,12 @@ from model_training.datasets.png import write_png
 from model_training.importing.recording import Depth, RecordedPicture
 from service.geometry.rigid import Transform
 
-#: Step of depth that was recorded as metres: up to 65 m in 16 bits, finer than any sensor that is meant here.
+#: Step for depth recorded in metres: 16 bits reach 65 m, and the step is finer than the resolution of our sensors.
 METRES_SCALE_M = 0.001
 
 
 class QueryWriter:
-    """Numbers pairs as they come; poses and cameras are written at the end.
+    """Number and write pairs as they come. Poses and cameras are written at the end.
 
     Args:
         out: folder of the dataset.
@@ -38,11 +38,19 @@ class QueryWriter:
 
     @property
     def count(self) -> int:
-        """Pairs so far."""
+        """Number of pairs so far."""
         return len(self._stamps)
 
     def add(self, picture: RecordedPicture, T_map_camera: Transform) -> str | None:
-        """Write a rectified pair with its depth, or say why it cannot be one."""
+        """Write a rectified image pair.
+
+        Args:
+            picture: rectified, with depth.
+            T_map_camera: pose of the optical frame (4, 4).
+
+        Returns:
+            None, or the reason why the pair was left out.
+        """
         size = (picture.camera.height, picture.camera.width)
         if picture.depth is None or picture.rgb.shape[:2] != size or picture.depth.shape != size:
             depth = None if picture.depth is None else picture.depth.shape
@@ -59,7 +67,7 @@ class QueryWriter:
         return None
 
     def finish(self) -> list[CameraSensor]:
-        """Write poses and cameras; the cameras are for ``dataset.json``."""
+        """Write poses and cameras, and return the cameras for ``dataset.json``."""
         if self.count:
             write_tum(self._folder / "poses.txt", np.array(self._stamps), np.stack(self._poses))
             if len(self._cameras) > 1:
@@ -89,7 +97,14 @@ class QueryWriter:
 
 
 def whole_steps(depth: Depth, scale_m: float) -> tuple[NDArray[np.uint16], float]:
-    """Depth in 16 bits and the metres of a step; what is no depth, or too far for 16 bits, becomes 0."""
+    """Convert depth to 16 bits, and return the metres per step too.
+
+    A value that is invalid, or too large for 16 bits, becomes 0.
+
+    Args:
+        depth: integer steps or metres (H, W).
+        scale_m: metres per step of an integer depth.
+    """
     if depth.dtype == np.uint16:
         return np.asarray(depth, np.uint16), scale_m
     metres = np.nan_to_num(np.asarray(depth, np.float32), nan=0.0, posinf=0.0, neginf=0.0)

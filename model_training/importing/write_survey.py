@@ -1,4 +1,4 @@
-"""The survey of a dataset, written scan after scan."""
+"""Write the survey of a dataset, scan by scan."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from service.geometry.rigid import Transform
 
 
 class SurveyWriter:
-    """Numbers scans as they come; the poses are written at the end.
+    """Number and write scans as they come. Poses are written at the end.
 
     Args:
         out: folder of the dataset.
@@ -25,11 +25,17 @@ class SurveyWriter:
 
     @property
     def count(self) -> int:
-        """Scans so far."""
+        """Number of scans so far."""
         return len(self._stamps)
 
     def add(self, stamp_s: float, T_map_lidar: Transform, points: Float32[NDArray[np.float32], "N 4"]) -> None:
-        """Write a scan: x y z (m, LiDAR frame) and intensity."""
+        """Write a scan.
+
+        Args:
+            stamp_s: time, seconds.
+            T_map_lidar: pose of the LiDAR (4, 4).
+            points: x y z (m, LiDAR frame) and intensity.
+        """
         scan_path(self._out, self.count).write_bytes(np.ascontiguousarray(points, np.float32).data)
         self._stamps.append(stamp_s)
         self._poses.append(T_map_lidar)

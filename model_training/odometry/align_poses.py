@@ -1,7 +1,8 @@
-"""A recording's own poses, mended by its scans: steps by scan matching, the whole where the recording has it.
+"""Correct the poses of a recording with its scans: scan matching gives the steps, the recording gives the overall position.
 
-Poses of GNSS and inertial sensors are off by decimetres between houses, differently every few dozen metres: on KITTI's drive 0005 by up to
-0.26 m in a step of 2.3 m. A map of them is blurred, and what is measured against them is measured wrongly.
+Poses of GNSS and inertial sensors err by decimetres between houses, differently every few dozen metres.
+On KITTI drive 0005 a step of 2.3 m errs by up to 0.26 m.
+A map from such poses is blurred, and they are a wrong reference for measurements.
 """
 
 from collections.abc import Callable
@@ -19,21 +20,21 @@ from service.errors import ExtraMissingError, how_to_install
 from service.geometry.rigid import inverse
 
 Report = Callable[[str, int, int], None]
-#: Formats whose own poses are of GNSS and inertial sensors: these are aligned unless told otherwise.
+#: Formats whose own poses come from GNSS and inertial sensors. These are aligned by default.
 ALIGNED_KINDS = frozenset({"kitti-raw"})
-#: A scan that has no given pose so near in time has no guess, and is left out.
+#: Greatest time between a scan and the given poses, seconds. A scan beyond it has no initial guess and is left out.
 TOLERANCE_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class AlignedPoses:
-    """Poses that were mended.
+    """Corrected poses.
 
     Attributes:
-        trajectory: T_map_vehicle at the given poses' times and at the scans'.
-        scans: how many scans were matched.
-        step_m: how much the steps from scan to scan changed: the median;
-        most_step_m: and the most.
+        trajectory: T_map_vehicle at the times of the given poses and of the scans.
+        scans: number of matched scans.
+        step_m: median change of a step from scan to scan, metres.
+        most_step_m: greatest change of a step, metres.
     """
 
     trajectory: Trajectory
@@ -45,23 +46,23 @@ class AlignedPoses:
 def aligned_with_scans(
     recording: Recording, trajectory: Trajectory, *, report: Report = lambda *_: None
 ) -> AlignedPoses | None:
-    """Match each scan to those before it, guided by the given poses, and bring both into agreement.
+    """Match each scan to the scans before it, starting at the given poses, and fuse both in a pose graph.
 
-    Between scans the given poses keep their own motion: what is interpolated is the correction, in the vehicle's frame.
+    Between scans the given poses keep their own motion: only the correction is interpolated, in the vehicle frame.
 
     Args:
         recording: with scans.
         trajectory: T_map_vehicle, as the recording gives it.
-        report: told stage, done and all.
+        report: called with the stage, the scans done and all scans.
 
     Returns:
-        None where fewer than two scans have a pose.
+        The corrected poses; None if fewer than two scans have a pose.
 
     Raises:
         ExtraMissingError: small_gicp or gtsam is not installed.
     """
     try:
-        import gtsam  # noqa: F401  # asked for before the work, not after it
+        import gtsam  # noqa: F401  # fails before the work, not after it
         import small_gicp  # noqa: F401
     except ModuleNotFoundError as error:
         raise ExtraMissingError(
@@ -102,23 +103,33 @@ def aligned_with_scans(
 
 
 def inverse_of(transforms: np.ndarray) -> np.ndarray:
-    """Of each of many transforms (n, 4, 4)."""
+    """Invert transforms.
+
+    Args:
+        transforms: rigid transforms (N, 4, 4).
+
+    Returns:
+        Their inverses (N, 4, 4).
+    """
     return np.stack([inverse(T) for T in transforms])
 
 
 def usual_poses(
     recording: Recording, trajectory: Trajectory, *, align: bool | None = None, report: Report = lambda *_: None
 ) -> tuple[Trajectory, str | None]:
-    """The poses that an import takes unless told otherwise, and a line for people about them.
+    """Return the poses that an import uses by default, and a line about them for people.
 
     Args:
         recording: opened.
-        trajectory: its own.
-        align: with the scans, or not; None does so for ``ALIGNED_KINDS`` where the packages for it are installed.
-        report: told stage, done and all.
+        trajectory: the recording's own poses, T_map_vehicle.
+        align: align the poses with the scans. None does so for ``ALIGNED_KINDS`` if the packages are installed.
+        report: called with the stage, the scans done and all scans.
+
+    Returns:
+        T_map_vehicle, and the line; None without a line if alignment was not wanted.
 
     Raises:
-        ExtraMissingError: ``align`` is True, and a package for it is not installed.
+        ExtraMissingError: ``align`` is True, and a package is not installed.
     """
     if align is False or (align is None and recording.kind not in ALIGNED_KINDS):
         return trajectory, None

@@ -1,4 +1,4 @@
-"""Poses of a recording that has none: odometry, then loops closed."""
+"""Find the poses of a recording that has none: odometry, then loop closure."""
 
 import tempfile
 from collections.abc import Callable
@@ -23,13 +23,13 @@ Report = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What odometry found.
+    """Result of odometry and loop closure.
 
     Attributes:
-        trajectory: T_map_vehicle; the map is the LiDAR's frame at the first scan.
-        before: the same without loops closed.
-        loops: how many were proved.
-        disagreement_m: of odometry with the loops, in the mean: before and after they were closed.
+        trajectory: T_map_vehicle after loop closure. The map frame is the LiDAR frame of the first scan.
+        before: T_map_vehicle before loop closure.
+        loops: number of verified loops.
+        disagreement_m: mean distance between odometry and the loops, metres: before and after loop closure.
     """
 
     trajectory: Trajectory
@@ -41,13 +41,13 @@ class Found:
 def find_trajectory(
     recording: Recording, *, close_loops: bool = True, expected_height_m: float = 1.8, report: Report = lambda *_: None
 ) -> Found:
-    """Follow the scans of a recording, and close loops where a place is met again.
+    """Follow the scans of a recording, and close loops at places that the traversal visits again.
 
     Args:
-        recording: its own poses are not looked at.
-        close_loops: False leaves odometry as it is.
-        expected_height_m: of the LiDAR above the ground, roughly.
-        report: told stage, done and all.
+        recording: its own poses are not used.
+        close_loops: False keeps the odometry as it is.
+        expected_height_m: approximate height of the LiDAR above the ground, metres.
+        report: called with the stage, the steps done and all steps.
 
     Raises:
         DatasetError: there is no usable scan.

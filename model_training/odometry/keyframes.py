@@ -1,4 +1,4 @@
-"""Keyframes of a drive: every other metre a scan, thinned, described from all sides, and kept on disk."""
+"""Keyframes of a traversal: a scan every two metres, thinned, with descriptors in all directions, kept on disk."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,9 +15,11 @@ from service.imaging.pca import Level, level_scan, principal_heading
 from service.imaging.view_grid import ViewGrid, panorama_from_points, survey_planes, view_from_panorama
 from service.localization.encoder import Encoder
 
+#: Least distance travelled between keyframes, metres.
 SPACING_M = 2.0
+#: Views per keyframe, one every 15 degrees.
 HEADINGS = 24
-#: Edge of the cells that keep one point each, and how far points are kept.
+#: Edge of the cells that keep one point each, and greatest range of a kept point, metres.
 CELL_M, REACH_M = 0.25, 40.0
 
 
@@ -26,13 +28,13 @@ class Keyframe:
     """One kept scan.
 
     Attributes:
-        index: among the keyframes.
-        stamp_s: of the scan.
-        T_first_lidar: by odometry.
-        travelled_m: since the first scan.
-        level: of the scan.
-        start_rad: principal heading in the level frame, where its fan of views starts.
-        descriptors: of the views, counter-clockwise from there.
+        index: position among the keyframes.
+        stamp_s: time of the scan, seconds.
+        T_first_lidar: pose from odometry, in the LiDAR frame of the first scan.
+        travelled_m: distance travelled since the first scan, metres.
+        level: levelling of the scan.
+        start_rad: heading of the first view, in the level frame, radians: the principal heading of the scan.
+        descriptors: one per view, counter-clockwise from the first view.
     """
 
     index: int
@@ -46,13 +48,13 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive by odometry: times and poses of all scans, and its keyframes with their points.
+    """A traversal from odometry.
 
     Attributes:
-        stamps_s: of every scan.
-        T_first_lidar: of every scan.
+        stamps_s: time of every scan, seconds.
+        T_first_lidar: pose of every scan, in the LiDAR frame of the first scan.
         keyframes: in order of time.
-        folder: where the keyframes' points lie.
+        folder: holds the points of the keyframes.
     """
 
     stamps_s: Float64[NDArray[np.float64], " N"]
@@ -61,7 +63,11 @@ class Drive:
     folder: Path
 
     def points(self, index: int) -> Float32[NDArray[np.float32], "M 3"]:
-        """Thinned points of a keyframe, metres, LiDAR frame."""
+        """Load the thinned points of a keyframe, LiDAR frame, metres.
+
+        Args:
+            index: number of the keyframe.
+        """
         loaded: NDArray[np.float32] = np.load(self.folder / f"{index:06d}.npy", allow_pickle=False)
         return loaded
 
@@ -70,14 +76,14 @@ def drive_of(
     scans: Iterable[PosedScan], encoder: Encoder | None, folder: Path, *, expected_height_m: float = 1.8,
     report: Callable[[int], None] = lambda _: None,
 ) -> Drive:  # fmt: skip
-    """Follow a drive to its end.
+    """Collect poses and keyframes of a traversal.
 
     Args:
         scans: with poses.
-        encoder: describes the keyframes; None keeps poses alone.
-        folder: for the keyframes' points; memory holds their descriptors only.
-        expected_height_m: of the LiDAR above the ground, roughly.
-        report: told the scans done.
+        encoder: describes the keyframes; None keeps poses and no keyframes.
+        folder: for the points of the keyframes. Only descriptors stay in memory.
+        expected_height_m: approximate height of the LiDAR above the ground, metres.
+        report: called with the number of scans done.
     """
     stamps: list[float] = []
     poses: list[Transform] = []
@@ -101,7 +107,7 @@ def _keyframe(scan: PosedScan, index: int, travelled_m: float, encoder: Encoder,
     start_rad = principal_heading(levelled[:, :3], height_m=level.height_m)
     grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
     panorama = panorama_from_points(levelled, grid)
-    every_row = np.ones(grid.rows, np.bool_)  # both sides of a comparison are of one LiDAR
+    every_row = np.ones(grid.rows, np.bool_)  # one LiDAR recorded both sides of a comparison
     planes = np.stack([
         survey_planes(view_from_panorama(panorama, start_rad + turn, grid), sensor_height_m=level.height_m, rows_seen=every_row, grid=grid)
         for turn in fan(HEADINGS)
@@ -111,7 +117,7 @@ def _keyframe(scan: PosedScan, index: int, travelled_m: float, encoder: Encoder,
 
 
 def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """One point a cell, the first met."""
+    """Keep one point per cell, the first one, within ``REACH_M``."""
     near = points[np.linalg.norm(points, axis=1) < REACH_M]
     cell = np.floor(near / CELL_M).astype(np.int64)
     key = (cell[:, 0] * 4096 + cell[:, 1]) * 4096 + cell[:, 2]

@@ -1,4 +1,4 @@
-"""Places that a drive comes back to: proposed by descriptors of all sides, proved by registration."""
+"""Find loops of a traversal: descriptors in all directions propose them, registration verifies them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from service.registration.surfel_map import SurfelMap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopSettings:
-    """Ours, November 2026; chosen on drives of cities that no figure is measured on.
+    """Thresholds of the loop search, chosen in November 2026 on validation cities.
 
     Attributes:
-        apart_m: of travel between two keyframes, or they are neighbours and no loop.
-        every: each how many keyframes one is looked up.
-        drift: how far, as a share of the travel between them, two visits of one place may lie apart;
-        slack_m: and this much in any case.
-        similarity: mean over the views of all sides, at the best turn, that is worth a registration.
-        around: keyframes before and after the earlier visit that make its cloud.
-        voxel_m: of that cloud.
-        points: of the later visit that are registered.
-        sigma_m: range noise of a thinned scan.
-        inliers: share of the points on the cloud that proves a loop.
+        apart_m: least distance travelled between two keyframes of a loop, metres.
+        every: one of this many keyframes is looked up.
+        drift: allowed distance between two visits of one place, as a share of the distance travelled between them.
+        slack_m: allowed distance that is added to it, metres.
+        similarity: least mean similarity over all views, at the best rotation, for which registration is tried.
+        around: keyframes before and after the earlier visit that form its cloud.
+        voxel_m: voxel size of that cloud, metres.
+        points: registered points of the later visit.
+        sigma_m: range noise of a thinned scan, metres.
+        inliers: least share of inliers that verifies a loop.
     """
 
     apart_m: float = 40.0
@@ -46,7 +46,15 @@ class LoopSettings:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """The later keyframe's pose in the earlier's frame, and the share of its points that prove it."""
+    """A verified loop.
+
+    Attributes:
+        earlier: index of the earlier keyframe.
+        later: index of the later keyframe.
+        T_earlier_later: pose of the later LiDAR in the frame of the earlier one.
+        inliers: share of inliers of the registration.
+        similarity: mean similarity of the descriptors at the best rotation.
+    """
 
     earlier: int
     later: int
@@ -58,12 +66,12 @@ class Loop:
 def find_loops(
     drive: Drive, settings: LoopSettings = LoopSettings(), *, report: Callable[[int, int], None] = lambda *_: None
 ) -> list[Loop]:
-    """Loops of a drive, at most one for each keyframe that is looked up.
+    """Find loops of a traversal, at most one per keyframe that is looked up.
 
     Args:
         drive: with keyframes.
-        settings: what is near, like, and proved.
-        report: told the keyframes done and all.
+        settings: thresholds.
+        report: called with the keyframes done and all keyframes that are looked up.
     """
     keyframes = drive.keyframes
     if not keyframes:
@@ -93,14 +101,14 @@ def find_loops(
 def all_round(
     one: NDArray[np.float32], others: NDArray[np.float32]
 ) -> tuple[Float64[NDArray[np.float64], " N"], NDArray[np.intp]]:
-    """Mean similarity of a place's views to those of others, each at the turn that fits it best.
+    """Compute the mean similarity of a place's views to those of other places, at the best rotation of each.
 
     Args:
-        one: (H, D) descriptors, counter-clockwise.
-        others: (N, H, D).
+        one: descriptors of the place, counter-clockwise (H, D).
+        others: descriptors of N other places, counter-clockwise (N, H, D).
 
     Returns:
-        Similarities (n), and turns (n): the view of the other that looks like the first one of ``one``.
+        Similarities (N,) and rotations (N,): the number of the other's view that matches the first view of ``one``.
     """
     count = len(one)
     products = np.einsum("hd,ngd->nhg", one, others, optimize=True)
@@ -113,7 +121,7 @@ def all_round(
 def _proved(
     drive: Drive, later: Keyframe, earlier: Keyframe, turn: int, similarity: float, settings: LoopSettings
 ) -> Loop | None:
-    """Register the later visit on the cloud of the earlier one."""
+    """Register the later visit against the cloud of the earlier one; None if too few points are inliers."""
     cloud = _cloud(drive, earlier, settings)
     T_first_level = earlier.T_first_lidar @ transform_from(earlier.level.R_level_sensor.T, np.zeros(3))
     turned = earlier.start_rad + 2 * np.pi * turn / HEADINGS - later.start_rad
@@ -127,7 +135,7 @@ def _proved(
 
 
 def _cloud(drive: Drive, middle: Keyframe, settings: LoopSettings) -> SurfelMap:
-    """Surface elements of the keyframes around one, in the odometry's own frame."""
+    """Surfels of the keyframes around one, in the odometry frame."""
     voxels = VoxelMap(settings.voxel_m, np.round(middle.T_first_lidar[:3, 3]))
     low, high = max(0, middle.index - settings.around), middle.index + settings.around + 1
     for keyframe in drive.keyframes[low:high]:

@@ -1,4 +1,4 @@
-"""Odometry and loops brought into one consistent drive: a pose graph, solved by GTSAM (Dellaert and Kaess, 2017)."""
+"""Fuse odometry and loops in a pose graph, solved by GTSAM (Dellaert and Kaess, 2017)."""
 
 from itertools import pairwise
 
@@ -10,22 +10,28 @@ from model_training.odometry.keyframes import Drive
 from model_training.odometry.loops import Loop
 from service.geometry.rigid import inverse
 
-#: Standard deviations, rotation (rad) first as GTSAM has it: of odometry for each square root of a metre, and of a loop.
+#: Standard deviations of odometry per square root of a metre: rotation (rad) first, as in GTSAM, then translation (m).
 ODOMETRY_SIGMAS = np.array([0.0007, 0.0007, 0.0007, 0.01, 0.01, 0.01])
+#: Standard deviations of a loop, in the same order.
 LOOP_SIGMAS = np.array([0.003, 0.003, 0.003, 0.05, 0.05, 0.05])
-#: Of a given pose. Its errors last for dozens of metres, which the graph takes for independent: so each counts for less than its own.
+#: Standard deviations of a given pose. They are larger than its error: the error is correlated over dozens of metres,
+#: and the graph assumes independent errors.
 GIVEN_SIGMAS = np.array([0.02, 0.02, 0.03, 3.0, 3.0, 3.0])
-#: Beyond so many standard deviations a loop, or a given pose, counts for less and less: it may be another place that looks the same.
+#: Threshold of the robust kernel, standard deviations. A loop beyond it may be a perceptual alias.
 ROBUST = 3.0
 
 Transforms = Float64[NDArray[np.float64], "N 4 4"]
 
 
 def closed(drive: Drive, loops: list[Loop]) -> Transforms:
-    """T_first_lidar of every scan with the loops closed.
+    """Return T_first_lidar of every scan after loop closure (N, 4, 4).
 
-    Between keyframes the correction is carried on rigidly from the keyframe before, so that what odometry says of
-    neighbouring scans stays as it is.
+    Between keyframes the correction of the keyframe before is applied rigidly. So the relative poses of neighbouring scans
+    stay as odometry gives them.
+
+    Args:
+        drive: traversal with at least one keyframe.
+        loops: verified loops.
     """
     corrected = _solved(drive, loops)
     keyframes = drive.keyframes
@@ -37,7 +43,12 @@ def closed(drive: Drive, loops: list[Loop]) -> Transforms:
 
 
 def disagreement_m(T_first_keyframe: Transforms, loops: list[Loop]) -> float:
-    """How far, in the mean, poses are from what the loops say: what is left of the drift where places were met again."""
+    """Return the mean distance of poses from the loops, metres: the remaining drift at revisited places.
+
+    Args:
+        T_first_keyframe: poses of the keyframes (N, 4, 4).
+        loops: verified loops.
+    """
     away = [
         (inverse(T_first_keyframe[loop.earlier]) @ T_first_keyframe[loop.later])[:3, 3] - loop.T_earlier_later[:3, 3]
         for loop in loops
@@ -46,11 +57,14 @@ def disagreement_m(T_first_keyframe: Transforms, loops: list[Loop]) -> float:
 
 
 def held_near(T_map_steps: Transforms, T_map_given: Transforms) -> Transforms:
-    """Poses whose steps are those of a chain, and whose whole stays where given poses have it.
+    """Fuse a chain of accurate steps with given poses that do not drift.
 
     Args:
-        T_map_steps: of a drive, by odometry: right from one to the next, drifting as a whole.
-        T_map_given: of the same moments, by GNSS or an inertial system: off by decimetres each, not drifting.
+        T_map_steps: poses from odometry (N, 4, 4): each step is accurate, the whole drifts.
+        T_map_given: poses of GNSS or an inertial system at the same times (N, 4, 4): each errs by decimetres, without drift.
+
+    Returns:
+        T_map (N, 4, 4).
     """
     import gtsam
 

@@ -7,16 +7,29 @@ from numpy.typing import NDArray
 
 from model_training.simulation.meshes import Material, MeshBuilder
 
+#: Linear albedo (n, 3) of walls.
 PLASTERS = np.array([[.72, .66, .55], [.80, .76, .68], [.62, .45, .36], [.68, .60, .42], [.55, .57, .58], [.74, .58, .46],
                      [.48, .50, .46], [.83, .80, .74], [.60, .38, .30], [.45, .36, .32]])  # fmt: skip
+#: Linear albedo (n, 3) of roofs.
 ROOFS = np.array([[0.45, 0.20, 0.14], [0.30, 0.22, 0.20], [0.25, 0.26, 0.28], [0.38, 0.30, 0.24]])
+#: Linear albedo (n, 3) of awnings.
 AWNINGS = np.array([[0.6, 0.1, 0.1], [0.1, 0.3, 0.15], [0.1, 0.15, 0.45], [0.7, 0.6, 0.2], [0.75, 0.75, 0.72]])
+#: Linear albedo (3,) of window glass.
 GLASS = np.array([0.10, 0.13, 0.16])
 
 
 @dataclass(frozen=True)
 class FacadeStyle:
-    """Rhythm of a façade, metres."""
+    """Dimensions of a façade, metres.
+
+    Attributes:
+        storey: height of a storey.
+        bay: target distance between window axes.
+        window_width: width of a window.
+        window_height: height of a window.
+        relief: depth of the wall in front of the glass.
+        sill: height of a window's lower edge above its floor.
+    """
 
     storey: float
     bay: float
@@ -27,7 +40,11 @@ class FacadeStyle:
 
     @staticmethod
     def random(rng: np.random.Generator) -> "FacadeStyle":
-        """A style within what streets show."""
+        """Draw a style within the ranges of real streets.
+
+        Args:
+            rng: random generator.
+        """
         return FacadeStyle(
             storey=rng.uniform(2.8, 3.8),
             bay=rng.uniform(2.0, 5.0),
@@ -40,9 +57,17 @@ class FacadeStyle:
 
 @dataclass(frozen=True)
 class Footprint:
-    """A building's place: centre on the ground, size along and across the street, height, heading of its front's left."""
+    """Position and size of a building.
 
-    centre: NDArray[np.float64]  # (3,)
+    Attributes:
+        centre: centre of the footprint on the ground (3,), map frame, metres.
+        width: size along the street, metres.
+        depth: size across the street, metres.
+        height: height of the walls, metres.
+        yaw: heading of the width axis, radians, counter-clockwise from x. The front faces yaw - 90 degrees.
+    """
+
+    centre: NDArray[np.float64]
     width: float
     depth: float
     height: float
@@ -52,11 +77,22 @@ class Footprint:
 def add_building(
     builder: MeshBuilder, plan: Footprint, style: FacadeStyle, *, roof: str, lively: float, rng: np.random.Generator
 ) -> None:
-    """A core of glass behind a relief of wall, so that every gap of the relief is a window."""
+    """Add a building: a glass core behind a relief of wall pieces.
+
+    Every gap of the relief is a window.
+
+    Args:
+        builder: receives the triangles.
+        plan: position and size.
+        style: dimensions of the façade.
+        roof: ``flat``, ``hip``, or anything else for a gabled roof.
+        lively: probability that a side has balconies. The probability of awnings grows with it too.
+        rng: random generator.
+    """
     wall = PLASTERS[rng.integers(len(PLASTERS))] * rng.uniform(0.8, 1.15) + rng.normal(0, 0.02, 3)
     wall = np.clip(wall, 0.05, 0.92)
     material = Material.BRICK if rng.random() < 0.4 else Material.MATTE
-    sunk = 2.0  # below the ground, for slopes
+    sunk = 2.0  # metres below the ground: no gap opens on a slope
     base = plan.centre - [0.0, 0.0, sunk]
     builder.box(base, (plan.width, plan.depth, plan.height + sunk), plan.yaw, GLASS, Material.GLASS)
     for side in range(4):
@@ -69,7 +105,7 @@ def add_building(
             builder.box(
                 top, (plan.width * 0.5, plan.depth * 0.5, rng.uniform(1.5, 4)), plan.yaw, wall * 0.6, Material.MATTE
             )
-        for _ in range(int(rng.integers(0, 4))):  # chimneys, plant
+        for _ in range(int(rng.integers(0, 4))):  # chimneys and ventilation
             offset = rng.uniform(-0.4, 0.4, 2) * (plan.width, plan.depth)
             builder.box(
                 top + [*_turned(offset, plan.yaw), 0.3],
@@ -91,7 +127,7 @@ def _facade(
     builder: MeshBuilder, plan: Footprint, style: FacadeStyle, side: int, along: float, away: float,
     wall: NDArray[np.float64], material: Material, lively: float, rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Piers and spandrels of one side; balconies, a door, perhaps an awning or steps."""
+    """Add the piers and spandrels of one side, a door, and perhaps balconies, awnings, steps, a rain pipe or a bay window."""
     yaw = plan.yaw + side * np.pi / 2
     out = np.array([np.sin(yaw), -np.cos(yaw)])
     tangent = np.array([np.cos(yaw), np.sin(yaw)])
@@ -146,7 +182,7 @@ def _facade(
             builder.box(
                 at(u, 0.8, ground + rng.uniform(2.5, 3.0)), (rng.uniform(2, 4), 1.6, 0.25), yaw, colour, Material.MATTE
             )
-    if rng.random() < 0.5:  # a rain pipe or a projecting bay
+    if rng.random() < 0.5:  # a rain pipe or a bay window
         u = float(rng.uniform(-along / 2 + 0.3, along / 2 - 0.3))
         if along > 6 and rng.random() < 0.4 and storeys > 1:
             z = ground + rng.uniform(0, style.storey)
@@ -160,7 +196,7 @@ def _facade(
 def _pitched_roof(builder: MeshBuilder, plan: Footprint, *, hipped: bool, rng: np.random.Generator) -> None:
     rise, overhang = rng.uniform(1.5, 3.8), 0.45
     x, y = plan.width / 2 + overhang, plan.depth / 2 + overhang
-    if rng.random() < 0.6:  # the ridge along the street
+    if rng.random() < 0.6:  # the ridge is parallel to the street
         inset = x * 0.45 if hipped else 0.0
         corners = np.array(
             [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x + inset, 0, rise], [x - inset, 0, rise]]

@@ -1,4 +1,4 @@
-"""RGB and true depth of one camera pose."""
+"""Render the RGB image and the true depth of one camera pose."""
 
 from dataclasses import dataclass
 
@@ -15,12 +15,19 @@ from model_training.simulation.shading import Light, shade, shadows
 from model_training.simulation.terrain import GroundPicture
 from service.geometry.camera import PinholeCamera
 
-SHADOW_STEP = 2  # shadow rays at every second pixel each way: four times fewer, and edges stay soft
+#: Pixels between shadow rays, horizontally and vertically: a quarter of the rays.
+SHADOW_STEP = 2
 
 
 @dataclass(frozen=True)
 class Picture:
-    """``rgb`` (H, W, 3), true z ``depth_m`` (H, W; 0 for nothing) and ``blank`` (H, W): nothing to match on."""
+    """A rendered RGB-D image.
+
+    Attributes:
+        rgb: sRGB image (H, W, 3).
+        depth_m: true depth (H, W), z in the optical frame, metres; 0 where no surface is hit.
+        blank: pixels (H, W) on glass, metal or plain walls, where a stereo matcher finds no texture.
+    """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -28,7 +35,11 @@ class Picture:
 
 
 def unit_rays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Unit rays (H*W, 3) in the optical frame, and their z (H*W)."""
+    """Return the unit rays (N, 3) of all N = H * W pixels in the optical frame, row by row, and their z components (N,).
+
+    Args:
+        camera: intrinsics.
+    """
     rays = camera.rays_of_pixels().reshape(-1, 3)
     length = np.linalg.norm(rays, axis=1)
     return (rays / length[:, None]).astype(np.float32), (1.0 / length).astype(np.float32)
@@ -39,7 +50,22 @@ def take(
     condition: Condition, model: RgbModel, rng: np.random.Generator, *, rays_camera: NDArray[np.float32], z_of_ray: NDArray[np.float32],
     blocker: Blocker | None = None, metering: float | None = None,
 ) -> Picture:  # fmt: skip
-    """Take a picture; ``rays_camera`` and ``z_of_ray`` are those of ``unit_rays``, ``metering`` is as in ``exposed``."""
+    """Render an RGB-D image.
+
+    Args:
+        scene: static objects and occupants of the traversal.
+        ground: cover of the ground.
+        camera: intrinsics.
+        T_map_camera: camera pose (4, 4), optical frame to map frame, metres.
+        light: sun and sky of the traversal.
+        condition: weather and light of the traversal.
+        model: RGB camera.
+        rng: random generator of the frame.
+        rays_camera: unit rays (N, 3) of ``unit_rays``.
+        z_of_ray: z components (N,) of ``unit_rays``.
+        blocker: vehicle body that occludes a part of the scene.
+        metering: exposure factor, as in ``exposed``; None draws it.
+    """
     R = T_map_camera[:3, :3].astype(np.float32)
     origin = T_map_camera[:3, 3]
     rays = rays_camera @ R.T
@@ -63,7 +89,7 @@ def take(
 def _lit(
     scene: Scene, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light, shape: tuple[int, int]
 ) -> NDArray[np.bool_]:  # fmt: skip
-    """Shadow rays on a coarser grid, spread over the pixels between."""
+    """Return which pixels see the sun (N,): cast shadow rays on a coarser grid and copy each result to its neighbours."""
 
     def coarse(values: NDArray[np.float32]) -> NDArray[np.float32]:
         picked = values.reshape(*shape, -1)[::SHADOW_STEP, ::SHADOW_STEP]

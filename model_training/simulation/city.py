@@ -1,4 +1,4 @@
-"""A city by seed: streets, terrain, buildings, gardens, trees; and who stands there on a given drive."""
+"""A city that follows from its seed: streets, terrain, buildings, gardens and trees, and the occupants of each traversal."""
 
 from typing import Any
 
@@ -14,17 +14,27 @@ from model_training.simulation.streets import Street, paper_streets, random_stre
 from model_training.simulation.terrain import GroundPicture, Terrain
 
 Vector = NDArray[np.float64]
-#: Rows of a car park beyond the pavement, and the width of a slot, metres.
+#: Distances of a car park's rows from the pavement, and the width of a slot, metres.
 CAR_ROWS_M, CAR_SLOT_M = (4.0, 15.0, 20.5), 2.8
 
 
 class City:
-    """Everything that does not move, and the slots where things may stand.
+    """The static objects of a city, and the slots where vehicles and people may stand.
 
     Args:
-        name: ``paper`` for the paper's city, ``mixed`` for one of all kinds of districts, else only a name of one of the first three kinds.
         seed: the same seed gives the same city.
-        size_m: extent in x and y of a random city.
+        name: ``paper`` for the paper's city, ``mixed`` for one with all kinds of districts. Any other name gives a random city of the
+            first three kinds.
+        size_m: extent of a random city in x and y, metres.
+
+    Attributes:
+        seed: seed of the city.
+        name: name of the city.
+        streets: street network.
+        half_size_m: half the extent in x and y, metres.
+        terrain: ground height.
+        ground: cover of the ground.
+        static: mesh of all static objects, map frame.
     """
 
     def __init__(self, *, seed: int, name: str = "city", size_m: tuple[float, float] = (300.0, 400.0)) -> None:
@@ -40,8 +50,8 @@ class City:
         self._tree = cKDTree(points)
         self._district_seeds, self._district_kinds = self._districts(rng)
         self._occupied: list[NDArray[np.float64]] = []
-        self._parking: list[tuple[float, float, float, float]] = []  # x, y, yaw, share
-        self._walks: list[tuple[float, float, float, float]] = []
+        self._parking: list[tuple[float, float, float, float]] = []  # x and y (m), yaw (rad), probability of a car
+        self._walks: list[tuple[float, float, float, float]] = []  # x and y (m), yaw (rad), probability of a person
         builder = MeshBuilder()
         self.terrain.add_to(builder, self.half_size_m)
         lines = [(street, line) for street in self.streets for line in street.lines]
@@ -52,24 +62,35 @@ class City:
         self.static: Mesh = builder.mesh()
 
     def streets_geojson(self) -> dict[str, Any]:
-        """The classes as polygons."""
+        """Return the street classes as GeoJSON polygons, map frame, metres."""
         return streets_geojson(self.streets)
 
     def height(self, x: float, y: float) -> float:
-        """Ground height, metres."""
+        """Return the ground height at a point, metres.
+
+        Args:
+            x: map frame, metres.
+            y: map frame, metres.
+        """
         return float(self.terrain.height(np.array([x, y])))
 
     def district_of(self, point: Vector) -> int:
-        """Number of the nearest district in ``DISTRICTS``."""
+        """Return the index in ``DISTRICTS`` of the district nearest to a point.
+
+        Args:
+            point: position (2,), map frame, metres.
+        """
         nearest = int(np.argmin(((self._district_seeds - point) ** 2).sum(axis=1)))
         return int(self._district_kinds[nearest])
 
     def occupants(self, traversal: int, *, parked_changed: float = 0.5) -> Mesh:
-        """Vehicles and people of one drive: a share of the parked cars stays from drive to drive, people never do.
+        """Return the mesh of the vehicles and people of one traversal.
+
+        A share of the parked cars is the same in every traversal. People and moving vehicles differ between traversals.
 
         Args:
-            traversal: 0 is the survey.
-            parked_changed: share of the slots that are drawn anew for each traversal.
+            traversal: number of the traversal; 0 is the survey.
+            parked_changed: share of the parking slots whose cars are drawn anew for the traversal. It has no effect on the survey.
         """
         builder = MeshBuilder()
         for k, (x, y, yaw, share) in enumerate(self._parking):
@@ -85,7 +106,7 @@ class City:
                 offset = rng.normal(0, 0.6, 2)
                 base = np.array([x + offset[0], y + offset[1], self.height(x, y)])
                 add_person(builder, base, yaw + rng.uniform(-np.pi, np.pi), rng)
-        for street in self.streets:  # the odd vehicle in traffic, far between
+        for street in self.streets:  # sparse oncoming traffic
             for line in street.lines:
                 for k in range(4, len(line) - 4):
                     if rng.random() < 0.012:
@@ -97,7 +118,11 @@ class City:
         return builder.mesh()
 
     def clearance(self, points: Vector) -> float:
-        """Smallest distance (m) of points (n, 2) to any carriageway; negative on it."""
+        """Return the smallest distance of points to any carriageway, metres; negative on a carriageway.
+
+        Args:
+            points: positions (n, 2), map frame, metres.
+        """
         distance, index = self._tree.query(points, k=min(6, len(self._centre)))
         return float((distance - self._half[index]).min())
 
@@ -119,7 +144,7 @@ class City:
         return not any(np.abs(other[0] - middle).max() < 60.0 and _overlap(corners, other) for other in self._occupied)
 
     def _line_up(self, builder: MeshBuilder, street: Street, line: Vector, rng: np.random.Generator) -> None:
-        """Everything along both sides of one centre line."""
+        """Add the objects along both sides of one centre line."""
         travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
         length = float(travelled[-1])
 
@@ -144,7 +169,7 @@ class City:
             normal = np.array([-step[1], step[0]]) / length * side
             centre = middle + normal * (half + pavement / 2)
             if self.clearance(centre[None]) > 0.8:
-                # A slab that follows the slope: its top corners stand 13 cm above the ground under each.
+                # Each top corner is 13 cm above the ground at its own position, so the slab follows the slope.
                 ends = [line[k], line[k + 1]]
                 inner = [e + normal * half for e in ends]
                 outer = [e + normal * (half + pavement) for e in ends]
@@ -193,7 +218,7 @@ class City:
             u += width + gap
 
     def _car_park(self, edge: Vector, direction: Vector, normal: Vector, width: float, district: District) -> None:
-        """Slots at right angles to the street, two rows to each aisle."""
+        """Add parking slots at right angles to the street, two rows per aisle."""
         yaw = float(np.arctan2(normal[1], normal[0]))
         for aside in CAR_ROWS_M:
             for along in np.arange(-width / 2, width / 2, CAR_SLOT_M):
@@ -219,7 +244,7 @@ class City:
         self, builder: MeshBuilder, point: Vector, direction: Vector, normal: Vector, edge: float, length: float,
         district: District, rng: np.random.Generator,
     ) -> None:  # fmt: skip
-        """A fence, a hedge or a wall with a gate, following the slope piece by piece."""
+        """Add a fence, hedge or wall with a gate. Each piece stands at its own ground height."""
         kind = rng.choice(list(district.boundaries))
         height = {"fence": rng.uniform(0.8, 1.6), "hedge": rng.uniform(0.8, 1.9), "wall": rng.uniform(0.5, 1.8)}[
             str(kind)
@@ -233,7 +258,7 @@ class City:
         material = {"fence": Material.MATTE, "hedge": Material.FOLIAGE, "wall": Material.BRICK}[str(kind)]
         yaw = float(np.arctan2(direction[1], direction[0]))
         gate = rng.uniform(-0.3, 0.3) * length
-        step = 0.35 if kind == "fence" and rng.random() < 0.5 else 1.5  # pales one sees through, or boards
+        step = 0.35 if kind == "fence" and rng.random() < 0.5 else 1.5  # separate pales with gaps, or closed boards
         for u in np.arange(-length / 2, length / 2, step):
             if abs(u - gate) < 1.3:
                 continue
@@ -247,7 +272,7 @@ class City:
     def _verge(
         self, builder: MeshBuilder, at: Any, length: float, side: float, half: float, rng: np.random.Generator
     ) -> None:
-        """Street trees, furniture, parking slots and where people walk."""
+        """Add street trees, furniture, parking slots and places of pedestrians."""
 
         def spot(u: float, aside: float) -> tuple[Vector, float]:
             point, direction = at(u)
@@ -280,7 +305,7 @@ class City:
                 self._walks.append((place[0], place[1], yaw, district.people / 20.0))
 
     def _background(self, builder: MeshBuilder, rng: np.random.Generator) -> None:
-        """Trees, bushes and back-yard fences where no street runs."""
+        """Add trees, bushes and back-yard fences away from the streets."""
         half = np.array(self.half_size_m)
         count = int(half[0] * half[1] * 4 / 45.0)
         for point in rng.uniform(-half - 25, half + 25, (count, 2)):
@@ -305,7 +330,7 @@ def _corners(centre: Vector, width: float, depth: float, yaw: float) -> Vector:
 
 
 def _overlap(a: Vector, b: Vector) -> bool:
-    """Whether two rectangles overlap (separating axes)."""
+    """Test whether two rectangles (4, 2) overlap (separating axis theorem)."""
     for polygon in (a, b):
         for k in range(2):
             edge = polygon[k + 1] - polygon[k]

@@ -1,6 +1,6 @@
-"""Errors of a depth camera that triangulates: they grow with the square of the distance.
+"""Errors of a depth camera that triangulates. They grow with the square of the distance.
 
-Presets of the feasibility study (November 2026): ``precise`` and ``stereo``, both at focal length x baseline = 80 px m.
+The presets ``precise`` and ``stereo`` come from the feasibility study (November 2026), both at focal length x baseline = 80 px m.
 Gross errors of stereo matching (bleeding edges, invented depth in sky, glass and blank walls, holes): Scharstein and
 Szeliski, IJCV 47, 2002; Menze and Geiger, CVPR 2015.
 """
@@ -16,27 +16,44 @@ from model_training.simulation.conditions import Condition
 
 Depth = NDArray[np.float32]
 
-BEYOND_M = 200.0  # stands for "nothing there" while disparities are formed
+#: Depth of pixels without a surface while disparities are computed, metres.
+BEYOND_M = 200.0
 
 
 @dataclass(frozen=True, slots=True)
 class DepthModel:
-    """Parameters of a depth camera; pixels are those of a 640 wide picture."""
+    """Parameters of a depth camera. Pixels refer to an image that is 640 pixels wide.
+
+    Attributes:
+        name: name of the preset.
+        focal_baseline_px_m: focal length times baseline, pixels times metres.
+        noise_px: standard deviation of the disparity noise, pixels.
+        correlated: share of the noise variance that patches of 16 and 60 px have in common.
+        step_px: quantisation step of the disparity, pixels; 0: none.
+        offset_px: standard deviation of the disparity offset of a frame, pixels.
+        scale_error: standard deviation of the relative scale error of a frame.
+        bleeding: share of depth edges that take the depth of the foreground.
+        hole_level: patches where a unit normal field exceeds this level have no depth.
+        invented_frames: share of frames with invented depth in sky, glass and blank walls.
+        min_range_m: smallest measured depth, metres.
+        max_range_m: largest measured depth, metres.
+    """
 
     name: str
     focal_baseline_px_m: float = 80.0
     noise_px: float = 0.1
-    correlated: float = 0.5  # share of the noise's variance common to patches of 16 and 60 px
+    correlated: float = 0.5
     step_px: float = 1 / 16
-    offset_px: float = 0.0  # one sigma, a frame
-    scale_error: float = 0.003  # one sigma, a frame
-    bleeding: float = 0.42  # share of edges that take the foreground's depth
-    hole_level: float = 2.3  # patches of a unit normal field above this are missing
-    invented_frames: float = 0.0  # share of frames with depth made up in sky, glass and blank walls
+    offset_px: float = 0.0
+    scale_error: float = 0.003
+    bleeding: float = 0.42
+    hole_level: float = 2.3
+    invented_frames: float = 0.0
     min_range_m: float = 0.4
     max_range_m: float = 40.0
 
 
+#: Presets of modelled depth by name.
 DEPTHS = {
     m.name: m
     for m in (
@@ -48,7 +65,7 @@ DEPTHS = {
 
 
 def _field(rng: np.random.Generator, shape: tuple[int, int], patch: int, smooth: bool = True) -> Depth:
-    """A unit normal field whose values hang together over ``patch`` pixels."""
+    """Draw a field of unit normal values that are correlated over ``patch`` pixels."""
     rows, columns = max(2, shape[0] // patch), max(2, shape[1] // patch)
     coarse = rng.standard_normal((rows, columns), dtype=np.float32)
     field = cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR)
@@ -58,17 +75,14 @@ def _field(rng: np.random.Generator, shape: tuple[int, int], patch: int, smooth:
 def measured_depth(
     clean_m: Depth, blank: NDArray[np.bool_], model: DepthModel, condition: Condition, rng: np.random.Generator
 ) -> Depth:
-    """What the camera says where the truth is ``clean_m``.
+    """Return the depth (H, W) that the camera measures, z in metres; 0 where it measures nothing.
 
     Args:
-        clean_m: z (H, W), metres, 0 for nothing there.
-        blank: pixels (H, W) without texture (glass, plain walls), where stereo may make depth up.
-        model: the camera.
-        condition: the weather and light.
-        rng: of this frame.
-
-    Returns:
-        z (H, W), metres, 0 for no measurement.
+        clean_m: true depth (H, W), z in metres; 0 where there is no surface.
+        blank: pixels (H, W) without texture (glass, plain walls), where stereo may invent depth.
+        model: depth camera.
+        condition: weather and light.
+        rng: random generator of the frame.
     """
     shape = clean_m.shape
     zoom = shape[1] / 640.0
@@ -79,7 +93,7 @@ def measured_depth(
 
     there = clean_m > 0
     z = np.where(there, clean_m, np.float32(BEYOND_M))
-    if condition.extinction_per_m > 0:  # contrast under 5 % is not matched (Koschmieder)
+    if condition.extinction_per_m > 0:  # a contrast below 5 % gives no match (Koschmieder)
         there &= np.exp(-condition.extinction_per_m * z) > 0.05
     size = 2 * patch(2) + 1
     near = cv2.erode(z, np.ones((size, size), np.uint8))
@@ -117,9 +131,10 @@ def measured_depth(
 
 
 def _level_of(share: float) -> float:
-    """The level that a unit normal field exceeds in this share of its pixels."""
+    """Return the level that a unit normal field exceeds in a given share of its pixels."""
     return NormalDist().inv_cdf(1 - share) if share > 0 else float("inf")
 
 
 def _unit(field: Depth) -> Depth:
+    """Scale a field to a standard deviation of 1."""
     return field / np.float32(max(1e-6, float(field.std())))

@@ -1,4 +1,4 @@
-"""Poses of a plan: the survey's, and every query traversal's. All chance is by seed and drive, not by frame order."""
+"""Poses of a plan: those of the survey and of every query traversal. Random numbers depend on seed and traversal, not on frame order."""
 
 from dataclasses import dataclass
 
@@ -21,12 +21,19 @@ from service.errors import DatasetError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y, rotation_z, transform_from
 
 Transforms = NDArray[np.float64]
+#: Distance between the frames of a sequence, metres.
 DEFAULT_STEP_M = 2.0
 
 
 @dataclass(frozen=True)
 class Survey:
-    """True poses of the scans, and those that the survey writes down, which are off by its smooth error."""
+    """Poses of a survey.
+
+    Attributes:
+        stations: positions of the scans along the streets.
+        T_map_lidar: true poses of the scans (n, 4, 4), LiDAR frame to map frame, metres.
+        T_map_lidar_written: poses (n, 4, 4) that the survey reports. They contain its smooth error.
+    """
 
     stations: list[Station]
     T_map_lidar: Transforms
@@ -34,7 +41,12 @@ class Survey:
 
 
 def driven(city: City, plan: SimulationPlan, step_m: float) -> list[Station]:
-    """The stations of the streets that the plan drives.
+    """Return the stations along the streets that the plan surveys.
+
+    Args:
+        city: city of the plan.
+        plan: names the streets; no names mean all streets.
+        step_m: distance between stations, metres.
 
     Raises:
         DatasetError: the plan names a street that the city does not have.
@@ -50,7 +62,15 @@ def driven(city: City, plan: SimulationPlan, step_m: float) -> list[Station]:
 
 
 def survey_of(city: City, plan: SimulationPlan) -> Survey:
-    """The survey drive."""
+    """Return the poses of the survey.
+
+    Args:
+        city: city of the plan.
+        plan: settings of the survey.
+
+    Raises:
+        DatasetError: the plan names a street that the city does not have.
+    """
     rng = np.random.default_rng([plan.seed, 21])
     track = driven(city, plan, plan.spacing_m)
     true = np.array([lidar_pose(city, station, rng, height_m=plan.lidar_height_m) for station in track])
@@ -68,9 +88,15 @@ def survey_of(city: City, plan: SimulationPlan) -> Survey:
 
 
 def query_candidates(city: City, plan: SimulationPlan, query: QueryPlan, survey: Survey) -> Transforms:
-    """T_map_camera of more poses than wanted, in the order in which they are tried: some may be blocked.
+    """Return more camera poses than wanted (n, 4, 4), T_map_camera in metres, in the order in which to try them.
 
-    For ``per_class`` the order is class by class; ``wanted_of`` says how many of each are kept.
+    Obstacles may block some of the poses. ``Quota`` says how many poses of each class to keep.
+
+    Args:
+        city: city of the plan.
+        plan: camera height and seed.
+        query: query traversal.
+        survey: survey whose track the queries follow.
     """
     rng = np.random.default_rng([plan.seed, 22, query.traversal, 1 if query.on_track else 0])
     drive = QueryDrive(
@@ -86,9 +112,17 @@ def query_candidates(city: City, plan: SimulationPlan, query: QueryPlan, survey:
 
 
 def followed(city: City, query: QueryPlan, poses: Transforms) -> Transforms:
-    """Every pose with the frames that led to it, in the order in which they were taken; itself where there is no sequence.
+    """Return every pose preceded by the earlier frames of its sequence, in recording order; the poses themselves without a sequence.
 
-    Straight driving on the ground; the camera keeps its height above it and its angles against the vehicle.
+    The vehicle drives straight. The camera keeps its height above the ground and its rotation.
+
+    Args:
+        city: city of the poses.
+        query: query traversal: length and step of a sequence.
+        poses: T_map_camera (n, 4, 4), metres.
+
+    Returns:
+        T_map_camera (n * sequence, 4, 4), metres.
     """
     if query.sequence is None:
         return poses
@@ -104,7 +138,7 @@ def followed(city: City, query: QueryPlan, poses: Transforms) -> Transforms:
 
 
 def _camera_on(T_map_lidar: NDArray[np.float64], plan: SimulationPlan, query: QueryPlan) -> NDArray[np.float64]:
-    """A camera that rides below the LiDAR and looks ahead, but for its turn and pitch against the vehicle."""
+    """Return T_map_camera of a camera below the LiDAR that looks ahead, plus its turn and pitch against the vehicle."""
     R = rotation_z(np.deg2rad(query.turn_deg)) @ rotation_y(np.deg2rad(query.pitch_deg)) @ R_BODY_OPTICAL
     T_lidar_camera = transform_from(R, np.array([0.0, 0.0, plan.camera_height_m - plan.lidar_height_m]))
     T: NDArray[np.float64] = T_map_lidar @ T_lidar_camera
@@ -113,14 +147,25 @@ def _camera_on(T_map_lidar: NDArray[np.float64], plan: SimulationPlan, query: Qu
 
 @dataclass(frozen=True)
 class Quota:
-    """How many queries are wanted of each class; one class for all where classes do not count."""
+    """How many queries are wanted of each class. Without classes there is one class for all.
+
+    Attributes:
+        wanted: number of queries of each class.
+        class_of: class of each candidate (n,); -1: not wanted.
+    """
 
     wanted: list[int]
-    class_of: NDArray[np.int64]  # of every candidate; -1 is wanted nowhere
+    class_of: NDArray[np.int64]
 
 
 def quota_of(city: City, query: QueryPlan, candidates: Transforms) -> Quota:
-    """Table I's counts, or all alike."""
+    """Return the counts of the paper's Table I, or a single count if the query does not count by class.
+
+    Args:
+        city: city with street classes.
+        query: query traversal.
+        candidates: T_map_camera (n, 4, 4), metres.
+    """
     if not query.per_class:
         return Quota([query.count], np.zeros(len(candidates), np.int64))
     shapes = [shapely.geometry.shape(feature["geometry"]) for feature in city.streets_geojson()["features"]]

@@ -1,4 +1,4 @@
-"""From light to the bytes of a picture: metering, gain, noise, rain and snow in the air."""
+"""Conversion of linear light to image bytes: metering, gain, noise, rain and snow in the air."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,37 +10,48 @@ from numpy.typing import NDArray
 from model_training.simulation.conditions import Condition
 from model_training.simulation.shading import to_srgb
 
-METERING = (0.8, 1.25)  # factors by which metering errs
-_MEAN_LIGHT = 0.26  # what metering brings the darkest channel's mean to (linear)
-_PROPORTIONAL = 1.6  # display value (0 to 1) of light 1 times the gain, of a response in proportion
+#: Range of the factor by which metering is wrong.
+METERING = (0.8, 1.25)
+#: Metering target: mean over the pixels of the darkest channel, linear.
+_MEAN_LIGHT = 0.26
+#: Display value (0 to 1) of light 1 at gain 1 for the proportional response.
+_PROPORTIONAL = 1.6
 
 
 @dataclass(frozen=True, slots=True)
 class RgbModel:
     """Parameters of an RGB camera.
 
-    Gain turns light into display values, exposure time and amplifier in one: what is metered by each picture, or fixed. Noise is a
-    display value (0 to 255), one sigma: a floor, and a share that grows with the gain up to 40, where denoising sets in.
-    ``response`` is how values follow light: ``tone_mapped`` has a soft shoulder and gamma 2.2, so lights and shadows keep their detail;
-    ``proportional`` has neither and clips, as cameras for measuring do. Of KITTI's drive 0005 a tenth of the lower half is clipped.
+    The gain converts linear light to display values. It combines exposure time and amplification. It is metered per image, or fixed.
+
+    Attributes:
+        name: name of the preset.
+        exposure_ev: exposure correction, stops; positive is brighter.
+        most_gain: largest metered gain: longest exposure and strongest amplification.
+        fixed_gain: gain of an exposure that is not metered; 0: metered.
+        noise: constant part of the noise, one sigma, display values of 0 to 255.
+        noise_per_gain: noise per unit of gain, display values. It stops growing at a gain of 40, where denoising would start.
+        response: ``tone_mapped`` has a soft shoulder and gamma 2.2, so highlights and shadows keep their detail. ``proportional`` is
+            linear and clips, as machine-vision cameras do. In KITTI drive 0005 a tenth of the lower image half is clipped.
     """
 
     name: str
-    exposure_ev: float = 0.0  # stops that pictures are brighter than metered
-    most_gain: float = 60.0  # the longest exposure and the strongest amplifier together
-    fixed_gain: float = 0.0  # of an exposure that is not metered; 0: metered
+    exposure_ev: float = 0.0
+    most_gain: float = 60.0
+    fixed_gain: float = 0.0
     noise: float = 1.2
     noise_per_gain: float = 0.35
     response: Literal["tone_mapped", "proportional"] = "tone_mapped"
 
 
+#: Presets by name.
 RGBS = {
     m.name: m
     for m in (
         RgbModel("automatic"),
-        RgbModel("small", most_gain=30.0, noise=3.0, noise_per_gain=1.0),  # a phone's or webcam's sensor
-        RgbModel("fixed", fixed_gain=0.8),  # set once for a clear day: night is nearly black
-        RgbModel("machine", response="proportional"),  # a machine-vision camera, as KITTI's
+        RgbModel("small", most_gain=30.0, noise=3.0, noise_per_gain=1.0),  # sensor of a phone or webcam
+        RgbModel("fixed", fixed_gain=0.8),  # set for a clear day: night images are nearly black
+        RgbModel("machine", response="proportional"),  # a machine-vision camera, as in KITTI
     )
 }
 
@@ -48,7 +59,15 @@ RGBS = {
 def exposed(
     linear: NDArray[np.float32], model: RgbModel, condition: Condition, rng: np.random.Generator, *, metering: float | None = None
 ) -> NDArray[np.uint8]:  # fmt: skip
-    """The picture (H, W, 3) of linear light (H, W, 3); ``metering`` is the factor by which metering errs, by chance if not given."""
+    """Return the image (H, W, 3) of linear light.
+
+    Args:
+        linear: linear light (H, W, 3).
+        model: RGB camera.
+        condition: weather; it may put rain streaks or snow flakes into the image.
+        rng: random generator of the frame.
+        metering: factor by which the metered gain is wrong; None draws it from ``METERING``.
+    """
     mean = float(np.mean(linear[::4, ::4].min(axis=2))) + 1e-4
     metering = rng.uniform(*METERING) if metering is None else metering
     metered = min(_MEAN_LIGHT * 2.0**model.exposure_ev / mean, model.most_gain) * metering
@@ -64,12 +83,12 @@ def exposed(
 
 
 def _in_proportion(linear: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
-    """Display values that are proportional to light; they clip after the noise, so that what is clipped is flat."""
+    """Return display values proportional to light. They clip only after the noise is added, so clipped areas are flat."""
     return linear * np.float32(255.0 * _PROPORTIONAL * gain)
 
 
 def _particles(picture: NDArray[np.float32], condition: Condition, rng: np.random.Generator) -> None:
-    """Streaks of rain or flakes of snow, drawn into the picture in place."""
+    """Draw rain streaks or snow flakes into the image in place."""
     height, width = picture.shape[:2]
     flakes = condition.snow_cover > 0
     slant = rng.normal(0, 0.15)

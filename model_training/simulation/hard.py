@@ -1,10 +1,11 @@
-"""Hard conditions of a query drive, each by its name in the reports; the survey's own are other datasets or other maps."""
+"""Hard conditions of a query traversal by their names in the reports. Hard conditions of the survey need another dataset or map."""
 
 from model_training.simulation.plan import QueryPlan
 
+#: Conditions of weather and light; see ``conditions.CONDITIONS``.
 WEATHER_AND_LIGHT = ("rain", "snow", "fog", "night", "low_sun")
 
-#: What differs from a clear day's drive; everything else is a ``QueryPlan``'s default.
+#: Differences from a traversal on a clear day. All other settings are the defaults of ``QueryPlan``.
 _CHANGES: dict[str, dict[str, float]] = {
     "cars_changed": {"parked_changed": 1.0},
     "heading_30": {"turn_deg": 30.0},
@@ -15,17 +16,21 @@ _CHANGES: dict[str, dict[str, float]] = {
     "depth_15m": {"max_depth_m": 15.0},
 }
 
+#: Names of all hard conditions.
 HARD = (*WEATHER_AND_LIGHT, *_CHANGES)
 
 
 def hard_query(name: str, *, traversal: int, count: int, depths: tuple[str, ...] = ("precise",)) -> QueryPlan:
-    """The drive of one hard condition.
+    """Return the query traversal of one hard condition.
 
     Args:
         name: one of ``HARD``.
-        traversal: its vehicles and poses; another number, another drive.
-        count: of queries.
-        depths: presets.
+        traversal: number that selects vehicles and poses; another number gives another traversal.
+        count: number of queries.
+        depths: depth presets.
+
+    Raises:
+        KeyError: the name is not one of ``HARD``.
     """
     changed = {"condition": name} if name in WEATHER_AND_LIGHT else _CHANGES[name]
     plan = {"name": name, "traversal": traversal, "count": count, "depths": depths}

@@ -16,7 +16,19 @@ from model_training.simulation.terrain import GroundPicture
 
 @dataclass(frozen=True, slots=True)
 class LidarModel:
-    """Geometry and errors of a LiDAR; metres, degrees, shares. ``beams_deg`` is empty where the beams are evenly spaced."""
+    """Geometry and errors of a LiDAR.
+
+    Attributes:
+        name: name of the preset.
+        channels: number of beams.
+        columns: number of firings per revolution.
+        top_deg: elevation of the highest beam, degrees.
+        bottom_deg: elevation of the lowest beam, degrees.
+        range_noise_m: standard deviation of the range, metres.
+        dropout: share of returns that are lost.
+        max_range_m: largest range, metres.
+        beams_deg: elevation of each beam, degrees, from the top; empty: evenly spaced.
+    """
 
     name: str
     channels: int
@@ -29,7 +41,7 @@ class LidarModel:
     beams_deg: tuple[float, ...] = ()
 
     def rays(self) -> NDArray[np.float32]:
-        """Unit rays (channels * columns, 3) in the LiDAR frame, row by row from the top, azimuth from -pi upwards."""
+        """Return the N = channels * columns unit rays (N, 3), LiDAR frame, row by row from the top, azimuth ascending from -pi."""
         beams_deg = self.beams_deg or np.linspace(self.top_deg, self.bottom_deg, self.channels)
         elevation = np.deg2rad(np.asarray(beams_deg))[:, None]
         azimuth = (np.arange(self.columns) / self.columns * 2 * np.pi - np.pi)[None, :]
@@ -40,9 +52,9 @@ class LidarModel:
         return rays.reshape(-1, 3).astype(np.float32)
 
 
-#: Beams of the HDL-64E: two blocks of 32, a third of a degree and half a degree apart (Velodyne, HDL-64E S2 manual).
+#: Beams of the HDL-64E: two blocks of 32 beams, spaced 1/3 and 1/2 degree (Velodyne, HDL-64E S2 manual).
 _HDL_64 = tuple(2.0 - k / 3 for k in range(32)) + tuple(-8.83 - k / 2 for k in range(32))
-#: Beams of the Pandar64: dense about the horizon, sparse above and below it (Hesai, Pandar64 manual; rounded to 0.01 degrees).
+#: Beams of the Pandar64: dense near the horizon, sparse above and below it (Hesai, Pandar64 manual; rounded to 0.01 degrees).
 _PANDAR_64 = (
     (14.88, 11.03, 8.06, 5.06, 3.04) + tuple(2.03 - k * 8.09 / 48 for k in range(49))
     + (-7.06, -8.06, -9.06, -9.89, -11.03, -12.01, -12.97, -13.93, -18.89, -24.9)
@@ -53,6 +65,7 @@ def _with_beams(name: str, beams_deg: tuple[float, ...]) -> LidarModel:
     return LidarModel(name, len(beams_deg), 1024, beams_deg[0], beams_deg[-1], beams_deg=beams_deg)
 
 
+#: Presets by name.
 LIDARS = {
     m.name: m
     for m in (
@@ -66,9 +79,11 @@ LIDARS = {
     )
 }
 
+#: A survey whose vehicle stands still during each scan.
 STANDING = SurveyModel()
-INTENSITY_NOISE = np.float32(0.08)  # of the logarithm: speckle and the pulse's own scatter
-#: Glass mostly lets the beam through or mirrors it away.
+#: Standard deviation of the logarithm of the intensity: speckle and pulse-to-pulse variation.
+INTENSITY_NOISE = np.float32(0.08)
+#: Share of the beams that each material returns. Glass transmits or reflects some of them away.
 _RETURNS = np.ones(len(Material), np.float32)
 _RETURNS[Material.GLASS] = 0.75
 
@@ -77,22 +92,22 @@ def scan(
     scene: Scene, ground: GroundPicture, model: LidarModel, rays: NDArray[np.float32], T_map_lidar: NDArray[np.float64],
     condition: Condition, rng: np.random.Generator, *, survey: SurveyModel = STANDING, ahead: Blocker | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """One revolution.
+    """Simulate one revolution.
 
     Args:
-        scene: what stands there.
+        scene: static objects and occupants.
         ground: cover of the ground.
-        model: of the LiDAR.
-        rays: its rays, as ``LidarModel.rays`` has them.
-        T_map_lidar: its pose; of a moving one, in the middle of the turn.
-        condition: the weather.
-        rng: of this scan.
-        survey: how the vehicle moves.
+        model: LiDAR.
+        rays: unit rays (n, 3) of ``LidarModel.rays``, LiDAR frame.
+        T_map_lidar: LiDAR pose (4, 4), LiDAR frame to map frame, metres; of a moving LiDAR, its pose in the middle of the revolution.
+        condition: weather.
+        rng: random generator of the scan.
+        survey: motion of the vehicle.
         ahead: a vehicle that drives ahead.
 
     Returns:
-        Points (n, 4): x, y, z in the LiDAR frame (m) and intensity (0..1), as KITTI lays them out. The intensity is made up
-        for the distance, as sensors report it, but not for the angle of incidence, which a sensor cannot know.
+        Points (n, 4): x, y, z in the LiDAR frame (m) and intensity (0 to 1), in KITTI's layout. The intensity is corrected for the
+        distance, as sensors report it. It is not corrected for the angle of incidence, which a sensor does not know.
     """
     R = T_map_lidar[:3, :3].astype(np.float32)
     rays_map = rays @ R.T
@@ -117,7 +132,7 @@ def scan(
         reflectance = np.where(stopped, albedo.mean(axis=1), reflectance).astype(np.float32)
         keep_share = np.where(stopped, 1.0 - model.dropout, keep_share)
     if condition.extinction_per_m > 0:
-        # A return is heard while reflectance / r^2 * exp(-2 a r) stays over that of a 10 % target at the nominal range.
+        # A return is detected if reflectance / r^2 * exp(-2 a r) exceeds that of a 10 % target at the nominal range in clear air.
         heard = reflectance / np.maximum(distance, 0.5) ** 2 * np.exp(-2 * condition.extinction_per_m * distance)
         met &= heard > 0.1 / model.max_range_m**2
     distance += rng.standard_normal(count, dtype=np.float32) * np.float32(model.range_noise_m)

@@ -1,4 +1,4 @@
-"""Triangles with colour and material, from boxes, prisms, cones and leaves."""
+"""Triangles with colour and material, built from boxes, cones, blobs and leaves."""
 
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -26,9 +26,9 @@ _FACES = np.array(
 
 
 class Material(IntEnum):
-    """How a surface answers light; the order is that of the tables in ``shading``."""
+    """Optical class of a surface. The tables in ``shading`` and ``lidar`` use its order."""
 
-    GROUND = 0  # coloured by the ground picture: asphalt, paving, markings, grass
+    GROUND = 0  # its colour comes from ``GroundPicture``: asphalt, paving, markings, grass
     MATTE = 1
     BRICK = 2
     GLASS = 3
@@ -38,7 +38,13 @@ class Material(IntEnum):
 
 @dataclass
 class Mesh:
-    """Triangles (n, 3, 3) in metres, linear albedo (n, 3) in 0..1, material (n)."""
+    """A triangle mesh.
+
+    Attributes:
+        triangles: corners (n, 3, 3), map frame, metres.
+        albedo: linear albedo (n, 3), 0 to 1.
+        material: ``Material`` of each triangle (n,).
+    """
 
     triangles: NDArray[np.float32]
     albedo: NDArray[np.float32]
@@ -50,7 +56,7 @@ class Mesh:
 
 @dataclass
 class MeshBuilder:
-    """Collects parts; ``mesh()`` joins them."""
+    """Collect the parts of a mesh; ``mesh()`` joins them."""
 
     _triangles: list[NDArray[np.float32]] = field(default_factory=list)
     _albedo: list[NDArray[np.float32]] = field(default_factory=list)
@@ -58,7 +64,13 @@ class MeshBuilder:
     _boxes: list[tuple[float, ...]] = field(default_factory=list)
 
     def triangles(self, triangles: Vector, albedo: Vector, material: Material) -> None:
-        """Add triangles (n, 3, 3) with one albedo (3,) or one for each (n, 3)."""
+        """Add triangles.
+
+        Args:
+            triangles: corners (n, 3, 3), map frame, metres.
+            albedo: linear albedo of all triangles (3,), or of each (n, 3).
+            material: material of all triangles.
+        """
         n = len(triangles)
         self._triangles.append(triangles.astype(np.float32))
         self._albedo.append(np.broadcast_to(albedo, (n, 3)).astype(np.float32))
@@ -67,11 +79,19 @@ class MeshBuilder:
     def box(
         self, centre: Vector, size: tuple[float, float, float], yaw_rad: float, albedo: Vector, material: Material
     ) -> None:
-        """Add a box standing on z = ``centre[2]``; it has no underside."""
+        """Add a box that stands on z = ``centre[2]``. It has no bottom face.
+
+        Args:
+            centre: centre of the bottom (3,), map frame, metres.
+            size: length along the heading, width and height, metres.
+            yaw_rad: heading, radians, counter-clockwise from x.
+            albedo: linear albedo (3,).
+            material: material of all faces.
+        """
         self._boxes.append((*centre, *size, yaw_rad, *albedo, float(material)))
 
     def mesh(self) -> Mesh:
-        """All parts as one mesh."""
+        """Return all parts as one mesh."""
         triangles, albedo, material = list(self._triangles), list(self._albedo), list(self._material)
         if self._boxes:
             boxes = np.array(self._boxes)
@@ -90,7 +110,11 @@ class MeshBuilder:
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Join several meshes to one.
+
+    Args:
+        meshes: at least one mesh, all in the same frame.
+    """
     return Mesh(
         np.concatenate([m.triangles for m in meshes]),
         np.concatenate([m.albedo for m in meshes]),
@@ -99,7 +123,14 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def cone(base: Vector, radius_m: float, height_m: float, sides: int = 8) -> Vector:
-    """Triangles of a cone that stands on ``base``."""
+    """Return the triangles (sides, 3, 3) of a cone's side, metres.
+
+    Args:
+        base: centre of the base (3,), metres.
+        radius_m: radius of the base, metres.
+        height_m: height, metres.
+        sides: number of triangles.
+    """
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     ring = base + radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(sides + 1)], axis=1)
     apex = np.broadcast_to(base + [0.0, 0.0, height_m], (sides, 3))
@@ -107,18 +138,31 @@ def cone(base: Vector, radius_m: float, height_m: float, sides: int = 8) -> Vect
 
 
 def leaves(points: Vector, size_m: float, rng: np.random.Generator) -> Vector:
-    """A small triangle of random attitude at each point."""
+    """Return one small, randomly oriented triangle per point (n, 3, 3), metres.
+
+    Args:
+        points: centres (n, 3), metres.
+        size_m: standard deviation of the corners around the point, metres.
+        rng: random generator.
+    """
     return points[:, None, :] + rng.normal(0, size_m, (len(points), 3, 3))
 
 
 def blob(centre: Vector, radii: Vector, rng: np.random.Generator) -> Vector:
-    """A lumpy closed body of 80 triangles: an icosphere with its corners moved."""
+    """Return a lumpy closed body of 80 triangles (80, 3, 3), metres: an icosphere with displaced vertices.
+
+    Args:
+        centre: centre (3,), metres.
+        radii: radii along x, y and z (3,), metres.
+        rng: random generator.
+    """
     lumpy = _ICOSPHERE[0] * radii * rng.uniform(0.75, 1.15, (len(_ICOSPHERE[0]), 1)) + centre
     body: Vector = lumpy[_ICOSPHERE[1]]
     return body
 
 
 def _icosphere() -> tuple[Vector, NDArray[np.int64]]:
+    """Return the vertices (42, 3) and faces (80, 3) of an icosahedron that is subdivided once, on the unit sphere."""
     golden = (1 + 5**0.5) / 2
     vertices = [[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0], [0, -1, golden], [0, 1, golden],
                 [0, -1, -golden], [0, 1, -golden], [golden, 0, -1], [golden, 0, 1], [-golden, 0, -1], [-golden, 0, 1]]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What to simulate: the settings of a dataset, frozen and checked."""
+"""Settings of a simulated dataset, frozen and checked."""
 
 import math
 from collections.abc import Iterable
@@ -21,7 +21,8 @@ from model_training.simulation.stereo_pair import STEREOS
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
-CitySide = Annotated[float, Field(ge=30, le=10_000)]  # metres
+#: Extent of a city along one axis, metres.
+CitySide = Annotated[float, Field(ge=30, le=10_000)]
 
 
 class _Model(BaseModel):
@@ -29,36 +30,71 @@ class _Model(BaseModel):
 
     @model_serializer(mode="wrap")
     def without_empty_parameters(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """All fields, but parameters of sensors only where some are given.
+        """Return all fields without empty sensor parameters, and without unset options of a query traversal.
 
-        A finished dataset is recognised by its plan's text, which must not change for plans that say nothing new.
+        A finished dataset is recognised by the text of its plan. So the text must not change when a new option is not used.
+
+        Args:
+            handler: default serialiser of pydantic.
         """
         left_out: tuple[object, ...] = ({}, None) if isinstance(self, QueryPlan) else ({},)
-        kept = ("max_depth_m",)  # was always written
+        kept = ("max_depth_m",)  # older plans contain it even when it is None
         return {name: value for name, value in handler(self).items() if name in kept or value not in left_out}
 
 
 class CameraPlan(_Model):
-    """The RGB-D camera; by default 640 x 480 with 90 degrees of horizontal field."""
+    """The RGB-D camera.
+
+    Attributes:
+        width: image width, pixels.
+        height: image height, pixels.
+        horizontal_deg: horizontal field of view, degrees.
+    """
 
     width: int = Field(640, ge=64, le=4096)
     height: int = Field(480, ge=48, le=4096)
     horizontal_deg: float = Field(90.0, ge=20, le=150)
 
     def pinhole(self) -> PinholeCamera:
-        """Its intrinsics, the optical axis in the middle of the picture."""
+        """Return the intrinsics. The principal point is the image centre."""
         focal = self.width / 2 / math.tan(math.radians(self.horizontal_deg) / 2)
         return PinholeCamera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
 
 
 class QueryPlan(_Model):
-    """One query traversal; a query set is written for each depth preset, over the same pictures."""
+    """One query traversal. Each depth preset gives its own query set with the same RGB images.
+
+    Attributes:
+        name: name of the traversal.
+        traversal: number that selects vehicles and poses; 0 is the survey's own traversal.
+        count: number of queries.
+        per_class: use the counts of the paper's Table I instead of ``count``.
+        on_track: place the queries at the survey's own poses. This is the paper's split, which leaks.
+        depths: depth presets, either modelled or stereo-matched.
+        condition: weather and light.
+        parked_changed: share of the parking slots that are drawn anew instead of kept from the survey.
+        aside_m: largest lateral distance from the survey's track, metres.
+        heading_deg: largest heading difference from the track, degrees.
+        turn_deg: yaw of the camera against the vehicle, degrees, counter-clockwise.
+        pitch_deg: pitch of the camera against the vehicle, degrees; positive is downwards.
+        blocked: share of the view that a vehicle right in front of the camera covers.
+        followed: share of the images with a vehicle that drives ahead; None: no such vehicle.
+        max_depth_m: depths beyond this range are removed, metres; None: no limit.
+        depth_parameters: numbers that replace those of each modelled preset in ``depths``.
+        stereo_parameters: numbers that replace those of each stereo-matched preset in ``depths``.
+        rgb: RGB preset; None means ``automatic``.
+        rgb_parameters: numbers that replace those of ``rgb``.
+        sun_elevation_deg: elevation of the sun, degrees; None: from the condition, different for each traversal.
+        sun_azimuth_deg: azimuth of the sun, degrees from east, counter-clockwise; None: random.
+        sequence: number of frames in a row, of which the last is at the drawn pose; None: single frames.
+        step_m: distance between the frames of a sequence, metres; None: ``drives.DEFAULT_STEP_M``.
+    """
 
     name: str = Field(pattern=r"^[a-z0-9_]+$")
     traversal: int = Field(ge=0, description="0 is the survey's own drive, with its own vehicles")
     count: int = Field(200, ge=1)
-    per_class: bool = False  # Table I's counts of the paper, instead of ``count``
-    on_track: bool = False  # at the survey's own poses: the paper's leaking split
+    per_class: bool = False
+    on_track: bool = False
     depths: tuple[str, ...] = ("precise",)
     condition: str = "clear"
     parked_changed: float = Field(0.5, ge=0, le=1)
@@ -69,29 +105,28 @@ class QueryPlan(_Model):
     blocked: float = Field(0.0, ge=0, le=0.9)
     followed: float | None = Field(None, ge=0, le=1, description="share of pictures with a vehicle driving ahead")
     max_depth_m: float | None = Field(None, ge=1)
-    depth_parameters: DepthParameters = DepthParameters()  # in place of those of each of ``depths`` that a model draws
-    stereo_parameters: StereoParameters = StereoParameters()  # in place of those of each of ``depths`` that is matched
-    rgb: str | None = None  # None: the preset ``automatic``
-    rgb_parameters: RgbParameters = RgbParameters()  # in place of those of ``rgb``
-    sun_elevation_deg: float | None = Field(None, ge=1, le=90)  # None: by the condition, differing from drive to drive
-    sun_azimuth_deg: float | None = Field(None, ge=-360, le=360)  # from east counter-clockwise; None: by chance
-    # Frames in a row, ``step_m`` of straight driving apart, the last at the pose drawn; None: single pictures.
+    depth_parameters: DepthParameters = DepthParameters()
+    stereo_parameters: StereoParameters = StereoParameters()
+    rgb: str | None = None
+    rgb_parameters: RgbParameters = RgbParameters()
+    sun_elevation_deg: float | None = Field(None, ge=1, le=90)
+    sun_azimuth_deg: float | None = Field(None, ge=-360, le=360)
     sequence: int | None = Field(None, ge=2, le=20)
     step_m: float | None = Field(None, ge=0.1, le=10)
 
     def rgb_model(self) -> RgbModel:
-        """The RGB camera of this drive."""
+        """Return the RGB camera of this traversal."""
         return self.rgb_parameters.on(self.rgb or "automatic")
 
     def matched(self) -> bool:
-        """Whether depth comes from pairs that are rendered and matched."""
+        """Return whether the depth comes from rendered and matched stereo pairs."""
         return any(depth in STEREOS for depth in self.depths)
 
     def refuse_what_does_nothing(self) -> None:
-        """Refuse a field that was changed and that this traversal would pass over in silence.
+        """Refuse a changed field that would have no effect on this traversal.
 
         Raises:
-            DatasetError: naming the field, its value and why it does nothing here.
+            DatasetError: a field has no effect. The error names the field, its value and the reason.
         """
         poses, vehicles = "stands at the survey's own poses", "meets the survey's own vehicles"
         refused = [("aside_m", poses), ("heading_deg", poses)] if self.on_track else []
@@ -124,13 +159,31 @@ class QueryPlan(_Model):
 
 
 class SimulationPlan(_Model):
-    """A city, its survey and its query traversals."""
+    """A city, its survey and its query traversals.
+
+    Attributes:
+        name: name of the dataset.
+        city: kind of city.
+        seed: seed of the city and of all other random numbers.
+        size_m: extent of a random city in x and y, metres.
+        streets: names of the surveyed streets; empty: all.
+        lidar: LiDAR preset.
+        lidar_height_m: height of the LiDAR above the ground, metres.
+        spacing_m: distance between scans, metres.
+        survey_condition: weather and light of the survey.
+        survey_error: whether the survey's poses have a smooth error.
+        camera: camera of the queries.
+        camera_height_m: mean height of the camera above the ground, metres.
+        queries: query traversals.
+        lidar_parameters: numbers that replace those of ``lidar``.
+        survey_parameters: motion and pose error of the survey.
+    """
 
     name: str
     city: Literal["paper", "city", "mixed", "repeating"] = "city"
     seed: int = Field(0, ge=0)
     size_m: tuple[CitySide, CitySide] = (300.0, 400.0)
-    streets: tuple[str, ...] = ()  # only these are driven; empty: all
+    streets: tuple[str, ...] = ()
     lidar: str = "paper_32"
     lidar_height_m: float = Field(1.8, gt=0, le=20)
     spacing_m: float = Field(1.0, ge=0.02)
@@ -139,14 +192,14 @@ class SimulationPlan(_Model):
     camera: CameraPlan = CameraPlan()
     camera_height_m: float = Field(1.5, gt=0, le=20)
     queries: tuple[QueryPlan, ...] = ()
-    lidar_parameters: LidarParameters = LidarParameters()  # in place of those of ``lidar``
+    lidar_parameters: LidarParameters = LidarParameters()
     survey_parameters: SurveyParameters = SurveyParameters()
 
     def checked(self) -> "SimulationPlan":
-        """Itself, if every preset it names exists and every field does something.
+        """Return the plan if all its presets exist and all its fields have an effect.
 
         Raises:
-            DatasetError: naming the field, the value and what there is or why it is refused.
+            DatasetError: a preset is unknown or a field is refused. The error names the field, the value, and the presets or the reason.
         """
         named: list[tuple[str, str, Iterable[str]]] = [
             ("lidar", self.lidar, LIDARS),
@@ -183,14 +236,14 @@ class SimulationPlan(_Model):
         return self
 
     def focal_baseline_px_m(self) -> float | None:
-        """Of the stereo rig whose pairs are matched; None where depth is drawn by a model."""
+        """Return focal length times baseline (px m) of the stereo rig; None if all depth is modelled."""
         for query in self.queries:
             if query.matched():
                 return query.stereo_parameters.on(query.depths[0]).focal_baseline_px_m
         return None
 
     def _refuse_two_rigs(self) -> None:
-        """A dataset describes one camera, with one baseline."""
+        """Refuse several rigs: a dataset describes one camera with one baseline."""
         if len({depth in STEREOS for query in self.queries for depth in query.depths}) > 1:
             raise DatasetError(
                 f"depth: matched pairs ({', '.join(STEREOS)}) and depth drawn by a model ({', '.join(DEPTHS)}) do not go into one "

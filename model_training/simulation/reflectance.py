@@ -1,8 +1,8 @@
-"""What a LiDAR's infrared sees of a surface: related to its colour, and far from the same.
+"""Reflectance of surfaces at a LiDAR's infrared wavelength. It correlates with the visible colour but differs from it.
 
-Paints of one colour differ in the near infrared, leaves and grass are dark to the eye and bright at 905 nm, glass answers
-hardly at all, lane markings hold retroreflective beads (reflectances by kind: ECOSTRESS spectral library, Meerdink et al.,
-Remote Sensing of Environment 230, 2019). A surface is Lambert's, so its return falls with the cosine of the angle of incidence.
+Paints of one colour differ in the near infrared. Leaves and grass are dark to the eye and bright at 905 nm. Glass returns almost
+nothing. Lane markings contain retroreflective beads. Reflectances by kind: ECOSTRESS spectral library, Meerdink et al., Remote
+Sensing of Environment 230, 2019. Surfaces are Lambertian, so a return falls with the cosine of the angle of incidence.
 """
 
 import numpy as np
@@ -14,16 +14,29 @@ from model_training.simulation.scene import Hits, Scene
 from model_training.simulation.shading import albedo_of, hashed
 from model_training.simulation.terrain import Cover, GroundPicture
 
-PIGMENTS = np.float32(0.5)  # half the range of the logarithm by which paints of one brightness differ
-LEAVES, LEAVES_OF_GREY = np.float32(0.5), np.float32(0.14)  # reflectance at 905 nm of leaves as dark as this to the eye
+#: Half the range of the logarithm of reflectance among paints of one brightness.
+PIGMENTS = np.float32(0.5)
+#: Reflectance of leaves at 905 nm, and the visible albedo at which they have it.
+LEAVES, LEAVES_OF_GREY = np.float32(0.5), np.float32(0.14)
+#: Factor on the reflectance of lane markings, from their retroreflective beads.
 BEADS = np.float32(1.6)
+#: Reflectance of glass.
 PANE = np.float32(0.05)
 
 
 def reflectance_of(
     scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, condition: Condition
 ) -> NDArray[np.float32]:  # fmt: skip
-    """Share of the pulse (n) that comes back from what rays (n, 3, unit, map frame) met; every ray has met something."""
+    """Return the share of the pulse (n,) that the intersected surfaces send back, 0 to 1.
+
+    Args:
+        scene: mesh that the rays intersect.
+        ground: cover of the ground.
+        origin: origin of the rays (3,), or one origin per ray (n, 3), map frame, metres.
+        rays: unit directions (n, 3), map frame.
+        hits: intersections of the rays. Every ray must have one.
+        condition: weather.
+    """
     points = origin.astype(np.float32) + rays * hits.distance[:, None]
     grey = albedo_of(scene, ground, points, hits, condition).mean(axis=1)
     material = scene.mesh.material[hits.primitive]

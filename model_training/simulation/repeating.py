@@ -1,4 +1,4 @@
-"""A street of blocks that are all alike, but for a landmark every few of them: where single pictures cannot tell where they are."""
+"""A street of identical blocks with a landmark every few blocks. A single image cannot tell the blocks apart."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,30 +10,34 @@ from model_training.simulation.street_life import add_furniture, add_person, add
 from model_training.simulation.streets import Street
 from model_training.simulation.terrain import GroundPicture, Terrain
 
+#: Length of a block, metres.
 BLOCK_M = 36.0
+#: Number of blocks.
 BLOCKS = 20
+#: Number of blocks from one landmark to the next, and the index of the first landmark's block.
 LANDMARK_EVERY, FIRST_LANDMARK = 5, 2
+#: Half width of the carriageway and width of the pavement, metres.
 _HALF_WIDTH_M, _PAVEMENT_M = 4.2, 2.2
 
 
 def landmarks_m() -> NDArray[np.float64]:
-    """Where along the street (x, metres) the landmarks' blocks have their middles."""
+    """Return the middles (n,) of the landmark blocks along the street: x in the map frame, metres."""
     numbers = np.arange(FIRST_LANDMARK, BLOCKS, LANDMARK_EVERY)
     middles: NDArray[np.float64] = (numbers.astype(np.float64) + 0.5 - BLOCKS / 2) * BLOCK_M
     return middles
 
 
 class RepeatingCity(City):
-    """One straight, level street along x; nobody parks there, or the parked cars would be landmarks.
+    """One straight, level street along x. No cars park there, because parked cars would be landmarks.
 
     Args:
-        seed: of the block that repeats and of the landmarks.
+        seed: seed of the repeated block and of the landmarks.
     """
 
-    def __init__(self, *, seed: int) -> None:  # not City's: nothing here is drawn along streets
+    def __init__(self, *, seed: int) -> None:  # City's own places random objects along streets
         self.seed, self.name = seed, "repeating"
         half_m = BLOCKS * BLOCK_M / 2
-        points = 3 * BLOCKS + 1  # every third piece is marked: one a block, in the same place
+        points = 3 * BLOCKS + 1  # every third piece has a road marking: one per block, always at the same position
         line = np.stack([np.linspace(-half_m, half_m, points), np.zeros(points)], axis=1)
         self.streets = [Street("1", (line,), _HALF_WIDTH_M, True)]
         self.half_size_m = (half_m + 20.0, 60.0)
@@ -52,7 +56,12 @@ class RepeatingCity(City):
         self.static = builder.mesh()
 
     def occupants(self, traversal: int, *, parked_changed: float = 0.5) -> Mesh:  # noqa: ARG002  # nobody parks here
-        """People, others on every drive."""
+        """Return the mesh of the people of one traversal. They differ between traversals.
+
+        Args:
+            traversal: number of the traversal.
+            parked_changed: without effect, because no cars park here.
+        """
         builder = MeshBuilder()
         rng = np.random.default_rng([self.seed, 44, traversal])
         for x in np.arange(-self.half_size_m[0] + 25, self.half_size_m[0] - 25, 9.0):
@@ -63,7 +72,7 @@ class RepeatingCity(City):
 
 
 def _block(builder: MeshBuilder, start_m: float, side: float, rng: np.random.Generator, *, tower: bool) -> None:
-    """Houses, a tree, a lamp or the like on one side of the street."""
+    """Add houses, a tree, a piece of furniture and perhaps a tower on one side of the street."""
     edge, u = side * (_HALF_WIDTH_M + _PAVEMENT_M), 0.0
     while u < BLOCK_M - 6:
         width, depth, height = rng.uniform(8, 14), rng.uniform(8, 12), rng.uniform(6, 16)

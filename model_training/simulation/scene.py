@@ -1,4 +1,4 @@
-"""Ray casting with Embree. It works in float32: coordinates stay near the city's origin."""
+"""Ray casting with Embree. Embree computes in float32, so coordinates must stay near the city's origin."""
 
 from dataclasses import dataclass
 
@@ -9,24 +9,39 @@ from numpy.typing import NDArray
 
 from model_training.simulation.meshes import Mesh
 
-NO_HIT = np.float32(1e30)  # Embree says 1e37
+#: Distances from this value on mean no intersection; Embree returns 1e37, metres.
+NO_HIT = np.float32(1e30)
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays met: distance (m, 0 for nothing), primitive (-1 for nothing), unnormalised normal of the triangle."""
+    """Intersections of rays with a mesh.
+
+    Attributes:
+        distance: distance along each ray (n,), metres; 0 without an intersection.
+        primitive: index of the triangle (n,); -1 without an intersection.
+        normal: normal of the triangle (n, 3), not normalised.
+    """
 
     distance: NDArray[np.float32]
     primitive: NDArray[np.int32]
     normal: NDArray[np.float32]
 
     def of(self, rays: NDArray[np.bool_] | NDArray[np.int64]) -> "Hits":
-        """Hits of some of the rays."""
+        """Return the intersections of some of the rays.
+
+        Args:
+            rays: mask (n,) or indices (k,) of the rays.
+        """
         return Hits(self.distance[rays], self.primitive[rays], self.normal[rays])
 
 
 class Scene:
-    """A mesh ready for rays."""
+    """A mesh that is ready for ray casting.
+
+    Args:
+        mesh: triangles, map frame.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
@@ -34,14 +49,24 @@ class Scene:
         TriangleMesh(self._scene, mesh.triangles)
 
     def distances(self, origin: NDArray[np.float64], directions: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Distances (n,) along unit directions (n, 3) from one origin (3,), metres; 0 where nothing is met."""
+        """Return the distance to the first surface along each ray (n,), metres; 0 if there is none.
+
+        Args:
+            origin: origin of the rays (3,), or one origin per ray (n, 3), map frame, metres.
+            directions: unit directions (n, 3), map frame.
+        """
         rays = np.ascontiguousarray(directions, np.float32)
         starts = np.broadcast_to(origin.astype(np.float32), rays.shape).copy()
         distance = np.asarray(self._scene.run(starts, rays, query="DISTANCE"))
         return np.where(distance < NO_HIT, distance, np.float32(0))
 
     def hits(self, origin: NDArray[np.float64], directions: NDArray[np.floating]) -> Hits:
-        """The same with primitives and normals."""
+        """Return the first intersection of each ray, with triangle and normal.
+
+        Args:
+            origin: origin of the rays (3,), or one origin per ray (n, 3), map frame, metres.
+            directions: unit directions (n, 3), map frame.
+        """
         rays = np.ascontiguousarray(directions, np.float32)
         starts = np.broadcast_to(origin.astype(np.float32), rays.shape).copy()
         found = self._scene.run(starts, rays, output=True)
@@ -50,7 +75,12 @@ class Scene:
         return Hits(distance, primitive, found["Ng"])
 
     def lit(self, points: NDArray[np.float32], toward: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points (n, 3) see the light in direction ``toward`` (3,)."""
+        """Return whether each point (n,) sees the light.
+
+        Args:
+            points: positions (n, 3), map frame, metres.
+            toward: direction to the light (3,), map frame.
+        """
         rays = np.broadcast_to(toward.astype(np.float32), points.shape).copy()
         blocked = self._scene.run(np.ascontiguousarray(points), rays, query="OCCLUDED")
         free: NDArray[np.bool_] = np.asarray(blocked) < 0

@@ -1,4 +1,4 @@
-"""Numbers of a simulated sensor that replace those of its preset; what is not given stays the preset's."""
+"""Numbers that replace those of a sensor preset. Numbers that are not set keep the preset's value."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,16 +14,22 @@ from service.errors import DatasetError
 
 
 class _Parameters(BaseModel):
+    """Base of all parameters: each field is None or replaces the preset's number of the same name."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @model_serializer(mode="wrap")
     def given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Only what replaces a preset's number: a plan that replaces nothing is written as it was before this existed."""
+        """Return only the numbers that are set. A plan without them keeps the text that it had before these parameters existed.
+
+        Args:
+            handler: default serialiser of pydantic.
+        """
         return {name: value for name, value in handler(self).items() if value is not None}
 
 
 class LidarParameters(_Parameters):
-    """Of the survey's LiDAR; metres, degrees above the horizon, shares, as in ``LidarModel``."""
+    """Numbers of the survey's LiDAR; for meanings and units see ``LidarModel``."""
 
     channels: int | None = Field(None, ge=16, le=128)
     columns: int | None = Field(None, ge=64, le=4096)
@@ -34,17 +40,19 @@ class LidarParameters(_Parameters):
     max_range_m: float | None = Field(None, ge=1, le=500)
 
     def on(self, preset: str) -> LidarModel:
-        """The preset with these numbers.
+        """Return the preset with these numbers.
+
+        Args:
+            preset: one of ``LIDARS``.
 
         Raises:
-            DatasetError: the vertical field is empty.
+            DatasetError: the top of the vertical field of view is not above its bottom.
         """
         own = LIDARS[preset]
         model = replace(own, **self.model_dump())
         if (model.channels, model.top_deg, model.bottom_deg) != (own.channels, own.top_deg, own.bottom_deg):
-            model = replace(
-                model, beams_deg=()
-            )  # of another vertical field the preset's table says nothing: evenly spaced
+            # The preset's beam table does not fit another vertical field, so the beams are evenly spaced.
+            model = replace(model, beams_deg=())
         if model.top_deg <= model.bottom_deg:
             raise DatasetError(
                 f"lidar.top_deg: {model.top_deg:g} is not above lidar.bottom_deg, {model.bottom_deg:g}; change one of them",
@@ -54,7 +62,7 @@ class LidarParameters(_Parameters):
 
 
 class RgbParameters(_Parameters):
-    """Of the RGB camera; stops, gains and display values of 0 to 255, as in ``RgbModel``."""
+    """Numbers of the RGB camera; for meanings and units see ``RgbModel``."""
 
     exposure_ev: float | None = Field(None, ge=-6, le=6)
     most_gain: float | None = Field(None, ge=0.01, le=1000)
@@ -63,10 +71,13 @@ class RgbParameters(_Parameters):
     noise_per_gain: float | None = Field(None, ge=0, le=128)
 
     def on(self, preset: str) -> RgbModel:
-        """The preset with these numbers.
+        """Return the preset with these numbers.
+
+        Args:
+            preset: one of ``RGBS``.
 
         Raises:
-            DatasetError: the limit of metering is set for an exposure that is fixed.
+            DatasetError: the limit of the metered gain is set although the gain is fixed.
         """
         model = replace(RGBS[preset], **self.model_dump())
         if model.fixed_gain > 0 and self.most_gain is not None:
@@ -78,7 +89,7 @@ class RgbParameters(_Parameters):
 
 
 class DepthParameters(_Parameters):
-    """Of the depth camera; metres, pixels of a 640 wide picture, shares, as in ``DepthModel``."""
+    """Numbers of a depth camera with modelled errors; for meanings and units see ``DepthModel``."""
 
     focal_baseline_px_m: float | None = Field(None, ge=1, le=10_000)
     noise_px: float | None = Field(None, ge=0, le=50)
@@ -93,10 +104,13 @@ class DepthParameters(_Parameters):
     max_range_m: float | None = Field(None, ge=1, le=65)  # 16 bits of millimetres end at 65.535 m
 
     def on(self, preset: str) -> DepthModel:
-        """The preset with these numbers.
+        """Return the preset with these numbers.
+
+        Args:
+            preset: one of ``DEPTHS``.
 
         Raises:
-            DatasetError: no range is left.
+            DatasetError: the largest depth is not greater than the smallest.
         """
         model = replace(DEPTHS[preset], **self.model_dump())
         _refuse_no_range("depth", model.min_range_m, model.max_range_m)
@@ -104,7 +118,7 @@ class DepthParameters(_Parameters):
 
 
 class SurveyParameters(_Parameters):
-    """Of the survey's drive; metres, degrees, metres a second, shares, as in ``SurveyModel``."""
+    """Numbers of the survey's vehicle; for meanings and units see ``SurveyModel``."""
 
     position_m: float | None = Field(None, ge=0, le=5)
     angle_deg: float | None = Field(None, ge=0, le=5)
@@ -113,10 +127,10 @@ class SurveyParameters(_Parameters):
     followed: float | None = Field(None, ge=0, le=1)
 
     def model(self) -> SurveyModel:
-        """The survey with these numbers.
+        """Return the survey model with these numbers.
 
         Raises:
-            DatasetError: nothing moves that could be taken out.
+            DatasetError: ``deskewed`` is set although the vehicle stands still during a scan.
         """
         model = SurveyModel(**self.model_dump())
         if self.deskewed is not None and model.speed_m_s == 0:
@@ -128,7 +142,7 @@ class SurveyParameters(_Parameters):
 
 
 class StereoParameters(_Parameters):
-    """Of a stereo rig whose pairs are matched; metres and pixels, as in ``StereoModel``."""
+    """Numbers of a stereo rig with matched pairs; for meanings and units see ``StereoModel``."""
 
     focal_baseline_px_m: float | None = Field(None, ge=1, le=10_000)
     offset_px: float | None = Field(None, ge=0, le=10)
@@ -138,10 +152,13 @@ class StereoParameters(_Parameters):
     max_range_m: float | None = Field(None, ge=1, le=65)  # 16 bits of millimetres end at 65.535 m
 
     def on(self, preset: str) -> StereoModel:
-        """The preset with these numbers.
+        """Return the preset with these numbers.
+
+        Args:
+            preset: one of ``STEREOS``.
 
         Raises:
-            DatasetError: no range is left.
+            DatasetError: the largest depth is not greater than the smallest.
         """
         model = replace(STEREOS[preset], **self.model_dump())
         _refuse_no_range("stereo", model.min_range_m, model.max_range_m)

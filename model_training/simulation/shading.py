@@ -1,4 +1,4 @@
-"""Colour of what rays meet: sun with shadows, sky light, textures, sky and clouds, haze, headlights."""
+"""Colour along rays: sun with shadows, sky light, textures, sky and clouds, haze, headlights."""
 
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ from model_training.simulation.terrain import Cover, GroundPicture
 
 Colour = NDArray[np.float32]
 
+#: Linear albedo of each ``Cover``.
 _COVER_ALBEDO = np.zeros((len(Cover), 3), np.float32)
 _COVER_ALBEDO[Cover.GRASS] = (0.14, 0.21, 0.07)
 _COVER_ALBEDO[Cover.ASPHALT] = (0.12, 0.12, 0.125)
@@ -19,18 +20,30 @@ _COVER_ALBEDO[Cover.PAVING] = (0.34, 0.33, 0.31)
 _COVER_ALBEDO[Cover.MARKING] = (0.62, 0.62, 0.60)
 _COVER_ALBEDO[Cover.SOIL] = (0.22, 0.16, 0.11)
 
-CHUNK = 8192  # rays shaded at a time: what they need stays in the cache
-_ROUGHNESS = np.array([0.25, 0.12, 0.30, 0.05, 0.45, 0.04], np.float32)  # contrast of the texture, by material
+#: Rays shaded at a time. Their working set fits in the processor's cache.
+CHUNK = 8192
+#: Contrast of the texture of each ``Material``.
+_ROUGHNESS = np.array([0.25, 0.12, 0.30, 0.05, 0.45, 0.04], np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Sun and sky of one drive (linear light)."""
+    """Sun and sky of one traversal. Colours are linear light (3,).
+
+    Attributes:
+        toward_sun: unit direction to the sun (3,), map frame.
+        sun: direct sunlight.
+        sky: ambient light from the sky.
+        zenith: colour of the sky at the zenith.
+        horizon: colour of the sky at the horizon.
+        clouds: cloudiness; the sky has more clouds with a larger value.
+        haze_per_m: extinction of visible light, per metre.
+    """
 
     toward_sun: NDArray[np.float64]
     sun: Colour
-    sky: Colour  # ambient
-    zenith: Colour  # colour of the sky itself
+    sky: Colour
+    zenith: Colour
     horizon: Colour
     clouds: float
     haze_per_m: float
@@ -43,13 +56,13 @@ class Light:
         elevation_deg: float | None = None,
         azimuth_deg: float | None = None,
     ) -> "Light":
-        """The sun stands where the hour has it, or where it is told to; its azimuth and the clouds differ from drive to drive.
+        """Draw the light of a traversal. The sun's azimuth and the clouds differ between traversals.
 
         Args:
-            condition: the weather.
-            rng: of this drive.
-            elevation_deg: of the sun above the horizon.
-            azimuth_deg: of the sun, from east counter-clockwise.
+            condition: weather and light.
+            rng: random generator of the traversal.
+            elevation_deg: elevation of the sun above the horizon, degrees; None draws it near the condition's.
+            azimuth_deg: azimuth of the sun, degrees from east (x), counter-clockwise; None draws it.
         """
         spread = 12.0 if condition.sun_elevation_deg > 20 else 2.0
         elevation = np.deg2rad(condition.sun_elevation_deg + rng.uniform(-spread, spread))
@@ -71,7 +84,11 @@ class Light:
 
 
 def hashed(cells: NDArray[np.int32]) -> NDArray[np.float32]:
-    """A number in -1..1 for each whole-numbered cell (n, 3): an integer hash."""
+    """Return a pseudo-random number from -1 to 1 for each cell (n,), by an integer hash.
+
+    Args:
+        cells: integer cell coordinates (n, 3).
+    """
     h = cells[:, 0].astype(np.uint32) * np.uint32(73856093)
     h ^= cells[:, 1].astype(np.uint32) * np.uint32(19349663)
     h ^= cells[:, 2].astype(np.uint32) * np.uint32(83492791)
@@ -100,7 +117,15 @@ def _sky(rays: NDArray[np.float32], light: Light, condition: Condition) -> Colou
 def albedo_of(
     scene: Scene, ground: GroundPicture, points: NDArray[np.float32], hits: Hits, condition: Condition
 ) -> Colour:
-    """Textured albedo (n, 3) at what rays met; every ray has met something."""
+    """Return the textured albedo (n, 3) of the intersected surfaces, 0 to 1.
+
+    Args:
+        scene: mesh that the rays intersect.
+        ground: cover of the ground.
+        points: points of intersection (n, 3), map frame, metres.
+        hits: intersections. Every ray must have one.
+        condition: weather: wet and snow-covered surfaces change their albedo.
+    """
     primitive = hits.primitive
     material = scene.mesh.material[primitive]
     albedo = scene.mesh.albedo[primitive]
@@ -126,18 +151,18 @@ def shade(
     scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light,
     condition: Condition, *, forward: NDArray[np.float64], lit: NDArray[np.bool_] | None = None,
 ) -> Colour:  # fmt: skip
-    """Linear light (n, 3) that comes along rays (n, 3) from what they hit.
+    """Return the linear light (n, 3) that comes along each ray from a surface or the sky.
 
     Args:
-        scene: what stands there.
+        scene: mesh that the rays intersect.
         ground: cover of the ground.
-        origin: of the rays, metres.
-        rays: unit, map frame.
-        hits: of the rays.
-        light: of the drive.
-        condition: of the drive.
-        forward: optical axis, for the headlights.
-        lit: which hits see the sun; None casts shadow rays here.
+        origin: origin of the rays (3,), map frame, metres.
+        rays: unit directions (n, 3), map frame.
+        hits: intersections of the rays.
+        light: sun and sky of the traversal.
+        condition: weather and light of the traversal.
+        forward: optical axis (3,), map frame, for the headlights.
+        lit: which intersections see the sun (n,); None casts shadow rays here.
     """
     colour = np.empty((len(rays), 3), np.float32)
     for start in range(0, len(rays), CHUNK):
@@ -159,7 +184,7 @@ def _surfaces(
     scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light,
     condition: Condition, forward: NDArray[np.float64], lit: NDArray[np.bool_] | None,
 ) -> Colour:  # fmt: skip
-    """Light from surfaces; every ray has met one."""
+    """Return the light (n, 3) from surfaces. Every ray must have an intersection."""
     points = origin.astype(np.float32) + rays * hits.distance[:, None]
     colour = albedo_of(scene, ground, points, hits, condition)
     normal = hits.normal / np.maximum(np.sqrt(np.einsum("ij,ij->i", hits.normal, hits.normal)), 1e-12)[:, None]
@@ -187,17 +212,32 @@ def _surfaces(
 
 
 def shadows(scene: Scene, points: NDArray[np.float32], normal: NDArray[np.float32], light: Light) -> NDArray[np.bool_]:
-    """Whether points see the sun, started a little off their surfaces."""
+    """Return whether each point (n,) sees the sun.
+
+    The rays start 3 cm above the surface, so the surface does not shade itself.
+
+    Args:
+        scene: mesh that casts shadows.
+        points: points on surfaces (n, 3), map frame, metres.
+        normal: unit normals (n, 3) that face the viewer, map frame.
+        light: sun of the traversal.
+    """
     return scene.lit(points + normal * np.float32(0.03), light.toward_sun)
 
 
 def to_srgb(linear: Colour, exposure: float) -> NDArray[np.float32]:
-    """Display values 0..255 of linear light: exposure, a soft shoulder, gamma 2.2 by table."""
+    """Return display values (0 to 255) of linear light: exposure, a soft shoulder and gamma 2.2, by lookup table.
+
+    Args:
+        linear: linear light (H, W, 3).
+        exposure: factor on the light.
+    """
     step = np.minimum(linear * np.float32(exposure * _CURVE_STEPS / _CURVE_END), np.float32(_CURVE_STEPS - 1))
     encoded: NDArray[np.float32] = _CURVE[step.astype(np.int32)]
     return encoded
 
 
+#: Exposed light at the end of the tone curve's table, and the number of entries.
 _CURVE_END, _CURVE_STEPS = 12.0, 16384
 
 

@@ -1,7 +1,7 @@
-"""Write a dataset: scans and picture pairs by a pool of workers, resumable, the same bytes for any number of them.
+"""Write a simulated dataset: scans and image pairs, by a pool of workers. An interrupted run can be resumed.
 
-Every frame draws its errors from its own seed, so neither order nor worker matters. Files are renamed when whole, and
-``dataset.json`` comes last: a folder without it goes on where it stopped.
+The bytes do not depend on the number of workers, because every frame draws its errors from its own seed. Files get their final name
+when they are complete. ``dataset.json`` comes last, so a folder without it is continued.
 """
 
 import json
@@ -46,23 +46,27 @@ from model_training.simulation.stereo_pair import STEREOS, StereoRig
 from service.errors import DatasetError
 from service.geometry.camera import PinholeCamera
 
+#: Metres per unit of a depth image.
 DEPTH_SCALE_M = 0.001
-TOO_NEAR_M = 1.5  # a picture that is mostly nearer shows a vehicle's side: the robot would not stand there
-ROOM_M = 1.0  # half the robot's width: nothing may stand nearer, all round
-Report = Callable[[str, int, int], None]  # stage, done, of
+#: If 40 % of the image is nearer than this, metres, the pose is rejected: the robot would stand beside a vehicle.
+TOO_NEAR_M = 1.5
+#: Half the robot's width: no object may be nearer in any direction, metres.
+ROOM_M = 1.0
+#: Receives the stage, the number of finished frames and their total.
+Report = Callable[[str, int, int], None]
 
 
 def simulate(plan: SimulationPlan, out: Path, *, workers: int | None = None, report: Report = lambda *_: None) -> None:
-    """Simulate a plan into the folder ``out``.
+    """Simulate a plan into a folder.
 
     Args:
-        plan: what to simulate.
-        out: a new folder, or one that an interrupted run of the same plan left.
-        workers: processes; by default as many as there are cores.
-        report: told after every frame.
+        plan: settings of the dataset.
+        out: a new folder, or the folder of an interrupted run of the same plan.
+        workers: number of processes; None takes one per core.
+        report: called after every frame with the stage, the number of finished frames and their total.
 
     Raises:
-        DatasetError: the plan names what does not exist, or ``out`` holds something else.
+        DatasetError: the plan names an unknown preset, ``out`` holds something else, or too few query poses are free.
     """
     plan = plan.checked()
     if not _claim(out, plan):
@@ -85,7 +89,7 @@ def _city(plan: SimulationPlan) -> City:
 
 
 def _claim(out: Path, plan: SimulationPlan) -> bool:
-    """Whether there is work to do in ``out``; it is then ours."""
+    """Write the plan into ``out`` and return whether there is work to do."""
     text = plan.model_dump_json(indent=2) + "\n"
     for name in ("simulation.done.json", "simulation.json"):
         path = out / name
@@ -104,7 +108,21 @@ def _claim(out: Path, plan: SimulationPlan) -> bool:
 
 @dataclass
 class _Job:
-    """What a worker has inherited: the scene and all that is the same for every frame of a traversal."""
+    """State that workers inherit: the scene and everything that is the same for all frames of a traversal.
+
+    Attributes:
+        plan: settings of the dataset.
+        city: city of the plan.
+        scene: static objects and occupants of the traversal.
+        out: folder of the dataset.
+        survey: poses of the survey, for scans.
+        query: query traversal, for image pairs.
+        light: sun and sky of the query traversal.
+        camera: intrinsics.
+        rays: unit rays of the LiDAR or the camera (n, 3), in its own frame.
+        z_of_ray: z components of the camera's rays (n,).
+        candidates: T_map_camera (n, 4, 4), metres.
+    """
 
     plan: SimulationPlan
     city: City
@@ -119,16 +137,16 @@ class _Job:
     candidates: NDArray[np.float64] | None = None
 
 
-_job: _Job | None = None  # set before the workers are forked: they share the scene instead of copying it
+_job: _Job | None = None  # set before the workers are forked, so they share the scene instead of copying it
 
 
 def _run(job: _Job, work: Callable[[int], Any], items: Iterable[int], workers: int) -> Iterable[Any]:
-    """Results of ``work`` in the order of ``items``."""
+    """Yield the results of ``work`` in the order of ``items``."""
     global _job
     _job = job
     cv2.setNumThreads(1)
     pool: Pool
-    # A worker a core: BLAS's own threads would only spin and take the core from the other workers.
+    # One worker runs per core. BLAS threads would only spin and take the core from other workers.
     with threadpool_limits(1, user_api="blas"):
         if workers == 1:
             yield from map(work, items)
@@ -216,9 +234,9 @@ def _queries(
 
 
 def _free_candidates(job: _Job, quota: Quota) -> NDArray[np.int64]:
-    """The first candidates, class by class, that do not stare at something right before them.
+    """Return the indices of the first candidates of each class that have free space around them.
 
-    One worker does it all: a check casts some hundred rays, less work than starting other processes.
+    One process does this. A check casts 840 rays per pose, so starting other processes would cost more.
     """
     left = list(quota.wanted)
     chosen: dict[int, list[int]] = {k: [] for k in range(len(left))}
@@ -241,7 +259,9 @@ def _free_candidates(job: _Job, quota: Quota) -> NDArray[np.int64]:
     return np.array([k for index in sorted(chosen) for k in chosen[index]])
 
 
+#: Horizontal unit directions (72, 3), 5 degrees apart.
 _RING = np.stack([np.cos(a := np.arange(72) * np.pi / 36), np.sin(a), np.zeros(72)], axis=1)
+#: Camera of a few rays, for the test of free space ahead.
 _COARSE = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
 
 
@@ -281,11 +301,11 @@ def _one_pair(number: int) -> int:
     if query.blocked > 0:
         blocker = Blocker.before(T, job.city.height(T[0, 3], T[1, 3]), query.blocked, rng)
     elif query.followed is not None:
-        # Queries stand anywhere along the way, in no order: how far along is drawn.
+        # Queries have no order along the way, so the travelled distance is random.
         heading = float(np.arctan2(T[1, 2], T[0, 2])) - float(np.deg2rad(query.turn_deg))
         along_m = float(rng.uniform(0, 10_000))
         blocker = _vehicle_ahead(job, T[:2, 3], heading, along_m, query.traversal, query.followed)
-    metering = float(rng.uniform(*METERING)) if query.matched() else None  # both cameras of a rig are exposed alike
+    metering = float(rng.uniform(*METERING)) if query.matched() else None  # both cameras of a rig share the exposure
 
     camera, light, rays, z_of_ray = job.camera, job.light, job.rays, job.z_of_ray
 
@@ -318,7 +338,7 @@ def _one_pair(number: int) -> int:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file under another name first, so that one that exists is whole."""
+    """Write a file under a temporary name first, so that an existing file is always complete."""
     part = path.with_name(path.name + ".part")
     part.write_bytes(data)
     part.rename(path)

@@ -1,7 +1,7 @@
-"""Depth of a simulated stereo rig by real matching: the right picture is rendered too, and a matcher that robots run finds the disparity.
+"""Depth of a simulated stereo rig by real matching: the right image is rendered too, and a real matcher finds the disparity.
 
-Smooth surfaces, fattened edges, streaks and holes come from matching itself. What is drawn by chance is how well the rig is rectified:
-a turn of the right camera about each of its axes. Its sizes are what KITTI's pairs show against the scans (``benchmarks/real/matcher.py``).
+Smooth surfaces, fattened edges, streaks and holes result from the matching. Only the rectification error is drawn: a rotation of the
+right camera about each of its axes. Its sizes come from KITTI's pairs against its scans (``benchmarks/real/matcher.py``).
 """
 
 import math
@@ -14,9 +14,9 @@ from model_training.importing.stereo import BLOCK_MATCHING, SEMI_GLOBAL, StereoM
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import rotation_x, rotation_y, rotation_z, transform_from
 
-#: Least distance that is searched, and fewest disparities.
+#: Smallest distance that the matcher searches, metres, and least number of disparities.
 NEAREST_M, FEWEST_DISPARITIES = 3.0, 64
-#: An error of rectification is its size times a factor between these, of either sign.
+#: Range of the factor on the size of a rectification error. The sign is random.
 SIZES = (0.6, 1.4)
 
 
@@ -25,14 +25,14 @@ class StereoModel:
     """A stereo rig and its matcher.
 
     Attributes:
-        name: of the preset.
-        matching: settings of the matcher, but for the disparities, which follow from the rig.
+        name: name of the preset.
+        matching: settings of the matcher. The number of disparities follows from the rig instead.
         focal_baseline_px_m: focal length times baseline, pixels times metres.
-        offset_px: size of the disparity's error all over a picture: the right camera is turned about its vertical axis.
-        vertical_px: size of the rows' error: it is turned about its horizontal axis.
-        roll_px: size of the rows' error a quarter of the width from the middle: it is turned about its optical axis.
-        min_range_m: nearer depths are dropped;
-        max_range_m: and farther ones.
+        offset_px: size of the disparity offset of the whole image, pixels. It rotates the right camera about its vertical axis.
+        vertical_px: size of the row offset, pixels. It rotates the right camera about its horizontal axis.
+        roll_px: size of the row offset at a quarter of the width from the centre, pixels. It rotates the camera about its optical axis.
+        min_range_m: smaller depths are removed, metres.
+        max_range_m: larger depths are removed, metres.
     """
 
     name: str
@@ -45,6 +45,7 @@ class StereoModel:
     max_range_m: float = 65.0
 
 
+#: Presets of stereo-matched depth by name.
 STEREOS = {
     m.name: m
     for m in (
@@ -57,12 +58,12 @@ STEREOS = {
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """A stereo model on a camera, rectified as well as one drive's was.
+    """A stereo model on a camera, with the rectification error of one traversal.
 
     Attributes:
-        model: with the disparities that this camera needs.
-        baseline_m: between the cameras.
-        T_left_right: pose of the right camera as it really is.
+        model: stereo model with the number of disparities that this camera needs.
+        baseline_m: distance between the cameras, metres.
+        T_left_right: true pose (4, 4) of the right camera in the left camera's optical frame, metres.
     """
 
     model: StereoModel
@@ -71,7 +72,13 @@ class StereoRig:
 
     @staticmethod
     def drawn(model: StereoModel, camera: PinholeCamera, rng: np.random.Generator) -> "StereoRig":
-        """The rig of one drive."""
+        """Draw the rig of one traversal.
+
+        Args:
+            model: stereo model.
+            camera: intrinsics of both cameras.
+            rng: random generator of the traversal.
+        """
         baseline_m = model.focal_baseline_px_m / camera.fx
         signs, sizes = rng.choice([-1.0, 1.0], 3), rng.uniform(*SIZES, 3)
         offset, vertical, roll = signs * sizes * [model.offset_px, model.vertical_px, model.roll_px]
@@ -81,7 +88,14 @@ class StereoRig:
         return StereoRig(replace(model, matching=matching), baseline_m, transform_from(R, np.array([baseline_m, 0, 0])))
 
     def depth(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Depth (z) of the left camera (H, W), metres, 0 for no measurement, as a user computes it: by the nominal geometry."""
+        """Return the depth of the left camera (H, W), z in metres; 0 where nothing was matched.
+
+        As in practice, the conversion uses the nominal geometry, not the true pose.
+
+        Args:
+            left: sRGB image (H, W, 3).
+            right: sRGB image (H, W, 3) of the right camera.
+        """
         model = self.model
         z_m = depth_from_stereo(left, right, focal_baseline_px_m=model.focal_baseline_px_m, matching=model.matching)
         z_m[(z_m < model.min_range_m) | (z_m > model.max_range_m)] = 0

@@ -1,4 +1,4 @@
-"""What stands beside and on streets: trees of several kinds, furniture, vehicles, people."""
+"""Objects beside and on streets: trees of several kinds, furniture, vehicles, people."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,15 +7,24 @@ from model_training.simulation.meshes import Material, MeshBuilder, blob, cone, 
 
 Vector = NDArray[np.float64]
 
+#: Linear albedo (n, 3) of vehicles.
 CAR_COLOURS = np.array([[.75, .75, .76], [.08, .08, .09], [.30, .31, .33], [.55, .06, .06], [.07, .12, .35], [.85, .85, .84],
                         [.12, .22, .14], [.45, .38, .25]])  # fmt: skip
+#: Linear albedo (n, 3) of clothes.
 CLOTHES = np.array(
     [[0.1, 0.12, 0.25], [0.5, 0.1, 0.1], [0.15, 0.15, 0.15], [0.55, 0.5, 0.4], [0.2, 0.35, 0.2], [0.7, 0.7, 0.72]]
 )
 
 
 def add_tree(builder: MeshBuilder, base: Vector, rng: np.random.Generator, *, kind: str | None = None) -> None:
-    """A broad-leaved tree, a conifer, a slim poplar or a bare one; each with loose leaves that LiDAR sees through."""
+    """Add a broad-leaved tree, a conifer, a poplar or a bare tree. Loose leaves let some LiDAR beams through.
+
+    Args:
+        builder: receives the triangles.
+        base: foot of the trunk (3,), map frame, metres.
+        rng: random generator.
+        kind: ``broad``, ``conifer``, ``poplar`` or ``bare``; None draws the kind.
+    """
     kind = kind or str(rng.choice(["broad", "broad", "broad", "conifer", "poplar", "bare"]))
     height = rng.uniform(4, 11) * (1.25 if kind == "poplar" else 1.0)
     trunk = rng.uniform(0.2, 0.55)
@@ -65,7 +74,13 @@ def add_tree(builder: MeshBuilder, base: Vector, rng: np.random.Generator, *, ki
 
 
 def add_bush(builder: MeshBuilder, base: Vector, rng: np.random.Generator) -> None:
-    """A bush of half a metre to two."""
+    """Add a bush.
+
+    Args:
+        builder: receives the triangles.
+        base: ground point (3,), map frame, metres.
+        rng: random generator.
+    """
     radius = rng.uniform(0.4, 1.1)
     green = np.array([0.12, 0.2, 0.07]) * rng.uniform(0.7, 1.5)
     radii = np.array([radius, radius, radius * rng.uniform(0.6, 1.0)])
@@ -78,7 +93,14 @@ def add_bush(builder: MeshBuilder, base: Vector, rng: np.random.Generator) -> No
 
 
 def add_furniture(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.Generator) -> None:
-    """A lamp, a sign, a bin, a bench, a hoarding, a shelter or a cabinet."""
+    """Add a lamp, a sign, a bin, a bench, an advertising board, a shelter or a cabinet.
+
+    Args:
+        builder: receives the triangles.
+        base: ground point (3,), map frame, metres.
+        yaw: heading of the street, radians, counter-clockwise from x.
+        rng: random generator.
+    """
     kind = rng.choice(["lamp", "lamp", "lamp", "sign", "sign", "bin", "bench", "cabinet", "hoarding", "shelter"])
     steel = np.array([0.35, 0.37, 0.38]) * rng.uniform(0.6, 1.3)
     low = base - [0, 0, 0.4]
@@ -117,7 +139,15 @@ def add_furniture(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random
 def add_vehicle(
     builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.Generator, *, kind: str | None = None
 ) -> None:
-    """A car, a van or a lorry, standing on its wheels."""
+    """Add a car, a van or a lorry on its wheels.
+
+    Args:
+        builder: receives the triangles.
+        base: ground point below the centre (3,), map frame, metres.
+        yaw: heading, radians, counter-clockwise from x.
+        rng: random generator.
+        kind: ``car``, ``van`` or ``lorry``; None draws the kind.
+    """
     kind = kind or str(rng.choice(["car", "van", "lorry"], p=[0.88, 0.09, 0.03]))
     ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     colour = CAR_COLOURS[rng.integers(len(CAR_COLOURS))] * rng.uniform(0.8, 1.15)
@@ -155,7 +185,14 @@ def add_vehicle(
 
 
 def add_person(builder: MeshBuilder, base: Vector, yaw: float, rng: np.random.Generator) -> None:
-    """A standing or walking person."""
+    """Add a standing or walking person.
+
+    Args:
+        builder: receives the triangles.
+        base: ground point (3,), map frame, metres.
+        yaw: heading, radians, counter-clockwise from x.
+        rng: random generator.
+    """
     height = rng.uniform(1.5, 1.9)
     legs, coat = CLOTHES[rng.integers(len(CLOTHES))], CLOTHES[rng.integers(len(CLOTHES))]
     stride = rng.uniform(0.0, 0.3)

@@ -1,4 +1,4 @@
-"""The street network: centre lines with widths, cut into the classes of the paper's Table I."""
+"""The street network: centre lines with widths, divided into the classes of the paper's Table I."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 Line = NDArray[np.float64]
 
-GRID_M = 0.01  # coordinates of polygons, as they are written; rounding afterwards would make some cross themselves
-PAVEMENT_M = 3.0  # either side of the carriageway, part of the street's polygon
+#: Grid of the polygons' coordinates, metres. Rounding them later instead would make some polygons self-intersect.
+GRID_M = 0.01
+#: Width on either side of the carriageway that belongs to the street's polygon, metres.
+PAVEMENT_M = 3.0
 
-#: Table I: class names and the number of test images of each, in the paper's order.
+#: Table I of the paper: street, section and number of test images of each class, in the paper's order.
 TABLE_I = (
     ("1", "beginning", 56), ("1", "end", 54), ("2", "beginning", 22), ("2", "end", 67), ("3", None, 11),
     ("4", "beginning", 38), ("4", "end", 25), ("5", "beginning", 76), ("5", "end", 37), ("6", None, 34),
@@ -23,15 +25,22 @@ TABLE_I = (
 
 @dataclass(frozen=True)
 class Street:
-    """One street: centre lines (each (n, 2), metres, about 3 m between points), half width of the carriageway."""
+    """One street.
+
+    Attributes:
+        street: name of the street.
+        lines: centre lines, each (n, 2), map frame, metres, about 3 m between points.
+        half_width_m: half the width of the carriageway, metres.
+        sections: whether the street is divided into a beginning and an end.
+    """
 
     street: str
     lines: tuple[Line, ...]
     half_width_m: float
-    sections: bool  # cut into a beginning and an end
+    sections: bool
 
     def classes(self) -> list[tuple[str | None, tuple[Line, ...]]]:
-        """Section name and centre lines of each class."""
+        """Return the section name (None without sections) and the centre lines of each class."""
         if not self.sections:
             return [(None, self.lines)]
         (line,) = self.lines
@@ -41,7 +50,12 @@ class Street:
 
 
 def class_name(street: str, section: str | None) -> str:
-    """The name as the paper's Table I writes it."""
+    """Return the name of a class as in the paper's Table I.
+
+    Args:
+        street: name of the street.
+        section: ``beginning``, ``end``, or None for the whole street.
+    """
     if street == "between":
         return "Between"
     if section is None:
@@ -50,7 +64,15 @@ def class_name(street: str, section: str | None) -> str:
 
 
 def smooth_line(points: list[tuple[float, float]], bend_m: float, rng: np.random.Generator) -> Line:
-    """A polyline through points, about 3 m a step, gently bent between its ends."""
+    """Return a gently bent polyline (n, 2) near the given points, metres, with about 3 m between its points.
+
+    It contains the first and the last point exactly.
+
+    Args:
+        points: positions, map frame, metres.
+        bend_m: standard deviation of the bend in the middle, metres.
+        rng: random generator.
+    """
     corners = np.array(points, float)
     length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))]
     steps = max(8, int(length[-1] / 3.0))
@@ -65,7 +87,11 @@ def smooth_line(points: list[tuple[float, float]], bend_m: float, rng: np.random
 
 
 def paper_streets(rng: np.random.Generator) -> list[Street]:
-    """Nine streets and the ways between them on about 300 m x 400 m, as the paper's Figure 8 shows in kind."""
+    """Return nine streets and the ways between them on about 300 m x 400 m, similar to the paper's Figure 8.
+
+    Args:
+        rng: random generator.
+    """
 
     def line(*points: tuple[float, float]) -> Line:
         return smooth_line(list(points), 2.5, rng)
@@ -85,7 +111,12 @@ def paper_streets(rng: np.random.Generator) -> list[Street]:
 
 
 def random_streets(rng: np.random.Generator, size_m: tuple[float, float]) -> list[Street]:
-    """A bent grid of streets with gaps and a diagonal, on about the size wanted."""
+    """Return a bent grid of streets with gaps and one diagonal.
+
+    Args:
+        rng: random generator.
+        size_m: approximate extent in x and y, metres.
+    """
     counts = [max(2, round(size / 88.0) + 1) for size in size_m]
     grids = []
     for count, size in zip(counts, size_m, strict=True):
@@ -108,7 +139,7 @@ def random_streets(rng: np.random.Generator, size_m: tuple[float, float]) -> lis
             for i in range(counts[along]):
                 node = nodes[i, k] if along == 0 else nodes[k, i]
                 run.append(node)
-                if i + 1 < counts[along] and rng.random() < 0.12:  # a block without this street
+                if i + 1 < counts[along] and rng.random() < 0.12:  # the street is missing along this block
                     if len(run) > 1:
                         add(run)
                     run = []
@@ -120,7 +151,13 @@ def random_streets(rng: np.random.Generator, size_m: tuple[float, float]) -> lis
 
 
 def streets_geojson(streets: list[Street]) -> dict[str, Any]:
-    """Polygons of all classes; where two meet, the first named one keeps the crossing, so no point has two streets."""
+    """Return the polygons of all classes as GeoJSON, map frame, metres.
+
+    Where two classes overlap, the first one keeps the area. So no point belongs to two classes.
+
+    Args:
+        streets: the street network.
+    """
     features = []
     taken: shapely.Geometry = shapely.Polygon()
     index = 0
@@ -151,15 +188,18 @@ def streets_geojson(streets: list[Street]) -> dict[str, Any]:
 
 
 def _areas(shape: shapely.Geometry) -> shapely.Geometry:
-    """Its polygons alone: slivers collapse to lines on the grid, and what has lines in it GEOS refuses as an operand."""
+    """Return only the polygons of a shape.
+
+    On the grid, slivers collapse to lines. GEOS refuses a collection with lines as an operand.
+    """
     if isinstance(shape, shapely.Polygon | shapely.MultiPolygon):
         return shape
-    parts = shapely.get_parts(shapely.get_parts(shape))  # a collection may hold several that are several themselves
+    parts = shapely.get_parts(shapely.get_parts(shape))  # a collection may contain multi-polygons
     return shapely.MultiPolygon([part for part in parts if isinstance(part, shapely.Polygon)])
 
 
 def _geometry(shape: shapely.Geometry) -> dict[str, Any]:
-    """GeoJSON coordinates, slivers under 1 m2 left out; rounding only cuts the digits, the points lie on the grid."""
+    """Return the GeoJSON geometry without slivers below 1 m2. The points lie on the grid, so rounding only shortens the digits."""
     parts = [p for p in shapely.get_parts(shape) if isinstance(p, shapely.Polygon) and p.area > 1.0]
     polygons = [
         [[[round(x, 2), round(y, 2)] for x, y in ring.coords] for ring in (p.exterior, *p.interiors)] for p in parts

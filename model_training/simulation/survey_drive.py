@@ -1,23 +1,23 @@
-"""How the survey's vehicle drove: how well its poses are known, how fast it was while the LiDAR turned, and who drove ahead of it."""
+"""How the survey was recorded: pose error, speed during a revolution of the LiDAR, and a vehicle that drives ahead."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: One turn of the LiDAR, seconds.
+#: Duration of one revolution of the LiDAR, seconds.
 TURN_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyModel:
-    """Of one survey.
+    """Motion and pose error of one survey.
 
     Attributes:
-        position_m: smooth error of the poses, one sigma an axis.
-        angle_deg: and of their angles.
-        speed_m_s: at which the vehicle drove while the LiDAR turned; 0: it stood still for each scan.
-        deskewed: the motion was taken out of the scans, as the odometry tells it.
+        position_m: standard deviation of the smooth position error per axis, metres.
+        angle_deg: standard deviation of the smooth error of each angle, degrees.
+        speed_m_s: speed of the vehicle during a revolution of the LiDAR, metres per second; 0: it stands still for each scan.
+        deskewed: whether the scans are corrected for the motion, as with odometry.
         followed: share of the way on which another vehicle drives ahead.
     """
 
@@ -29,7 +29,14 @@ class SurveyModel:
 
 
 def moved_m(rays: NDArray[np.float32], speed_m_s: float) -> NDArray[np.float32]:
-    """Where the LiDAR was (n, 3), metres, in its own frame of mid-turn, when it sent each ray; it turns from -pi to pi."""
+    """Return the LiDAR's displacement (n, 3) at each ray, metres, in its own frame in the middle of the revolution.
+
+    The LiDAR rotates from azimuth -pi to pi.
+
+    Args:
+        rays: directions (n, 3), LiDAR frame.
+        speed_m_s: forward speed (x), metres per second.
+    """
     when_s = np.arctan2(rays[:, 1], rays[:, 0]) / (2 * np.pi) * TURN_S
     offsets = np.zeros_like(rays)
     offsets[:, 0] = speed_m_s * when_s

@@ -1,4 +1,4 @@
-"""Drives: where the survey's LiDAR stood, and where queries are asked."""
+"""Traversals: poses of the survey's LiDAR and of queries."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,12 +17,20 @@ from service.geometry.rigid import (
     transform_from,
 )
 
-SURVEY_LANE_M = 0.5  # right of the centre line
+#: Distance of the survey's vehicle to the right of the centre line, metres.
+SURVEY_LANE_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A point of a drive: position (m) and heading (rad) on the ground plane; ``travelled`` (m) from the drive's start."""
+    """A point of a traversal on the ground plane.
+
+    Attributes:
+        x: map frame, metres.
+        y: map frame, metres.
+        heading: heading, radians, counter-clockwise from x.
+        travelled: distance from the start of the traversal, metres.
+    """
 
     x: float
     y: float
@@ -31,12 +39,24 @@ class Station:
 
 
 def stations(city: City, step_m: float, *, lane_m: float = SURVEY_LANE_M) -> list[Station]:
-    """The stations along all streets of a city, as ``stations_along`` says."""
+    """Return the stations along all streets of a city; see ``stations_along``.
+
+    Args:
+        city: city with streets.
+        step_m: distance between stations, metres.
+        lane_m: distance to the right of the centre line, metres.
+    """
     return stations_along(city.streets, step_m, lane_m=lane_m)
 
 
 def stations_along(streets: Iterable[Street], step_m: float, *, lane_m: float = SURVEY_LANE_M) -> list[Station]:
-    """Every street once, in its own direction, a station each ``step_m``, ``lane_m`` right of its centre line (m)."""
+    """Return stations that follow every street once, in its own direction.
+
+    Args:
+        streets: streets in the order of the traversal.
+        step_m: distance between stations along the centre line, metres.
+        lane_m: distance to the right of the centre line, metres.
+    """
     found: list[Station] = []
     travelled = 0.0
     for street in streets:
@@ -62,7 +82,14 @@ def stations_along(streets: Iterable[Street], step_m: float, *, lane_m: float = 
 
 
 def upright_on(city: City, x: float, y: float, heading: float) -> NDArray[np.float64]:
-    """Rotation of a vehicle that stands on the slope at (x, y) with a heading."""
+    """Return the rotation (3, 3), vehicle frame to map frame, of a vehicle that stands on the slope.
+
+    Args:
+        city: city with terrain.
+        x: map frame, metres.
+        y: map frame, metres.
+        heading: heading, radians, counter-clockwise from x.
+    """
     tilt = rotation_taking(np.array([0.0, 0.0, 1.0]), city.terrain.normal(np.array([x, y])))
     return tilt @ rotation_z(heading)
 
@@ -70,7 +97,15 @@ def upright_on(city: City, x: float, y: float, heading: float) -> NDArray[np.flo
 def lidar_pose(
     city: City, station: Station, rng: np.random.Generator, *, height_m: float = 1.8, sway_deg: float = 0.4
 ) -> NDArray[np.float64]:
-    """T_map_lidar of a vehicle on the slope, with the suspension's sway in roll, pitch and height."""
+    """Return T_map_lidar (4, 4), metres, of a vehicle on the slope. The suspension adds random roll, pitch and height.
+
+    Args:
+        city: city with terrain.
+        station: position and heading.
+        rng: random generator.
+        height_m: mean height of the LiDAR above the ground, metres.
+        sway_deg: standard deviation of roll and pitch, degrees.
+    """
     roll, pitch = np.deg2rad(rng.normal(0, sway_deg, 2))
     R = upright_on(city, station.x, station.y, station.heading) @ rotation_y(pitch) @ rotation_x(roll)
     z = city.height(station.x, station.y) + height_m + rng.normal(0, 0.02)
@@ -79,7 +114,18 @@ def lidar_pose(
 
 @dataclass(frozen=True, slots=True)
 class QueryDrive:
-    """How far a query may be from the survey's track."""
+    """How far the query poses may deviate from the survey's track.
+
+    Attributes:
+        aside_m: largest lateral distance, metres.
+        heading_deg: largest heading difference, degrees.
+        height_m: mean height of the camera above the ground, metres.
+        height_sigma_m: standard deviation of the height, metres.
+        sway_deg: standard deviation of roll and pitch, degrees.
+        both_directions: whether half of the queries face the opposite direction.
+        turn_deg: yaw of the camera against the vehicle, degrees, counter-clockwise.
+        pitch_deg: pitch of a wrongly mounted camera, degrees; positive is downwards.
+    """
 
     aside_m: float = 2.0
     heading_deg: float = 15.0
@@ -87,12 +133,19 @@ class QueryDrive:
     height_sigma_m: float = 0.1
     sway_deg: float = 1.0
     both_directions: bool = True
-    turn_deg: float = 0.0  # of the camera against the vehicle, counter-clockwise
-    pitch_deg: float = 0.0  # a camera mounted wrong by this
+    turn_deg: float = 0.0
+    pitch_deg: float = 0.0
 
 
 def query_pose(city: City, station: Station, drive: QueryDrive, rng: np.random.Generator) -> NDArray[np.float64]:
-    """T_map_camera of one query near a station of the survey."""
+    """Return T_map_camera (4, 4), metres, of one query near a station of the survey.
+
+    Args:
+        city: city with terrain.
+        station: station of the survey.
+        drive: allowed deviations.
+        rng: random generator.
+    """
     aside = rng.uniform(-drive.aside_m, drive.aside_m)
     ahead = rng.uniform(-0.7, 0.7)
     c, s = np.cos(station.heading), np.sin(station.heading)
@@ -108,9 +161,15 @@ def query_pose(city: City, station: Station, drive: QueryDrive, rng: np.random.G
 def survey_error(
     travelled_m: NDArray[np.float64], rng: np.random.Generator, *, position_m: float = 0.03, angle_deg: float = 0.05
 ) -> list[NDArray[np.float64]]:
-    """Smooth errors of survey poses: for each station a transform to multiply T_map_lidar with, from the right.
+    """Return one transform (4, 4) per station: a smooth error of the survey's pose. T_map_lidar @ error is the reported pose.
 
-    Waves of 30 to 200 m of travel; ``position_m`` is one sigma an axis, ``angle_deg`` one sigma of each angle.
+    Each error component is a sum of sine waves of 30 to 200 m of travel.
+
+    Args:
+        travelled_m: distance of each station from the start (n,), metres.
+        rng: random generator.
+        position_m: standard deviation per axis, metres.
+        angle_deg: standard deviation of each angle, degrees.
     """
     waves = []
     for sigma in [position_m] * 3 + [np.deg2rad(angle_deg)] * 3:

@@ -1,1 +1,1 @@
-"""Streets of a map from other people's files: GeoJSON, OpenDRIVE, OpenStreetMap."""
+"""Read the streets of a map from GeoJSON, OpenDRIVE and OpenStreetMap files."""

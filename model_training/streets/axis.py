@@ -1,4 +1,4 @@
-"""A street's axis: one line from its beginning to its end, along which it can be cut."""
+"""The axis of a street: one line from its beginning to its end, along which we cut it."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -10,21 +10,23 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree, shortest_path
 from shapely.geometry.base import BaseGeometry
 
-#: Carriageways of one street are rarely further apart than this.
+#: Carriageways of one street are rarely further apart, metres.
 _PARALLEL_M = 25.0
+#: Share of a line that lies beside longer lines. From this share on the line counts as parallel and is dropped.
 _PARALLEL_SHARE = 0.8
 
 
 def axis_of(surface: BaseGeometry, lines: Sequence[shapely.LineString]) -> shapely.LineString:
-    """The line along which a street's length is counted, metres.
+    """Return the line along which a street's length is measured.
 
-    Of centre lines: the longest way along them, gaps (junctions) bridged where they are narrowest; it runs as the first line
-    does. So of two carriageways one counts, and a branch falls to where it leaves. Of a polygon alone: the long axis of
-    the narrowest rectangle around it, from west to east (south to north where it runs exactly north).
+    With centre lines: the longest way along them. Gaps (junctions) are bridged where they are narrowest. The axis has the
+    direction of the first line. Of two carriageways only one counts. A branch belongs to where it leaves the axis.
+    With a polygon only: the long axis of the smallest rectangle around it, from west to east, or from south to north if it
+    runs exactly north.
 
     Args:
-        surface: the street's.
-        lines: its centre lines, if known.
+        surface: ground of the street, map frame, metres.
+        lines: its centre lines, map frame, metres; empty if unknown.
     """
     if not lines:
         return _of_rectangle(surface)
@@ -37,7 +39,7 @@ def axis_of(surface: BaseGeometry, lines: Sequence[shapely.LineString]) -> shape
 
 
 def _one_carriageway(lines: Sequence[shapely.LineString]) -> list[shapely.LineString]:
-    """The lines, longest first, less those that run beside longer ones: along both, the way would lead there and back."""
+    """Drop lines that run beside longer ones. Otherwise the axis would lead along both, there and back."""
     kept: list[shapely.LineString] = []
     beside: BaseGeometry = shapely.Polygon()
     for line in sorted(lines, key=lambda each: -each.length):
@@ -59,12 +61,12 @@ def _of_rectangle(surface: BaseGeometry) -> shapely.LineString:
 
 
 def _longest_way(pieces: Sequence[shapely.LineString]) -> shapely.LineString:
-    """The longest of the shortest ways between any two ends of the pieces."""
+    """The longest of the shortest paths between any two ends of the pieces."""
     ends = np.array([piece.coords[at][:2] for piece in pieces for at in (0, -1)])
     nodes, node_of_end = np.unique(np.round(ends, 3), axis=0, return_inverse=True)
     starts, stops = node_of_end.reshape(-1, 2).T
     lengths = np.array([piece.length for piece in pieces])
-    shortest = np.lexsort((lengths,))[::-1]  # of two pieces between the same nodes the shorter comes last and is kept
+    shortest = np.lexsort((lengths,))[::-1]  # longest first: between the same nodes the shorter piece is kept
     piece_of: dict[tuple[int, int], shapely.LineString] = {}
     for number in shortest:
         a, b = int(starts[number]), int(stops[number])
@@ -90,7 +92,7 @@ def _longest_way(pieces: Sequence[shapely.LineString]) -> shapely.LineString:
 
 
 def _bridges(nodes: NDArray[np.float64], joined: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Pairs of nodes that join the pieces to one, as short in sum as can be."""
+    """Pairs of nodes that connect all pieces, with the least total length."""
     rows, columns = np.array(joined or np.empty((0, 2)), int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(nodes), len(nodes)))
     count, group = connected_components(graph, directed=False)

@@ -1,4 +1,4 @@
-"""``streets.geojson`` as the service reads it: no point in two streets, every id its own."""
+"""Make ``streets.geojson`` as the service reads it: streets do not overlap, and every id is unique."""
 
 import json
 import re
@@ -15,16 +15,24 @@ from model_training.streets.named_street import NamedStreet
 from service.errors import DatasetError
 from service.maps.streets import Streets
 
+#: Grid of all coordinates, metres.
 GRID_M = 0.001
-#: Points that say less about an edge are left out. Every street is widened by as much, else rounding to the grid would leave
-#: gaps between streets that follow one another.
+#: Tolerance of the simplified edges, metres. Every street is widened by the same amount. Otherwise rounding to the grid
+#: would leave gaps between adjacent streets.
 _EDGE_M = 0.002
+#: Smaller parts are dropped, square metres.
 _SLIVER_M2 = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class StreetCollection:
-    """A FeatureCollection in map metres; what was left out, a sentence each; how much ground two streets laid claim to, m2."""
+    """Streets as GeoJSON.
+
+    Attributes:
+        document: a FeatureCollection, map frame, metres.
+        dropped: what was left out, one sentence each.
+        overlap_m2: ground that two streets claimed, square metres.
+    """
 
     document: dict[str, Any]
     dropped: tuple[str, ...]
@@ -32,13 +40,13 @@ class StreetCollection:
 
 
 def collection_of(streets: Iterable[NamedStreet]) -> StreetCollection:
-    """Make a FeatureCollection; where streets overlap, the earlier one keeps the ground.
+    """Make a FeatureCollection. If streets overlap, the earlier one keeps the ground.
 
     Args:
-        streets: in the order in which ground is given away.
+        streets: in order of priority.
 
     Raises:
-        DatasetError: two streets bring the same id, or none covers any ground.
+        DatasetError: two streets have the same id, or none covers any ground.
     """
     given = list(streets)
     surfaces = [_widened(street.surface) for street in given]
@@ -48,7 +56,7 @@ def collection_of(streets: Iterable[NamedStreet]) -> StreetCollection:
     for number, (street, surface) in enumerate(zip(given, surfaces, strict=True)):
         earlier = [surfaces[other] for other in sorted(tree.query(surface, predicate="intersects")) if other < number]
         own = shapely.difference(surface, shapely.union_all(earlier), grid_size=GRID_M) if earlier else surface
-        if earlier and surface.area - own.area >= _SLIVER_M2:  # less is the widening
+        if earlier and surface.area - own.area >= _SLIVER_M2:  # a smaller overlap comes from the widening
             overlap += surface.area - own.area
         coordinates = _coordinates(own)
         if not coordinates:
@@ -75,19 +83,19 @@ def collection_of(streets: Iterable[NamedStreet]) -> StreetCollection:
 
 
 def write_streets(path: Path, document: dict[str, Any], *, replace: bool = False) -> Streets:
-    """Write ``streets.geojson``, renamed when whole.
+    """Write ``streets.geojson``; the file is renamed when it is complete.
 
     Args:
         path: of the file.
-        document: a FeatureCollection.
-        replace: whether a file that is there may go.
+        document: a FeatureCollection, map frame, metres.
+        replace: overwrite an existing file.
 
     Returns:
         The streets as the service reads them.
 
     Raises:
-        DatasetError: the file is there and may not go, or cannot be written.
-        BundleError: the service would not read it.
+        DatasetError: the file exists and ``replace`` is False, or it cannot be written.
+        BundleError: the service would refuse the document.
     """
     if path.exists() and not replace:
         raise DatasetError(f"{path} is there; give --replace to write over it", field=path.name)
@@ -103,14 +111,14 @@ def write_streets(path: Path, document: dict[str, Any], *, replace: bool = False
 
 
 def _widened(surface: BaseGeometry) -> BaseGeometry:
-    """A surface's parts that cover ground, on the grid and without points that its edge does not need."""
+    """Parts of a surface that cover ground, on the grid, with simplified edges."""
     parts = [part for part in shapely.get_parts(surface) if isinstance(part, shapely.Polygon)]
     plain = shapely.simplify(shapely.union_all(parts), _EDGE_M)
     return shapely.set_precision(plain.buffer(_EDGE_M, join_style="mitre"), GRID_M)
 
 
 def _coordinates(shape: BaseGeometry) -> list[list[list[list[float]]]]:
-    """GeoJSON coordinates of all parts but slivers; the points lie on the grid, rounding only cuts their digits."""
+    """GeoJSON coordinates of all parts except slivers. Points already lie on the grid; rounding only shortens their digits."""
     parts = [part for part in shapely.get_parts(shape) if isinstance(part, shapely.Polygon) and part.area >= _SLIVER_M2]
     return [
         [[[round(x, 3), round(y, 3)] for x, y in ring.coords] for ring in (part.exterior, *part.interiors)]

@@ -1,4 +1,4 @@
-"""Ground of streets that are known by centre lines and widths."""
+"""Ground of streets that are given by centre lines and widths."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,14 +8,14 @@ from shapely.geometry.base import BaseGeometry
 
 
 def corridor(lines: Sequence[shapely.LineString], widths_m: Sequence[float]) -> BaseGeometry:
-    """The ground along a street's centre lines, each as wide as given; it ends where its lines do.
+    """Return the ground along a street's centre lines. It ends where the lines end.
 
     Args:
-        lines: metres.
-        widths_m: from edge to edge, one a line.
+        lines: centre lines, metres.
+        widths_m: width of each line from edge to edge, metres.
 
     Returns:
-        Polygon or MultiPolygon; without wedges missing where one line goes on from another.
+        Polygon or MultiPolygon. The wedges between consecutive lines are filled.
     """
     meet = Counter(point for line in lines for point in (line.coords[0][:2], line.coords[-1][:2]))
     halves: dict[tuple[float, ...], float] = {}

@@ -1,4 +1,4 @@
-"""Streets of a GeoJSON file: polygons, or centre lines with a width."""
+"""Read the streets of a GeoJSON file: polygons, or centre lines with a width."""
 
 import json
 import math
@@ -18,17 +18,19 @@ from model_training.streets.map_frame import FARTHEST_M, MapFrame
 from model_training.streets.named_street import LARGEST_M, NamedStreet, Section, StreetSource
 from service.errors import DatasetError
 
+#: Width of a centre line without its own width, metres.
 DEFAULT_WIDTH_M = 8.0
+#: Greatest width that is accepted, metres.
 WIDEST_M = 500.0
 _LARGEST_BYTES = 256 * 2**20
-#: The two spellings of WGS-84 by which older files say what RFC 7946 takes for granted.
+#: Names of WGS-84 in the ``crs`` of older files. RFC 7946 always uses WGS-84.
 _WGS84 = ("urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "OGC:CRS84")
 ToMap = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
 class _Naming:
-    """A feature's properties that say which street it is."""
+    """Properties of a feature that name its street."""
 
     street: str
     name: str
@@ -37,19 +39,20 @@ class _Naming:
 
 
 def read_geojson(path: Path, *, width_m: float | None = None, frame: MapFrame | None = None) -> StreetSource:
-    """Read a FeatureCollection whose features have a ``name`` or ``street``, and may have ``id``, ``section`` and ``width`` (m).
+    """Read a FeatureCollection of streets.
 
-    Features of the same street, name and section that have no id are joined.
+    A feature has a ``name`` or ``street``, and may have ``id``, ``section`` and ``width`` (m).
+    Features without an id that have the same street, name and section are joined.
 
     Args:
         path: of the file.
-        width_m: of centre lines that have none of their own; None for ``DEFAULT_WIDTH_M``.
-        frame: the map's, for longitude and latitude (or the projection that an older file's ``crs`` names); None takes the
-            coordinates as metres of the map.
+        width_m: width of centre lines without their own width, metres; None for ``DEFAULT_WIDTH_M``.
+        frame: converts longitude and latitude, or the projection that an older file's ``crs`` names, to the map frame.
+            None takes the coordinates as map metres.
 
     Raises:
-        DatasetError: the file is no FeatureCollection, a property makes no sense (its feature's number is named), two features
-            have one id, or nothing in it is a named polygon or line.
+        DatasetError: the file is no FeatureCollection, a property is invalid, two features have one id, or no feature is a
+            named polygon or line. The error names the number of the feature.
     """
     document = _load(path)
     features = document.get("features")
@@ -143,7 +146,7 @@ def _naming(feature: Any, where: str) -> _Naming | None:
 
 
 def _parts(feature: dict[str, Any], to_map: ToMap, where: str) -> list[BaseGeometry] | str:
-    """Polygons or lines of a feature in the map frame; or why it has none."""
+    """Polygons or lines of a feature in the map frame, or the reason why it has none."""
     geometry = feature.get("geometry")
     kind = geometry.get("type") if isinstance(geometry, dict) else None
     if not isinstance(geometry, dict) or kind not in ("Polygon", "MultiPolygon", "LineString", "MultiLineString"):
@@ -165,7 +168,7 @@ def _parts(feature: dict[str, Any], to_map: ToMap, where: str) -> list[BaseGeome
 
 
 def _leaves(shape: BaseGeometry) -> list[BaseGeometry]:
-    """A geometry's simple parts, also those of collections in collections."""
+    """Simple parts of a geometry, also of nested collections."""
     if not isinstance(shape, BaseMultipartGeometry):
         return [shape]
     return [leaf for part in shape.geoms for leaf in _leaves(part)]

@@ -1,4 +1,4 @@
-"""A road's surface of its lanes: from the reference line outwards, lane by lane (ASAM OpenDRIVE 1.8, chapter 11)."""
+"""The surface of a road from its lanes, outwards from the reference line (ASAM OpenDRIVE 1.8, chapter 11)."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,26 +12,35 @@ from shapely.geometry.base import BaseGeometry
 from model_training.streets.named_street import LARGEST_M, Lanes
 from model_training.streets.plan_view import STEP_M, Along, Geometry, Points, reference_line
 
-#: OpenDRIVE's types of lanes that vehicles drive on.
+#: OpenDRIVE's lane types that vehicles drive on.
 DRIVEN = frozenset({
     "driving", "entry", "exit", "onRamp", "offRamp", "slipLane", "connectingRamp", "bidirectional", "bus", "taxi", "HOV",
     "mwyEntry", "mwyExit", "roadWorks", "tram", "stop",
 })  # fmt: skip
-#: "none" is the ground outside of a road.
+#: Lane types that are no part of a road: "none" is the ground outside of it.
 NOWHERE = frozenset({"none"})
-#: Strips that follow one another meet to rounding only; on this grid they meet exactly.
+#: Grid of the surfaces, metres. Adjacent strips differ by rounding errors; on this grid they meet exactly.
 GRID_M = 0.001
 
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """Cubics one after the other, each from its start on: lane offsets and widths, metres."""
+    """A piecewise cubic function of the length along a road: a lane offset or a lane width.
+
+    Attributes:
+        starts: length at which each cubic begins, metres, rising.
+        coefficients: four coefficients of each cubic, lowest first; metres.
+    """
 
     starts: tuple[float, ...]
     coefficients: tuple[tuple[float, float, float, float], ...]
 
     def at(self, s: Along) -> Along:
-        """Values (n) at lengths from where ``starts`` count; 0 before the first record and where there is none."""
+        """Return the values (n,), metres; 0 before the first record and without records.
+
+        Args:
+            s: lengths (n,), metres, measured like ``starts``.
+        """
         values = np.zeros(len(s))
         record = np.searchsorted(self.starts, s, side="right") - 1
         for number, (start, cubic) in enumerate(zip(self.starts, self.coefficients, strict=True)):
@@ -42,7 +51,13 @@ class Records:
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """A lane: its number (positive to the left, rising outwards), type, and width by the length from its section's start."""
+    """A lane.
+
+    Attributes:
+        number: positive to the left of the reference line, negative to the right; its magnitude rises outwards.
+        kind: OpenDRIVE's lane type.
+        width: as a function of the length from the start of its section.
+    """
 
     number: int
     kind: str
@@ -51,7 +66,12 @@ class Lane:
 
 @dataclass(frozen=True, slots=True)
 class LaneSection:
-    """Lanes that begin together, at the length ``s`` (m) of their road."""
+    """Lanes that begin at the same length of their road.
+
+    Attributes:
+        s: length along the road, metres.
+        lanes: in the file's order.
+    """
 
     s: float
     lanes: tuple[Lane, ...]
@@ -59,7 +79,14 @@ class LaneSection:
 
 @dataclass(frozen=True, slots=True)
 class RoadShape:
-    """All that a road's surface follows from."""
+    """Everything that defines a road's surface.
+
+    Attributes:
+        length_m: of the road, metres.
+        geometries: pieces of the reference line, in order.
+        offset: lateral offset of the lanes from the reference line, positive to the left.
+        sections: in order.
+    """
 
     length_m: float
     geometries: tuple[Geometry, ...]
@@ -67,14 +94,17 @@ class RoadShape:
     sections: tuple[LaneSection, ...]
 
     def centre(self) -> Points:
-        """The reference line (n, 2), metres."""
+        """Return the reference line (n, 2), the file's coordinates, metres."""
         return reference_line(self.geometries, self._lengths(0.0, self.length_m))[0]
 
     def surface(self, lanes: Lanes) -> BaseGeometry:
-        """The ground its lanes cover, metres; empty where it has no lane of that kind.
+        """Return the ground of the lanes, the file's coordinates, metres; empty without a lane of that kind.
+
+        Args:
+            lanes: which lanes count.
 
         Raises:
-            ValueError: a cubic leads further than any map reaches.
+            ValueError: a coordinate is larger than those of any map.
         """
         ends = [section.s for section in self.sections[1:]] + [self.length_m]
         strips = [
@@ -90,8 +120,8 @@ class RoadShape:
         s = self._lengths(section.s, end)
         points, heading = reference_line(self.geometries, s)
         left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-        borders = [self.offset.at(s)]  # from the leftmost lane's outer border to the rightmost's
-        wanted: list[bool] = []  # of the lane to the right of each border
+        borders = [self.offset.at(s)]  # from the outer border of the leftmost lane to that of the rightmost lane
+        wanted: list[bool] = []  # for the lane to the right of each border
         for lane in sorted((each for each in section.lanes if each.number > 0), key=lambda each: each.number):
             borders.insert(0, borders[0] + np.maximum(lane.width.at(s - section.s), 0.0))
             wanted.insert(0, _is_wanted(lane.kind, lanes))
@@ -107,7 +137,7 @@ class RoadShape:
         ]
 
     def _lengths(self, start: float, end: float) -> Along:
-        """Lengths from start to end: every record's and geometry's start, and steps between."""
+        """Sample lengths from start to end: at the start of every record and geometry, and in steps between them."""
         marks = [g.s for g in self.geometries] + list(self.offset.starts)
         marks += [section.s + at for section in self.sections for lane in section.lanes for at in lane.width.starts]
         inner = np.unique([mark for mark in marks if start < mark < end])
@@ -119,7 +149,12 @@ class RoadShape:
 
 
 def strip_between(left: Points, right: Points) -> BaseGeometry:
-    """The ground between two lines that run side by side (n, 2), also where one folds over itself in a tight bend."""
+    """Return the ground between two lines that run side by side, even if one folds over itself in a tight bend.
+
+    Args:
+        left: (n, 2), metres.
+        right: (n, 2), metres.
+    """
     ring: BaseGeometry = shapely.Polygon(np.concatenate([left, right[::-1]]))
     if not ring.is_valid:
         quads: Float64[NDArray[np.float64], "m 4 2"] = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)

@@ -1,4 +1,4 @@
-"""From the Earth, or from a projection of it, to a dataset's map frame (x east, y north, metres); pyproj stays off the network."""
+"""Convert WGS-84 or projected coordinates to a dataset's map frame (x east, y north, metres). pyproj stays offline."""
 
 from collections.abc import Mapping
 from types import ModuleType
@@ -12,15 +12,16 @@ from service.errors import DatasetError
 from service.geometry.earth import Georeference
 
 Points = Float64[NDArray[np.float64], "n 2"]
-#: The map frame is a plane: 50 km out the ground lies 200 m below it, and no survey of one map reaches as far.
+#: Greatest distance from the map's origin, metres. The map frame is a plane: the ground at 50 km lies 200 m below it.
+#: No survey of one map reaches that far.
 FARTHEST_M = 50_000.0
 
 
 class MapFrame:
-    """A map's frame on the Earth.
+    """The frame of a map on the Earth.
 
     Args:
-        georeference: of the map's origin, as ``dataset.json`` has it.
+        georeference: of the map's origin, as in ``dataset.json``.
 
     Raises:
         DatasetError: the georeference is no place on the Earth.
@@ -39,33 +40,35 @@ class MapFrame:
         )
 
     def from_wgs84(self, longitude_latitude_deg: Points) -> Points:
-        """Map coordinates (n, 2), metres, of places on the Earth at the origin's height, which streets have no other of.
+        """Convert WGS-84 coordinates to map coordinates (n, 2), metres.
+
+        Streets have no height, so the points get the height of the origin.
 
         Args:
-            longitude_latitude_deg: in GeoJSON's order, WGS-84.
+            longitude_latitude_deg: (n, 2), degrees, in GeoJSON's order.
 
         Returns:
-            NaN where a place lies further than ``FARTHEST_M`` from the origin, or is none.
+            Map coordinates (n, 2); NaN for a point that is invalid or further than ``FARTHEST_M`` from the origin.
         """
         longitude, latitude = np.asarray(longitude_latitude_deg, np.float64).reshape(-1, 2).T
         x, y, z = self._to_map.transform(longitude, latitude, np.full(len(longitude), self.origin.height_m))
         known = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360) & (np.sqrt(x**2 + y**2 + z**2) <= FARTHEST_M)
-        # Far places would come back from under the plane: the other side of the Earth has x and y of nearly nothing.
+        # The distance includes z: a point on the other side of the Earth has x and y near 0.
         points: Points = np.where(known[:, None], np.column_stack([x, y]), np.nan)
         return points
 
     def from_projection(self, points: Points, projection: str) -> Points:
-        """Map coordinates (n, 2), metres, of points in a projection; NaN as in ``from_wgs84``.
+        """Convert projected coordinates to map coordinates (n, 2), metres; NaN as in ``from_wgs84``.
 
         Args:
-            points: eastings and northings.
-            projection: a PROJ string, WKT or authority's code, as OpenDRIVE's geoReference holds it.
+            points: eastings and northings (n, 2).
+            projection: a PROJ string, WKT or an authority's code, as in OpenDRIVE's geoReference.
 
         Raises:
-            DatasetError: the projection is not understood.
+            DatasetError: PROJ does not understand the projection.
         """
         pyproj = _pyproj()
-        # Heights are not asked for, and the grids they need (egm96) are rarely there.
+        # We need no heights, and the geoid grids for them (egm96) are rarely installed.
         flat = " ".join(word for word in projection.split() if not word.startswith(("+geoidgrids=", "+vunits=")))
         try:
             crs = pyproj.CRS.from_user_input(flat)

@@ -1,4 +1,4 @@
-"""What every source of streets is read into: names with a surface, in metres of the map frame."""
+"""Common result of all street readers: named surfaces in the map frame, metres."""
 
 import re
 from dataclasses import dataclass
@@ -8,9 +8,9 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 Section = Literal["beginning", "end"]
-#: Which lanes make a street's surface: those for vehicles, or the shoulders and pavements as well.
+#: Which lanes form a street's surface: those for vehicles, or shoulders and pavements too.
 Lanes = Literal["driving", "all"]
-#: No map's coordinates are larger, whatever its projection; GEOS does not come to an end on some that are.
+#: Greatest coordinate, metres; no projection has larger ones. GEOS does not terminate on some larger coordinates.
 LARGEST_M = 1e8
 
 
@@ -18,13 +18,13 @@ LARGEST_M = 1e8
 class NamedStreet:
     """A street, a section of one, or a junction.
 
-    Args:
+    Attributes:
         street: name of the whole street.
-        name: what people read; the street's, unless it is a section.
+        name: displayed name: that of the street, or of the section.
         surface: Polygon or MultiPolygon, map frame, metres.
-        lines: centre lines, map frame, metres; in the source's direction. Empty where the source has polygons only.
-        section: None where it is a whole street, or a section that is neither the beginning nor the end.
-        id: the source's own, or None where one is to be made of the name.
+        lines: centre lines in the source's direction, map frame, metres; empty if the source has only polygons.
+        section: None for a whole street, or for a section that is neither the beginning nor the end.
+        id: the source's own id; None if one is to be made from the name.
         divisible: whether it may be cut into sections; junctions and sections may not.
     """
 
@@ -39,12 +39,12 @@ class NamedStreet:
 
 @dataclass(frozen=True, slots=True)
 class StreetSource:
-    """What was read of a file.
+    """What a reader found in a file.
 
-    Args:
-        streets: where two overlap, the earlier one keeps the ground.
-        unnamed: how many roads (ways, features) of the source had no name.
-        dropped: what was left out, a sentence each, saying why.
+    Attributes:
+        streets: in order of priority: if two overlap, the earlier one keeps the ground.
+        unnamed: number of roads (ways, features) without a name.
+        dropped: what was left out and why, one sentence each.
     """
 
     streets: tuple[NamedStreet, ...]
@@ -53,6 +53,10 @@ class StreetSource:
 
 
 def in_natural_order(name: str) -> tuple[tuple[int, int, str], ...]:
-    """A sorting key under which "Road 9" comes before "Road 10"."""
+    """Return a sorting key under which "Road 9" comes before "Road 10".
+
+    Args:
+        name: of a street.
+    """
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts)

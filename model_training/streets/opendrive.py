@@ -1,7 +1,8 @@
-"""Streets of an OpenDRIVE map (.xodr).
+"""Read the streets of an OpenDRIVE map (.xodr).
 
-OpenDRIVE is right-handed: x east, y north, z up. CARLA's maps are OpenDRIVE files and fit as they are. CARLA's own world is
-left-handed (Unreal's), y turned about: a recording of CARLA lies in the same frame as its .xodr once its importer has turned y.
+OpenDRIVE is right-handed: x east, y north, z up. CARLA's maps are OpenDRIVE files and fit without conversion.
+CARLA's own world is left-handed (Unreal's) with the opposite y. After its importer has negated y, a CARLA recording has
+the frame of its .xodr file.
 """
 
 from collections import defaultdict
@@ -20,13 +21,20 @@ from model_training.streets.opendrive_road import Road, attribute, number_of, re
 from model_training.streets.safe_xml import read_xml
 from service.errors import DatasetError
 
-#: Surfaces are sampled every half metre; more roads than this fill the memory.
+#: Greatest total length of roads, metres. Surfaces are sampled every 0.5 m, so longer networks would fill the memory.
 _LONGEST_M = 5_000_000.0
 
 
 @dataclass(frozen=True, slots=True)
 class RoadNetwork:
-    """Roads in the file's order; names of the junctions by their ids; the projection, if the file tells it, and its offset."""
+    """Roads of an OpenDRIVE file.
+
+    Attributes:
+        roads: in the file's order.
+        junctions: names of the junctions by id.
+        projection: the file's geoReference; None if it has none.
+        offset: the header's offset: x, y (m) and heading (rad).
+    """
 
     roads: tuple[Road, ...]
     junctions: dict[str, str]
@@ -34,7 +42,11 @@ class RoadNetwork:
     offset: tuple[float, float, float]
 
     def to_projection(self, points: Points) -> Points:
-        """The file's coordinates (n, 2) as eastings and northings of its projection, by the header's offset."""
+        """Convert the file's coordinates to eastings and northings (n, 2) with the header's offset.
+
+        Args:
+            points: the file's coordinates (n, 2), metres.
+        """
         x, y, heading = self.offset
         c, s = np.cos(heading), np.sin(heading)
         moved: Points = points @ np.array([[c, s], [-s, c]]) + (x, y)
@@ -46,10 +58,11 @@ def read_network(path: Path, *, lanes: Lanes = "all") -> RoadNetwork:
 
     Args:
         path: of the .xodr file.
-        lanes: which of them make the surface.
+        lanes: which lanes form the surface.
 
     Raises:
-        DatasetError: the file is no OpenDRIVE, has no roads, or a road lacks what its surface follows from, naming the road.
+        DatasetError: the file is no OpenDRIVE, has no roads, has two roads with one id, is too large, or a road lacks what
+            defines its surface; the error names the road.
     """
     tree = read_xml(path, root="OpenDRIVE")
     elements = tree.findall("road")
@@ -77,15 +90,16 @@ def read_network(path: Path, *, lanes: Lanes = "all") -> RoadNetwork:
 
 
 def read_opendrive(path: Path, *, lanes: Lanes = "all", frame: MapFrame | None = None) -> StreetSource:
-    """Read an OpenDRIVE file's streets: roads of one name joined, junctions after them.
+    """Read the streets of an OpenDRIVE file: roads of one name joined, then the junctions.
 
     Args:
         path: of the .xodr file.
-        lanes: which lanes make the surface.
-        frame: the map's, into which the file's projection is turned; None takes the coordinates as they are.
+        lanes: which lanes form the surface.
+        frame: converts the file's projection to the map frame; None takes the coordinates as they are.
 
     Raises:
-        DatasetError: as ``read_network``; or the file has no geoReference though a frame is given, or lies elsewhere on the Earth.
+        DatasetError: as ``read_network``; or ``frame`` is given, and the file has no geoReference or lies too far from the
+            map's origin.
     """
     network = read_network(path, lanes=lanes)
     dropped = [f"road {road.id} has no lane of the kind {lanes!r}" for road in network.roads if road.surface.is_empty]

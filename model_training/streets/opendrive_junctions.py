@@ -1,4 +1,4 @@
-"""What an OpenDRIVE map calls its junctions: by their own names, by the streets that meet, or by number."""
+"""Name the junctions of an OpenDRIVE map: by their own names, by the streets that meet, or by number."""
 
 import re
 from collections import Counter, defaultdict
@@ -11,23 +11,23 @@ from model_training.streets.lanes import GRID_M
 from model_training.streets.named_street import NamedStreet, in_natural_order
 from model_training.streets.opendrive_road import Road
 
-#: Editors number their junctions; such a name says less than the streets that meet there.
+#: Names that an editor generated. The names of the streets that meet there are more useful.
 _NUMBERED = re.compile(r"junction[\s_]*[0-9]*", re.IGNORECASE)
 
 
 def junction_streets(
     roads: Sequence[Road], junctions: Mapping[str, str], names: Mapping[str, str]
 ) -> tuple[dict[str, list[BaseGeometry]], list[NamedStreet]]:
-    """The ground of all roads that lead through junctions.
+    """Collect the ground of all roads that lead through junctions.
 
     Args:
-        roads: of the file.
-        junctions: their names by id, as the file has them.
-        names: of the roads outside of junctions, by id; only those that the file names.
+        roads: all roads of the file.
+        junctions: names of the junctions by id, as in the file.
+        names: names of the roads outside of junctions by id; only those that the file names.
 
     Returns:
-        By street, the ground of junctions where no other named street meets it, which are a part of it; and the other
-        junctions, each a street of its own.
+        Ground of junctions that belong to one street, because only this street meets there, by its name; and the other
+        junctions, each as a street of its own.
     """
     surfaces: dict[str, list[BaseGeometry]] = defaultdict(list)
     meeting: dict[str, set[str]] = defaultdict(set)
@@ -41,7 +41,7 @@ def junction_streets(
     for identity in sorted(surfaces, key=in_natural_order):
         own = junctions.get(identity, "")
         met = sorted({names[road] for road in meeting[identity] if road in names}, key=in_natural_order)
-        # What its lanes lead around, between kerbs or on an island, belongs to a junction as well.
+        # Ground that the lanes enclose, such as an island, belongs to the junction too.
         parts = shapely.get_parts(shapely.union_all(surfaces[identity], grid_size=GRID_M))
         ground = shapely.union_all(
             [shapely.Polygon(part.exterior) for part in parts if isinstance(part, shapely.Polygon)]
@@ -53,7 +53,7 @@ def junction_streets(
             continue
         else:
             name = " / ".join(met) if len(met) > 1 else f"Junction {identity}"
-        uses[name] += 1  # two streets may meet twice
+        uses[name] += 1  # the same streets may meet at several junctions
         if uses[name] > 1:
             name = f"{name} ({uses[name]})"
         streets.append(NamedStreet(street=name, name=name, surface=ground, divisible=False))

@@ -1,4 +1,4 @@
-"""One <road> of OpenDRIVE: its elements as the numbers that its surface follows from."""
+"""Read one <road> element of OpenDRIVE as the numbers that define its surface."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from model_training.streets.named_street import Lanes
 from model_training.streets.plan_view import Bend, Cubic, Geometry, polynomial_shape
 from service.errors import DatasetError
 
-#: Beyond any projection's coordinates; larger numbers are mistakes that would overflow later.
+#: Greatest number that is accepted. No projection has larger coordinates; larger numbers would overflow later.
 _LARGEST = 1e8
 _LONGEST_ROAD_M = 100_000.0
 _ABCD = ("a", "b", "c", "d")
@@ -22,14 +22,14 @@ _ABCD = ("a", "b", "c", "d")
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """A road of the file, its ground in the file's own coordinates, metres.
+    """A road of the file. Its ground has the file's coordinates, metres.
 
-    Args:
-        id: the file's.
-        name: the file's; empty where it has none.
-        junction: id of the junction that it leads through, or None.
+    Attributes:
+        id: the file's id.
+        name: the file's name; empty if it has none.
+        junction: id of the junction that the road leads through, or None.
         linked: ids of the roads before and after it.
-        surface: the ground of its lanes; empty where it has none of the kind asked for.
+        surface: ground of its lanes; empty if it has no lane of the wanted kind.
         centre: its reference line.
     """
 
@@ -42,10 +42,15 @@ class Road:
 
 
 def attribute(element: Element, name: str, where: str) -> str:
-    """An attribute that must be there.
+    """Return a required attribute of an element.
+
+    Args:
+        element: XML element.
+        name: of the attribute.
+        where: file and road, for the error.
 
     Raises:
-        DatasetError: it is not.
+        DatasetError: the attribute is missing.
     """
     value = element.get(name)
     if value is None:
@@ -54,10 +59,16 @@ def attribute(element: Element, name: str, where: str) -> str:
 
 
 def number_of(element: Element, name: str, where: str, *, missing: float | None = None) -> float:
-    """An attribute as a number; ``missing`` in its place where it is not there.
+    """Return an attribute of an element as a number.
+
+    Args:
+        element: XML element.
+        name: of the attribute.
+        where: file and road, for the error.
+        missing: value if the attribute is missing; None makes the attribute required.
 
     Raises:
-        DatasetError: it is no finite number of a sensible size, or missing without a replacement.
+        DatasetError: the attribute is missing, not finite, or too large.
     """
     if missing is not None and name not in element.attrib:
         return missing
@@ -75,10 +86,15 @@ def number_of(element: Element, name: str, where: str, *, missing: float | None 
 
 
 def read_road(element: Element, lanes: Lanes, path: Path) -> Road:
-    """Read a <road> with the ground of its lanes.
+    """Read a <road> element with the ground of its lanes.
+
+    Args:
+        element: the element.
+        lanes: which lanes form the surface.
+        path: of the file, for errors.
 
     Raises:
-        DatasetError: it lacks what its surface follows from, naming file and road.
+        DatasetError: the road lacks what defines its surface; the error names file and road.
     """
     identity = attribute(element, "id", f"{path}: road")
     where = f"{path}: road {identity}"
@@ -100,14 +116,14 @@ def read_road(element: Element, lanes: Lanes, path: Path) -> Road:
 
 
 def road_shape(road: Element, where: str) -> RoadShape:
-    """A road's plan view and lanes.
+    """Read the plan view and the lanes of a road.
 
     Args:
-        road: the element.
-        where: file and road, for messages.
+        road: the <road> element.
+        where: file and road, for errors.
 
     Raises:
-        DatasetError: no geometry, no length, a shape or lane that is not described whole.
+        DatasetError: geometry or length is missing or invalid, or a shape or lane is incomplete.
     """
     length = number_of(road, "length", where)
     if not 0 < length <= _LONGEST_ROAD_M:
@@ -168,7 +184,7 @@ def _section(element: Element, where: str) -> LaneSection:
 
 
 def _station(element: Element, where: str) -> float:
-    """Where along the road an element begins; all between is sampled, so that a mistake would fill the memory."""
+    """Length along the road at which an element begins. It is limited, because all lengths up to it are sampled."""
     s = number_of(element, "s", where)
     if not 0 <= s <= _LONGEST_ROAD_M:
         raise DatasetError(f"{where}: <{element.tag}>: s is {s:g}, not between 0 and {_LONGEST_ROAD_M:g}", field="s")

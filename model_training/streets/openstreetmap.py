@@ -1,6 +1,7 @@
-"""Streets of an OpenStreetMap file (.osm XML, or .osm.pbf): named ways for vehicles and pedestrians, as wide as their tags say.
+"""Read the streets of an OpenStreetMap file (.osm XML or .osm.pbf): named ways for vehicles and pedestrians.
 
-Names and lines are from OpenStreetMap's contributors (ODbL): who passes a map on names them.
+Their width follows from their tags. Names and lines come from OpenStreetMap's contributors (ODbL).
+Whoever distributes a map with them must credit the contributors.
 """
 
 import math
@@ -19,14 +20,15 @@ from model_training.streets.map_frame import FARTHEST_M, MapFrame
 from model_training.streets.named_street import Lanes, NamedStreet, StreetSource, in_natural_order
 from service.errors import DatasetError
 
-#: Carriageways' widths (m) by class, greatest first: at a crossing the greater street keeps the ground.
+#: Carriageway width (m) by class, most important class first: at a crossing the more important street keeps the ground.
 CLASS_WIDTHS_M = {
     "motorway": 11.0, "trunk": 10.0, "primary": 9.0, "secondary": 8.0, "tertiary": 7.0, "unclassified": 6.0, "residential": 6.0,
     "living_street": 5.0, "pedestrian": 6.0, "motorway_link": 5.0, "trunk_link": 5.0, "primary_link": 5.0, "secondary_link": 5.0,
     "tertiary_link": 5.0, "road": 6.0, "busway": 6.0, "service": 4.0,
 }  # fmt: skip
+#: Width of a lane, metres.
 LANE_M = 3.25
-#: Each side's, where ``lanes`` is "all" and the way is not tagged as without, or of a class that has none.
+#: Width of a pavement, metres. With ``lanes`` "all" each side gets one, unless the tags or the class say otherwise.
 PAVEMENT_M = 2.0
 _WITHOUT_PAVEMENT = frozenset({"motorway", "motorway_link", "trunk", "trunk_link", "pedestrian", "service"})
 _FOOT_M = 0.3048
@@ -43,13 +45,13 @@ class _Way:
 def read_openstreetmap(
     path: Path, *, frame: MapFrame, lanes: Lanes = "all", width_m: float | None = None
 ) -> StreetSource:
-    """Read the named ways of an OpenStreetMap file; ways of one ``name`` (or else ``ref``) are one street.
+    """Read the named ways of an OpenStreetMap file. Ways of one ``name``, or else one ``ref``, form one street.
 
     Args:
         path: of the file.
-        frame: the map's; OpenStreetMap is WGS-84.
+        frame: converts WGS-84 to the map frame.
         lanes: "all" adds pavements.
-        width_m: of carriageways that have neither a width nor a number of lanes; None for ``CLASS_WIDTHS_M``.
+        width_m: width of carriageways without a tagged width or number of lanes, metres; None for ``CLASS_WIDTHS_M``.
 
     Raises:
         DatasetError: the file is missing or broken, or has no named way near the map.
@@ -71,7 +73,7 @@ def read_openstreetmap(
                 left_out[read] += 1
             else:
                 of_name[_name(tags)].append(read)
-    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:  # the parser's, of text, of coordinates
+    except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:  # from the parser, text, coordinates
         raise DatasetError(
             f"{path}: not whole OpenStreetMap data: {error}; fetch the extract again", field=path.name
         ) from error
@@ -103,7 +105,7 @@ def _name(tags: Mapping[str, str]) -> str:
 def _way(
     tags: Mapping[str, str], nodes: list[tuple[float, float]], frame: MapFrame, lanes: Lanes, width_m: float | None
 ) -> _Way | str:
-    """A street's way; or why it is none."""
+    """A way of a street, or the reason why it is none."""
     kind = tags["highway"]
     if kind not in CLASS_WIDTHS_M:
         return "are of other classes (footways, paths, steps, planned ones)"
@@ -123,7 +125,7 @@ def _way(
 
 
 def _carriageway_m(tags: Mapping[str, str], width_m: float | None) -> float:
-    """By the tag width, else the number of lanes, else the default; tags that make no sense are passed over, as they are everywhere."""
+    """Width by the tag width, else by the number of lanes, else the default, metres. Invalid tags are common and are ignored."""
     tagged = _WIDTH.fullmatch(tags.get("width", "").strip())
     if tagged:
         metres = float(tagged["number"]) * (_FOOT_M if tagged["unit"] in ("ft", "'") else 1.0)

@@ -1,4 +1,4 @@
-"""Streets from above, for people."""
+"""Draw the streets from above, for people."""
 
 import unicodedata
 
@@ -11,15 +11,15 @@ from service.maps.streets import Street, Streets
 
 _LONGEST_PX = 1600
 _PAPER, _INK = (246, 249, 250), (40, 36, 33)
-_SHIFT = 4  # OpenCV's fraction bits: edges are drawn to a sixteenth of a pixel
+_SHIFT = 4  # fraction bits of OpenCV's coordinates: edges are drawn to a sixteenth of a pixel
 
 
 def picture_png(streets: Streets, places: Float64[NDArray[np.float64], "n 2"]) -> bytes:
-    """A PNG, north up: streets in colours of their own with their names, the survey's places as dots.
+    """Draw a PNG, north up: each street in its own colour with its name, the places of the survey as dots.
 
     Args:
-        streets: map metres.
-        places: where the survey's scans were taken, map metres.
+        streets: map frame, metres.
+        places: positions of the survey's scans, map frame, metres.
     """
     rings = [ring for street in streets.features for polygon in street.polygons for ring in polygon]
     everything = np.concatenate([*rings, places])
@@ -47,14 +47,14 @@ def picture_png(streets: Streets, places: Float64[NDArray[np.float64], "n 2"]) -
 
 
 def _colour(number: int) -> tuple[int, int, int]:
-    """Light colours, neighbours in the list far apart (steps of the golden angle)."""
+    """A light colour; neighbours in the list differ by steps of the golden angle."""
     hue = int(number * 137.508 / 2) % 180
     blue, green, red = cv2.cvtColor(np.array([[[hue, 90, 235]]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0].tolist()
     return blue, green, red
 
 
 def _middle(street: Street) -> Float64[NDArray[np.float64], "2"]:
-    """A point in the street's largest part: where the horizontal through the middle is inside for longest."""
+    """A point in the street's largest part: the middle of the longest inner stretch at half its height."""
     polygon = max(street.polygons, key=lambda rings: float(np.ptp(rings[0], axis=0).sum()))
     y = float(polygon[0][:, 1].min() + polygon[0][:, 1].max()) / 2 + 1e-6
     crossings = []

@@ -1,6 +1,6 @@
 """OpenDRIVE's reference line from above: lines, arcs, spirals and cubics (ASAM OpenDRIVE 1.8, chapter 9).
 
-Coordinates are OpenDRIVE's: right-handed, x east, y north, headings counter-clockwise from x.
+Coordinates are OpenDRIVE's: right-handed, x east, y north. Headings are counter-clockwise from x.
 """
 
 from dataclasses import dataclass
@@ -12,28 +12,32 @@ from numpy.typing import NDArray
 
 Along = Float64[NDArray[np.float64], "n"]
 Points = Float64[NDArray[np.float64], "n 2"]
-#: A chord of a bend of 5 m radius leaves it by 6 mm.
+#: Distance between samples, metres. In a bend of 5 m radius the chord deviates by 6 mm.
 STEP_M = 0.5
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 @dataclass(frozen=True, slots=True)
 class Bend:
-    """Line, arc or spiral: curvature grows linearly with the length.
+    """Line, arc or spiral: its curvature changes linearly with the length.
 
-    Args:
-        curvature: 1/m at the start; positive turns left.
-        growth: of the curvature, 1/m2.
+    Attributes:
+        curvature: at the start, 1/m; positive turns left.
+        growth: change of the curvature per metre, 1/m2.
     """
 
     curvature: float = 0.0
     growth: float = 0.0
 
     def at(self, s: Along) -> tuple[Points, Along]:
-        """Points (n, 2) and headings (n), radians, at lengths (m, rising) along a bend that starts at 0, 0 towards x."""
+        """Return points (n, 2), metres, and headings (n,), radians, of a bend that starts at the origin along x.
+
+        Args:
+            s: lengths from the start (n,), metres, rising.
+        """
         ends = np.union1d(np.arange(0.0, max(s[-1], STEP_M), STEP_M), s)
         half, middle = np.diff(ends) / 2, (ends[1:] + ends[:-1]) / 2
-        # Gauss-Legendre from one length to the next: exact to rounding while a step turns by less than a radian.
+        # Gauss-Legendre quadrature per step: exact to rounding if a step turns by less than a radian.
         inner = self._heading(middle[:, None] + half[:, None] * _NODES)
         steps = np.stack([np.cos(inner) @ _WEIGHTS, np.sin(inner) @ _WEIGHTS], axis=1) * half[:, None]
         points = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
@@ -45,13 +49,13 @@ class Bend:
 
 @dataclass(frozen=True, slots=True)
 class Cubic:
-    """``poly3`` and ``paramPoly3``: u and v are cubics of a parameter, found by the length along the curve.
+    """``poly3`` and ``paramPoly3``: u and v are cubics of a parameter, which follows from the length along the curve.
 
-    Args:
+    Attributes:
         u: four coefficients of u, lowest first, metres.
         v: four coefficients of v, lowest first, metres.
-        last: the parameter at the geometry's end.
-        length_m: the geometry's; None where the parameter's range is not that of the length (poly3: u has no end of its own).
+        last: parameter at the end of the geometry.
+        length_m: length of the geometry, metres; None for poly3, whose parameter does not end at a given length.
     """
 
     u: tuple[float, float, float, float]
@@ -60,12 +64,16 @@ class Cubic:
     length_m: float | None
 
     def at(self, s: Along) -> tuple[Points, Along]:
-        """Points (n, 2) and headings (n), radians, at lengths (m, rising) along the curve from its start."""
+        """Return points (n, 2), metres, and headings (n,), radians, in the frame of the curve's start.
+
+        Args:
+            s: lengths from the start (n,), metres, rising.
+        """
         p = np.linspace(0.0, self.last, max(200, int(20 * (self.length_m or self.last))))
         slopes = np.stack([_derivative(self.u, p), _derivative(self.v, p)])
         speed = np.hypot(*slopes)
         travelled = np.r_[0.0, np.cumsum((speed[1:] + speed[:-1]) / 2 * np.diff(p))]
-        if self.length_m is not None:  # the writer's length is rounded; the curve still ends where its parameter does
+        if self.length_m is not None:  # the file's length is rounded; the curve ends at its last parameter
             s = s * (travelled[-1] / self.length_m)
         at = np.interp(s, travelled, p)
         points: Points = np.stack([np.polynomial.polynomial.polyval(at, c) for c in (self.u, self.v)], axis=1)
@@ -74,7 +82,16 @@ class Cubic:
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """A piece of a reference line: where it starts (s, x, y in metres, heading in radians), its length and its shape."""
+    """A piece of a reference line.
+
+    Attributes:
+        s: length of the road at its start, metres.
+        x: of its start, metres.
+        y: of its start, metres.
+        heading_rad: at its start, radians.
+        length_m: of the piece, metres.
+        shape: in the frame of its start.
+    """
 
     s: float
     x: float
@@ -85,7 +102,12 @@ class Geometry:
 
 
 def reference_line(geometries: tuple[Geometry, ...], s: Along) -> tuple[Points, Along]:
-    """Points (n, 2), metres, and headings (n), radians, of a reference line at lengths ``s`` (rising, metres)."""
+    """Return points (n, 2), metres, and headings (n,), radians, of a reference line.
+
+    Args:
+        geometries: pieces of the line, in order.
+        s: lengths along the line (n,), metres, rising.
+    """
     points, headings = np.empty((len(s), 2)), np.empty(len(s))
     piece = np.searchsorted([g.s for g in geometries], s, side="right") - 1
     for number, geometry in enumerate(geometries):
@@ -106,7 +128,14 @@ def polynomial_shape(
     length_m: float,
     p_range: Literal["normalized", "arcLength"] | None,
 ) -> Cubic:
-    """``paramPoly3`` by its pRange, or ``poly3`` where that is None (``u`` is then the parameter itself)."""
+    """Make a ``paramPoly3`` from its pRange, or a ``poly3``.
+
+    Args:
+        u: four coefficients of u, lowest first, metres.
+        v: four coefficients of v, lowest first, metres.
+        length_m: length of the geometry, metres.
+        p_range: pRange of a paramPoly3; None for poly3, where ``u`` is the parameter itself.
+    """
     if p_range is None:
         return Cubic(u, v, last=length_m, length_m=None)
     return Cubic(u, v, last=1.0 if p_range == "normalized" else length_m, length_m=length_m)

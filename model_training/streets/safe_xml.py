@@ -1,4 +1,4 @@
-"""XML of unknown origin: no document types, no entities, nothing fetched, a limit of size."""
+"""Read XML of unknown origin: no document types, no entities, no downloads, limited size."""
 
 from pathlib import Path
 from typing import NoReturn
@@ -7,20 +7,20 @@ from xml.parsers import expat
 
 from service.errors import DatasetError
 
-#: CARLA's largest town has 70 MB.
+#: Largest file that is read. CARLA's largest town has 70 MB.
 LARGEST_BYTES = 256 * 2**20
 
 
 def read_xml(path: Path, *, root: str, largest_bytes: int = LARGEST_BYTES) -> Element:
-    """Read a file's tree.
+    """Read the element tree of a file.
 
     Args:
         path: of the file.
         root: name of its outermost element.
-        largest_bytes: what is larger is not read.
+        largest_bytes: a larger file is refused.
 
     Raises:
-        DatasetError: the file is missing, too large, no XML, cut off, or has a document type.
+        DatasetError: the file is missing, too large, no XML, incomplete, has another root, or has a document type.
     """
     builder = TreeBuilder()
     parser = expat.ParserCreate()

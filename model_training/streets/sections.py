@@ -1,4 +1,4 @@
-"""Streets cut by length: into beginning and end, or into numbered sections."""
+"""Cut streets by length: into beginning and end, or into numbered sections."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -16,21 +16,21 @@ from service.errors import DatasetError
 Cut = Literal["ends", "numbered"]
 _STEP_M = 1.0
 _MOST = 1000
-#: Beyond as many points a stretch is sampled more coarsely, at its ends as finely as ever.
+#: Greatest number of samples per section. Longer sections are sampled more coarsely, except at their ends.
 _MOST_POINTS = 5000
 
 
 def in_sections(streets: Iterable[NamedStreet], *, length_m: float, cut: Cut = "ends") -> tuple[NamedStreet, ...]:
-    """Cut every street that is longer than ``length_m`` along its axis; junctions and sections stay whole.
+    """Cut every street that is longer than ``length_m`` along its axis. Junctions and sections stay whole.
 
     Args:
-        streets: metres.
-        length_m: of a section, above 0.
-        cut: "ends": its first metres are the beginning and its last the end; what lies between keeps the street's name,
-            and a street of less than two lengths is halved. "numbered": as few equal sections as are no longer than that.
+        streets: map frame, metres.
+        length_m: length of a section, metres, above 0.
+        cut: "ends": the first ``length_m`` are the beginning, the last are the end, and the rest keeps the street's name. A
+            street of up to two lengths is halved. "numbered": the fewest equal sections that are not longer.
 
     Raises:
-        DatasetError: a street would be cut into more than a thousand.
+        DatasetError: a street would be cut into more than a thousand sections.
     """
     return tuple(section for street in streets for section in _cut(street, length_m, cut))
 
@@ -70,10 +70,10 @@ def _cut(street: NamedStreet, length_m: float, cut: Cut) -> list[NamedStreet]:
 
 
 def _divided(surface: BaseGeometry, axis: shapely.LineString, bounds: NDArray[np.float64]) -> list[BaseGeometry]:
-    """A surface by which stretch of the axis lies nearest: all of it, nothing twice, cut at right angles to the axis."""
+    """Divide a surface by the nearest section of the axis. The parts cover all of it, do not overlap, and meet at right angles."""
     near, far = bounds[:-1], bounds[1:]
     half = min(_STEP_M, float((far - near).min())) / 2
-    # The last point before a bound and the first after it are as far from it, so the line between their cells is the cut.
+    # The samples before and after a bound are equally far from it. So their cells meet exactly at the cut.
     lengths = [
         np.linspace(a + half, b - half, int(np.clip(np.ceil((b - a) / _STEP_M), 2, _MOST_POINTS)))
         for a, b in zip(near, far, strict=True)

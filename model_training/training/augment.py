@@ -1,7 +1,8 @@
-"""What sensors do to a clean view, drawn anew for every pair: noise, gaps, blocked parts, cut rows and columns.
+"""Simulate the errors of sensors on clean views: noise, gaps, blocked parts, cut rows and columns.
 
-All works on batches on the view grid. The presets that bars are measured with (``simulation.depth_noise``) act on whole
-pictures with other code and other seeds; here only the kinds of error are the same, over wider ranges.
+Every pair gets new errors each time. All functions work on batches on the view grid.
+The presets of the evaluation (``simulation.depth_noise``) act on whole images, with other code and other seeds.
+Only the kinds of error are the same here. The ranges of the parameters are wider.
 """
 
 import torch
@@ -12,11 +13,34 @@ from torch.nn import functional
 from service.imaging.brightness import FLOOR, LEAST_SPREAD, LIMIT
 from service.imaging.view_grid import PLANES, ViewGrid
 
+#: Focal length times baseline of the simulated stereo camera, pixels times metres.
 FOCAL_BASELINE_PX_M = 80.0
 
 
 class Augmentation(BaseModel):
-    """Shares are probabilities a view; metres, pixels of disparity at 80 px m."""
+    """Settings of the augmentation.
+
+    Attributes:
+        disparity_noise_px: least and greatest standard deviation of the disparity, pixels at 80 px m; drawn log-uniformly.
+        scale_error: greatest relative error of the depth scale.
+        invented_depth: probability per view of a region with false depth where nothing was measured.
+        short_range: probability per view that depth ends before the grid's greatest range.
+        shortest_range_m: least such range, metres (z).
+        no_colour: probability per view without colour planes.
+        narrow_rows: probability per view of hidden rows at the top, and again at the bottom.
+        narrow_columns: probability per view of hidden columns at both sides.
+        blocked: probability per view of a vehicle that hides up to ``widest_block`` of the columns.
+        widest_block: share of the columns.
+        small_blocks: probability per view of a vehicle that hides 3 % to 20 % of the columns.
+        unseen_top_rows: probability per view that the survey sensor misses the top 8 to 16 rows.
+        survey_noise_m: standard deviation of LiDAR ranges, metres.
+        survey_dropout: greatest share of LiDAR cells that are lost.
+        no_intensity: probability per survey view without brightness.
+        intensity_gain: strength of the smooth and the independent error of the LiDAR intensity, natural logarithm.
+        no_brightness: probability per query view without brightness.
+        shading: strength of the smooth and the independent error of the image's grey level, natural logarithm.
+        height_error_m: standard deviation of the camera's height, metres.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -42,7 +66,16 @@ class Augmentation(BaseModel):
 
 
 class Augmenter:
-    """Draws errors for batches of views; all its chance comes from one generator."""
+    """Draw errors for batches of views.
+
+    All random numbers come from one generator.
+
+    Args:
+        settings: probabilities and sizes of the errors.
+        grid: the view grid.
+        generator: source of all random numbers; on ``device``.
+        device: device of all tensors.
+    """
 
     def __init__(
         self, settings: Augmentation, grid: ViewGrid, generator: torch.Generator, device: torch.device
@@ -50,7 +83,7 @@ class Augmenter:
         self.settings, self.grid, self._generator, self.device = settings, grid, generator, device
         self.elevation = torch.tensor(grid.elevations_rad, dtype=torch.float32, device=device)[:, None]
         self.azimuth = torch.tensor(grid.azimuths_rad.copy(), dtype=torch.float32, device=device)[None, :]
-        # z of the optical axis for each metre of range, of a level camera
+        # z along the optical axis per metre of range, for a level camera.
         self.z_of_range = torch.cos(self.elevation) * torch.cos(self.azimuth)
 
     def _uniform(self, *shape: int) -> Tensor:
@@ -68,18 +101,36 @@ class Augmenter:
         return functional.interpolate(coarse, size=size, mode="bilinear", align_corners=False)[:, 0]
 
     def cut_rows(self, rows_seen: Tensor, count: int) -> Tensor:
-        """Rows (B, rows, 1) that the survey covers: the sensor's, and sometimes fewer at the top."""
+        """Return which rows the survey covers; in some views rows at the top are missing too.
+
+        Args:
+            rows_seen: rows that the LiDAR covers (rows).
+            count: number of views, B.
+
+        Returns:
+            Boolean mask (B, rows, 1).
+        """
         row = torch.arange(self.grid.rows, device=self.device)[None, :, None]
         top = (self._uniform(count, 1, 1) * 9 + 8).floor() * self._chance(count, self.settings.unseen_top_rows)
         return rows_seen.reshape(1, -1, 1) & (row >= top)
 
     def survey(self, ranges: Tensor, intensity: Tensor, height_m: Tensor, rows_seen: Tensor) -> Tensor:
-        """Planes (B, 6, rows, columns) of LiDAR views (B, rows, columns): metres and 0..1."""
+        """Return the planes of LiDAR views with errors.
+
+        Args:
+            ranges: clean ranges (B, rows, columns), metres; 0 where nothing was measured.
+            intensity: LiDAR intensity (B, rows, columns), 0..1.
+            height_m: height of the LiDAR above the ground (B), metres.
+            rows_seen: rows that the survey covers (B, rows, 1).
+
+        Returns:
+            Planes (B, 6, rows, columns) in the order of ``service.imaging.view_grid.PLANES``.
+        """
         s, count = self.settings, len(ranges)
         noisy = ranges + self._normal(*ranges.shape) * s.survey_noise_m
         lost = self._uniform(*ranges.shape) < s.survey_dropout * self._uniform(count, 1, 1)
         keep = (ranges > 0) & ~lost & rows_seen & (noisy < self.grid.max_range_m)
-        # Sensors differ in how they make up for distance and angle, and some give no intensity at all.
+        # Sensors compensate intensity for distance and angle in different ways. Some give no intensity at all.
         wrong = torch.exp(s.intensity_gain * (self._field(count, 3, 8) + 0.5 * self._normal(*ranges.shape)))
         known = ~self._chance(count, s.no_intensity)
         bright = brightness(intensity * wrong, measured=keep, seen=keep & known)
@@ -88,14 +139,18 @@ class Augmenter:
     def query(
         self, ranges: Tensor, rgb: Tensor, height_m: Tensor, rows_seen: Tensor, *, seen: Tensor | None = None
     ) -> Tensor:
-        """Planes (B, 6, rows, columns) of query views (B, rows, columns) with colour (B, 3, rows, columns) 0..255.
+        """Return the planes of query views with errors.
 
         Args:
-            ranges: metres; clean, but where ``seen`` is given.
-            rgb: sRGB.
-            height_m: of the cameras above the ground (B).
-            rows_seen: rows that the survey covers.
-            seen: cells that the camera looks at (B, rows, columns), of depth that has its errors already: none are drawn.
+            ranges: ranges (B, rows, columns), metres; 0 where nothing was measured. They are clean unless ``seen`` is given.
+            rgb: sRGB (B, 3, rows, columns), 0..255.
+            height_m: height of the cameras above the ground (B), metres.
+            rows_seen: rows that the survey covers (B, rows, 1).
+            seen: cells that the camera looks at (B, rows, columns). Give it if the depth already has errors from stereo
+                matching. Then no stereo errors are drawn.
+
+        Returns:
+            Planes (B, 6, rows, columns) in the order of ``service.imaging.view_grid.PLANES``.
         """
         s, count = self.settings, len(ranges)
         blocked = ranges
@@ -119,7 +174,7 @@ class Augmenter:
         height = height_m + self._normal(count) * s.height_error_m
         light = torch.exp(s.shading * (self._field(count, 3, 6) + 0.3 * self._normal(*ranges.shape)))
         grey = (rgb.mean(dim=1) * light).clamp(max=255.0)
-        # A vehicle in the way has a brightness of its own.
+        # The vehicle in front has another brightness than the surface behind.
         hidden = blocked != ranges
         paint = (
             15.0 * torch.exp(2.6 * self._uniform(count, 1, 1)) * (1 + 0.1 * self._normal(*ranges.shape)).clamp(min=0.1)
@@ -130,7 +185,7 @@ class Augmenter:
         return self._planes(torch.where(keep, distance, 0.0), height, observed, self._colour(rgb), bright)
 
     def _stereo(self, z: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
-        """Disparity noise, partly correlated; bleeding edges; made-up depth where there is none; holes; a wrong scale."""
+        """Add stereo errors: correlated noise, bleeding edges, false depth in gaps, holes and a scale error."""
         s, count = self.settings, len(z)
         z = z * (1 + (self._uniform(count, 1, 1) * 2 - 1) * s.scale_error)
         low, high = (torch.log(torch.tensor(v)) for v in s.disparity_noise_px)
@@ -157,7 +212,7 @@ class Augmenter:
         return seen, measured
 
     def _block(self, ranges: Tensor, height_m: Tensor, happens: Tensor, narrowest: float, widest: float) -> Tensor:
-        """A vehicle's side: an upright plane 2.5 to 8.5 m away over a share of the columns, its top 1.3 to 4 m high."""
+        """Add the side of a vehicle: an upright plane at 2.5 to 8.5 m, 1.3 to 4 m high, over a share of the columns."""
         rows = happens.reshape(-1).nonzero()[:, 0]
         count, behind = len(rows), ranges[rows]
         width = (narrowest + (widest - narrowest) * self._uniform(count, 1, 1)) * self.grid.columns
@@ -174,7 +229,7 @@ class Augmenter:
         return ranges.index_copy(0, rows, torch.where(hides, plane, behind))
 
     def _field_of_view(self, count: int) -> Tensor:
-        """Cells (B, rows, columns) that the camera looks at: narrower cameras, cut borders."""
+        """Cells (B, rows, columns) that the camera sees: some cameras are narrower, some borders are cut."""
         s = self.settings
         row = torch.arange(self.grid.rows, device=self.device)[None, :, None]
         column = torch.arange(self.grid.columns, device=self.device)[None, None, :]
@@ -188,7 +243,10 @@ class Augmenter:
         return (row >= top) & (row < self.grid.rows - bottom) & (column >= left) & (column < self.grid.columns - right)
 
     def _colour(self, rgb: Tensor) -> Tensor:
-        """V1, V2 (B, 2, rows, columns) in grey levels (eq. 9): other white balance and saturation, noise, often none."""
+        """V1 and V2 (B, 2, rows, columns) in grey levels (eq. 9), with errors of white balance and saturation, and noise.
+
+        Many views get no colour: both planes are 0.
+        """
         known = (self._uniform(len(rgb)) > self.settings.no_colour).nonzero()[:, 0]
         count = len(known)
         balance = 1 + 0.12 * self._normal(count, 3, 1, 1)
@@ -210,7 +268,13 @@ class Augmenter:
 
 
 def least_of_nine(values: Tensor) -> Tensor:
-    """The least of each cell and its eight neighbours, (B, rows, columns); two passes of shifts take a fifth of a pooling's time."""
+    """Return the minimum of each cell and its eight neighbours.
+
+    Two passes of shifts take a fifth of the time of a pooling layer.
+
+    Args:
+        values: (B, rows, columns).
+    """
     for axis in (1, 2):
         ahead, behind = values.narrow(axis, 1, values.shape[axis] - 1), values.narrow(axis, 0, values.shape[axis] - 1)
         least = values.clone()
@@ -222,7 +286,16 @@ def least_of_nine(values: Tensor) -> Tensor:
 
 
 def brightness(values: Tensor, *, measured: Tensor, seen: Tensor) -> Tensor:
-    """``service.imaging.brightness`` of a batch (B, rows, columns): in spreads about each view's mean."""
+    """Return ``service.imaging.brightness`` of a batch: standard deviations from the mean of each view.
+
+    Args:
+        values: grey level or intensity (B, rows, columns).
+        measured: cells that define mean and standard deviation (B, rows, columns).
+        seen: cells that get a value (B, rows, columns); the others become 0.
+
+    Returns:
+        Brightness (B, rows, columns), clamped to +-``LIMIT``; 0 in views with too little contrast.
+    """
     weight = measured.to(values.dtype)
     count = weight.sum(dim=(1, 2), keepdim=True).clamp(min=1)
 

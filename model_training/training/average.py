@@ -1,7 +1,9 @@
-"""The mean of two runs' weights: keeps what the first knew beyond the second's data (Wortsman et al., CVPR 2022).
+"""Average the weights of two training runs (Wortsman et al., CVPR 2022).
 
-Both must lie in one basin, as a run and the one that started from it do. Batch normalisation's statistics belong to
-neither mean, so they are taken anew over augmented training batches (Izmailov et al., UAI 2018).
+The mean keeps what the first run learnt beyond the data of the second run.
+Both runs must lie in one basin of the loss. That holds for a run and a run that started from it.
+The statistics of batch normalisation fit neither run after averaging.
+They are computed again over augmented training batches (Izmailov et al., UAI 2018).
 """
 
 import json
@@ -16,6 +18,7 @@ from model_training.training.encoder_net import EncoderNet
 from model_training.training.loop import TrainingConfig, load_run, read_checkpoint, read_config, read_packs
 from service.errors import DatasetError
 
+#: Batches that set the statistics of batch normalisation.
 BATCHES = 150
 
 
@@ -26,17 +29,17 @@ def average(
     """Write a run whose weights are ``(1 - share) * first + share * second``.
 
     Args:
-        first: folder of the run that the second one started from.
+        first: folder of the run that the second run started from.
         second: folder of the later run.
-        packs: training cities for the statistics of batch normalisation.
-        run: folder to write; holds ``config.json`` (the second run's), ``checkpoint.pt`` and ``packs.json``.
-        share: of the second run, 0..1.
-        seed: of the batches.
-        batches: how many.
-        report: called with the number of batches seen.
+        packs: folders of the training cities that set the statistics of batch normalisation.
+        run: folder to write. It holds ``config.json`` (of the second run), ``checkpoint.pt`` and ``packs.json``.
+        share: weight of the second run, 0..1.
+        seed: seed of the batches.
+        batches: number of batches.
+        report: called with the number of batches done.
 
     Raises:
-        DatasetError: a folder holds no run, the encoders' shapes differ, or ``run`` is there already.
+        DatasetError: a folder holds no run, the shapes of the encoders differ, or ``run`` already exists.
     """
     if (run / "checkpoint.pt").exists():
         raise DatasetError(f"{run} holds a run already; take another --run folder, or remove it", field="run")
@@ -65,11 +68,11 @@ def average(
 def _renew_statistics(
     net: EncoderNet, packs: list[Path], config: TrainingConfig, seed: int, batches: int, report: Callable[[int], None]
 ) -> None:
-    """Means and variances of batch normalisation as plain averages over ``batches`` augmented batches."""
+    """Set mean and variance of batch normalisation to plain averages over ``batches`` augmented batches."""
     norms = [module for module in net.modules() if isinstance(module, torch.nn.BatchNorm2d)]
     for norm in norms:
         norm.reset_running_stats()
-        norm.momentum = None  # a plain average
+        norm.momentum = None  # torch then computes a plain average
     net.train()
     with torch.no_grad():
         for step, (planes, queries) in enumerate(islice(augmented_batches(packs, config, seed=seed), batches), 1):

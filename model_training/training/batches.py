@@ -1,4 +1,4 @@
-"""Batches of pairs, all of one city; the caller may ask for some of them, so that negatives are hard."""
+"""Draw batches of pairs of one city. The caller may choose some pairs, to get hard negatives."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +13,27 @@ from model_training.training.packs import Pack
 from service.errors import DatasetError
 from service.imaging.view_grid import ViewGrid
 
+#: Greatest distance of a query from the place that it is paired with, metres.
 PAIR_REACH_M = 2.5
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Clean views of pairs: tensors (B, rows, columns), colour (B, 3, rows, columns), heights and positions (m).
+    """Clean views of B pairs.
 
-    ``survey_intensity`` is 0..1; ``query_seen`` (B, rows, columns) are cells that the camera looks at, where depth comes from matching
-    and has its errors already, else None.
+    Attributes:
+        survey_ranges: (B, rows, columns), metres.
+        survey_intensity: (B, rows, columns), 0..1.
+        survey_height_m: LiDAR height above the ground (B), metres.
+        query_ranges: (B, rows, columns), metres.
+        query_rgb: sRGB (B, 3, rows, columns), 0..255.
+        query_height_m: camera height above the ground (B), metres.
+        rows_seen: rows that the LiDAR covers (rows).
+        survey_xy: position of the places (B, 2), map frame, metres.
+        query_xy: position of the queries (B, 2), map frame, metres.
+        pairs: number of each query in its pack (B).
+        query_seen: cells that the camera looks at (B, rows, columns), if depth comes from stereo matching and already has
+            errors; otherwise None.
     """
 
     survey_ranges: Tensor
@@ -38,15 +50,21 @@ class Batch:
 
     @property
     def images(self) -> int:
-        """Branches of pairs in the batch."""
+        """Number of views in the batch: two per pair."""
         return 2 * len(self.query_xy)
 
 
 def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: int) -> "list[City]":
-    """Open packs, each of which must fill a batch of ``pairs`` pairs.
+    """Open packs. Each pack must fill a batch.
+
+    Args:
+        folders: the packs.
+        grid: the view grid.
+        turn_deg: greatest rotation between a query and its map view, degrees.
+        pairs: pairs per batch.
 
     Raises:
-        DatasetError: a pack is damaged, or has too few queries that lie near a place.
+        DatasetError: a pack is damaged, or has too few queries near a place.
     """
     cities = []
     for folder in folders:
@@ -62,7 +80,13 @@ def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: 
 
 
 class City:
-    """One pack with what sampling needs: which places lie near each query; views are turned by up to ``turn_deg``."""
+    """One pack, with the places near each query.
+
+    Args:
+        pack: the city's views.
+        grid: the view grid.
+        turn_deg: greatest rotation between a query and its map view, degrees.
+    """
 
     def __init__(self, pack: Pack, grid: ViewGrid, *, turn_deg: float) -> None:
         self.pack, self._grid, self._turn_rad = pack, grid, np.deg2rad(turn_deg)
@@ -71,7 +95,13 @@ class City:
         self.usable = np.array([k for k, near in enumerate(self._places_near) if near])
 
     def draw(self, pairs: int, rng: np.random.Generator, wanted: NDArray[np.int64] | None = None) -> Batch:
-        """Draw a batch of up to ``pairs`` pairs: ``wanted`` (queries that are usable) and others by chance."""
+        """Draw a batch of up to ``pairs`` pairs.
+
+        Args:
+            pairs: greatest number of pairs; a pair that is chosen twice counts once.
+            rng: source of random numbers.
+            wanted: numbers of usable queries that the batch must hold (N,); the rest is random.
+        """
         pack, grid = self.pack, self._grid
         first = np.zeros(0, np.int64) if wanted is None else wanted[:pairs]
         others = rng.choice(self.usable, pairs - len(first), replace=False)

@@ -1,4 +1,4 @@
-"""Augmented batches for other ends than a step of training."""
+"""Augmented batches for other purposes than a training step."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +14,16 @@ from service.imaging.view_grid import ViewGrid
 
 
 def augmented_batches(packs: list[Path], config: TrainingConfig, *, seed: int) -> Iterator[tuple[Tensor, int]]:
-    """For ever: planes (B, 6, rows, columns) of a city drawn by chance, and how many of them, the first, are queries."""
+    """Yield augmented batches of random cities without end.
+
+    Args:
+        packs: folders of the training cities.
+        config: augmentation, pairs per batch and grid size.
+        seed: seed of all random numbers.
+
+    Yields:
+        Planes (B, 6, rows, columns), and the number of query views. The query views come first.
+    """
     grid = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns)
     rng, place = np.random.default_rng(seed), torch.device("cpu")
     augment = Augmenter(config.augmentation, grid, torch.Generator().manual_seed(seed), place)

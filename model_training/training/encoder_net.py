@@ -1,14 +1,15 @@
-"""The CNN: twelve layers with learned weights, one encoder for both sides.
+"""The encoder: a CNN with twelve layers of learned weights, one network for queries and survey views.
 
-conv1 reads the planes of a view (``service.imaging.view_grid.PLANES``) after a fixed normalisation; its input channels
-are doubled, so each side has filters of its own there, and all that follows is shared. conv11 narrows the channels and
-the last layer, fully connected, keeps *where* things are: it reads the flattened map, not an average.
+conv1 reads the planes of a view (``service.imaging.view_grid.PLANES``) after a fixed normalisation.
+Its input channels are doubled: queries and survey views have their own filters there. All later layers are shared.
+conv11 reduces the channels. The last layer is fully connected and reads the flattened map, not an average.
+So it keeps *where* things are.
 
    1 conv 3x3 /2   2 conv 3x3 /2   3-4 conv 3x3 (+)   5-6 conv 3x3 (+)   7 conv 3x3 /2   8-9 conv 3x3 (+)
   10 conv 3x3 /(2,1)   11 conv 1x1   12 fully connected -> unit vector            (+) with a shortcut around the pair
 
-Most of the work is done on a quarter of the grid and below: for the same time a step it holds twice the weights of a trunk
-that lingers at half the grid, and learns faster (decision log).
+Most layers work on a quarter of the grid or less. For the same time per step this network holds twice the weights of
+a trunk on half of the grid. It also learns faster (decision log).
 """
 
 from typing import cast
@@ -20,13 +21,24 @@ from torch.nn import functional
 
 from service.imaging.view_grid import PLANES
 
+#: Layers with learned weights.
 LAYERS = 12
-VIEWS_AT_ONCE = 16  # normalised together on a processor: their planes stay in its cache
-CHANNELS = 7  # log range, measured, height, observed, V1, V2, brightness
+#: Views that are normalised together on a CPU: their planes stay in its cache.
+VIEWS_AT_ONCE = 16
+#: Input channels: log range, measured, height, observed, V1, V2, brightness.
+CHANNELS = 7
 
 
 class EncoderShape(BaseModel):
-    """Widths of the encoder; the defaults are the stock encoder's."""
+    """Sizes of the encoder. The defaults are those of the stock encoder.
+
+    Attributes:
+        rows: rows of the view grid.
+        columns: columns of a view.
+        widths: channels of conv1, conv2 to conv6, conv7 to conv9, and conv10.
+        narrow: channels of conv11.
+        descriptor: length of the descriptor, D.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -38,7 +50,11 @@ class EncoderShape(BaseModel):
 
 
 class EncoderNet(nn.Module):
-    """Planes of either side into unit descriptors."""
+    """Encode the planes of queries and survey views as unit descriptors.
+
+    Args:
+        shape: sizes of the layers.
+    """
 
     def __init__(self, shape: EncoderShape) -> None:
         super().__init__()
@@ -56,13 +72,31 @@ class EncoderNet(nn.Module):
         self.full12 = nn.Linear(shape.narrow * cells, shape.descriptor)
 
     def forward(self, planes: Tensor, side: Tensor) -> Tensor:
-        """Descriptors (B, D) of planes (B, 6, rows, columns); ``side`` (B) is 0 for survey views, 1 for queries."""
+        """Compute descriptors of views.
+
+        Args:
+            planes: (B, 6, rows, columns).
+            side: 0 for survey views, 1 for queries (B).
+
+        Returns:
+            Unit descriptors (B, D).
+        """
         x = normalised(planes)
         query = side.reshape(-1, 1, 1, 1)
         return self._after_conv1(self.conv1(torch.cat([x * (1 - query), x * query], dim=1)))
 
     def of_both(self, planes: Tensor, queries: int) -> Tensor:
-        """What ``forward`` gives for a batch whose first ``queries`` rows are queries; without the zeros of the side that is not asked."""
+        """Compute the same descriptors as ``forward`` for a batch in which the queries come first.
+
+        It is faster: conv1 does not multiply the zeros of the other side.
+
+        Args:
+            planes: (B, 6, rows, columns).
+            queries: number of query views at the start of the batch.
+
+        Returns:
+            Unit descriptors (B, D).
+        """
         x = _normalised_in_parts(planes)
         convolution, norm, activation = self.conv1
         weight = cast("Tensor", convolution.weight)
@@ -79,12 +113,21 @@ class EncoderNet(nn.Module):
         x = self.conv7(x)
         x = x + self.conv9(self.conv8(x))
         x = functional.relu(self.conv11(self.conv10(x)))
-        # Rows first whatever the memory format, so that torch and ONNX flatten alike.
+        # flatten follows the logical order, not the memory format. So torch and ONNX agree.
         return functional.normalize(self.full12(x.flatten(1)), dim=1)
 
 
 def normalised(planes: Tensor) -> Tensor:
-    """Metres and grey levels into numbers near one, in the graph itself, so that no caller can forget it."""
+    """Scale metres and grey levels to numbers near one.
+
+    This is part of the exported graph, so no caller can forget it.
+
+    Args:
+        planes: (B, 6, rows, columns).
+
+    Returns:
+        Channels (B, 7, rows, columns).
+    """
     distance, v1, v2, height, observed, brightness = (planes[:, k : k + 1] for k in range(len(PLANES)))
     measured = (distance > 0).to(planes.dtype)
     return torch.cat(
@@ -102,7 +145,7 @@ def normalised(planes: Tensor) -> Tensor:
 
 
 def _normalised_in_parts(planes: Tensor) -> Tensor:
-    """``normalised`` for training: a few views at a time, into the layout and the precision that the first layer reads."""
+    """Apply ``normalised`` to a few views at a time, in the memory layout and precision of the first layer."""
     size = VIEWS_AT_ONCE if planes.device.type == "cpu" else len(planes)
     kind = (
         torch.get_autocast_dtype(planes.device.type) if torch.is_autocast_enabled(planes.device.type) else planes.dtype

@@ -1,4 +1,4 @@
-"""Export to ONNX: one file, dynamic batch, normalisation inside, checked against torch."""
+"""Export an encoder to ONNX: one file, dynamic batch size, normalisation inside, checked against torch."""
 
 import io
 from pathlib import Path
@@ -12,22 +12,23 @@ from service.errors import EncoderError
 from service.imaging.view_grid import PLANES
 from service.localization.encoder import Encoder
 
+#: Greatest difference of a descriptor's component between torch and ONNX Runtime.
 TOLERANCE = 1e-4
 
 
 def export(net: EncoderNet, out: Path, *, trained_on: tuple[str, ...] = ()) -> float:
-    """Write an encoder as ONNX and prove that it says the same.
+    """Write an encoder as ONNX, and check that it gives the same descriptors.
 
     Args:
-        net: in evaluation mode or not; it is left in evaluation mode.
-        out: file to write, renamed when whole.
-        trained_on: cities of the training set, kept in the file so that an evaluation can name its split.
+        net: the encoder; left in evaluation mode.
+        out: file to write; renamed when it is complete.
+        trained_on: cities of the training set. They are kept in the file, so that an evaluation can name its split.
 
     Returns:
-        The largest difference of a descriptor's component between torch and ONNX Runtime.
+        The greatest difference of a descriptor's component between torch and ONNX Runtime.
 
     Raises:
-        EncoderError: the two differ by more than ``TOLERANCE``.
+        EncoderError: that difference exceeds ``TOLERANCE``; nothing is written.
     """
     net.eval()
     shape = net.shape
@@ -54,7 +55,7 @@ def export(net: EncoderNet, out: Path, *, trained_on: tuple[str, ...] = ()) -> f
 
 
 def _difference(net: EncoderNet, encoder: Encoder) -> float:
-    """Over views with gaps, of both sides, in a batch of another size than the traced one."""
+    """Greatest difference over views with gaps, of both sides, in a batch of another size than the traced one."""
     rng = np.random.default_rng(0)
     planes = rng.uniform(0, 40, (7, len(PLANES), net.shape.rows, net.shape.columns)).astype(np.float32)
     planes[:, 0] *= rng.random(planes[:, 0].shape) > 0.3

@@ -1,8 +1,9 @@
-"""The network of an exported encoder, to train on: an encoder in a map bundle or in the package has no checkpoint.
+"""Rebuild the trainable network from an exported encoder.
 
-Export folds batch normalisation into the convolutions, and eight bits round their weights. Here each convolution takes the folded
-weights, and the statistics of its normalisation are set from views so that the layer says the same as the exported one, in training
-mode as in evaluation mode.
+An encoder in a map bundle or in the package has no checkpoint.
+Export folds batch normalisation into the convolutions. Eight-bit quantisation rounds their weights.
+Here each convolution takes the folded weights. The statistics of its normalisation are set from views.
+Then the layer gives the same output as the exported layer, in training mode and in evaluation mode.
 """
 
 from pathlib import Path
@@ -26,8 +27,8 @@ def net_of(encoder: Path, shape: EncoderShape, planes: Tensor, side: Tensor) -> 
 
     Args:
         encoder: ONNX file.
-        shape: that it must have.
-        planes: views (B, 6, rows, columns) that the statistics of batch normalisation are taken over; several hundred of both sides.
+        shape: shape that the encoder must have.
+        planes: views (B, 6, rows, columns) that set the statistics of batch normalisation; several hundred of both sides.
         side: 0 for survey views, 1 for queries (B).
 
     Raises:
@@ -50,7 +51,7 @@ def net_of(encoder: Path, shape: EncoderShape, planes: Tensor, side: Tensor) -> 
             biases[module] = torch.from_numpy(bias)
     hooks = [_norm(block).register_forward_pre_hook(_matching(biases[block[0]])) for block in blocks]
     net.eval()
-    with torch.no_grad():  # front to back: a layer's statistics are set before the next one's input is computed
+    with torch.no_grad():  # the hooks run front to back: each layer is set before the next one gets its input
         net(planes, side)
     for hook in hooks:
         hook.remove()
@@ -58,14 +59,21 @@ def net_of(encoder: Path, shape: EncoderShape, planes: Tensor, side: Tensor) -> 
 
 
 def require_shape(encoder: Path, shape: EncoderShape) -> list[tuple[Floats, Floats]]:
-    """Weight and bias of every layer of an encoder.
+    """Read weight and bias of every layer, and check the encoder's shape.
+
+    Args:
+        encoder: ONNX file.
+        shape: shape that the encoder must have.
+
+    Returns:
+        Weight and bias of the twelve layers, in order.
 
     Raises:
         EncoderError: the file is no encoder of this architecture and shape.
     """
     try:
         opened = Encoder.open(encoder)
-    except EncoderError as error:  # its text need not name the file
+    except EncoderError as error:  # its text may not name the file
         raise EncoderError(f"{encoder}: {error}", field="encoder") from error
     layers = _layers(encoder)
     found = _shape(opened, layers, encoder)
@@ -78,7 +86,7 @@ def require_shape(encoder: Path, shape: EncoderShape) -> list[tuple[Floats, Floa
 
 
 def _matching(bias: Tensor):  # type: ignore[no-untyped-def]  # torch's hook type is private
-    """A hook that sets a normalisation so that it adds ``bias`` to its input and changes nothing else."""
+    """Make a hook that sets a normalisation so that it only adds ``bias`` to its input."""
 
     def hook(norm: nn.BatchNorm2d, inputs: tuple[Tensor]) -> None:
         mean, variance = inputs[0].mean(dim=(0, 2, 3)), inputs[0].var(dim=(0, 2, 3))
@@ -103,7 +111,7 @@ def _norm(block: nn.Sequential) -> nn.BatchNorm2d:
 
 
 def _layers(encoder: Path) -> list[tuple[Floats, Floats]]:
-    """Weight and bias of every layer with weights, in their order, as float32."""
+    """Read weight and bias of every layer that has weights, in order, as float32."""
     graph = onnx.load(encoder).graph
     known = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
     for node in graph.node:
@@ -116,7 +124,7 @@ def _layers(encoder: Path) -> list[tuple[Floats, Floats]]:
             known[node.output[0]] = (
                 (values.astype(np.float32) - zero.astype(np.float32).reshape(along if zero.size > 1 else ())) * scale.reshape(along)
             ).astype(np.float32)  # fmt: skip
-        elif node.op_type == "Identity" and node.input[0] in known:  # torch stores equal tensors once
+        elif node.op_type == "Identity" and node.input[0] in known:  # torch stores equal tensors only once
             known[node.output[0]] = known[node.input[0]]
     found = []
     for node in graph.node:

@@ -1,4 +1,4 @@
-"""The training loop: draws pairs, steps, logs, saves, resumes."""
+"""The training loop: draw pairs, step, log, save, resume."""
 
 import json
 import signal
@@ -27,15 +27,42 @@ from service.errors import DatasetError
 from service.imaging.view_grid import PLANES, ViewGrid
 from service.localization.encoder import Encoder
 
-PAIRS_AT_ONCE = 16  # augmented together on a processor
-#: Batches, spread over all cities, whose views set the statistics of an encoder that was exported without them; pairs of each at most.
+#: Pairs that are augmented together on a CPU.
+PAIRS_AT_ONCE = 16
+#: Batches that set the statistics of an encoder exported without them, and greatest number of pairs per batch.
 STATISTICS_BATCHES, STATISTICS_PAIRS = 12, 64
 
 _LOSSES = {"info_nce": paired_info_nce, "triplet": hardest_triplet}
 
 
 class TrainingConfig(BaseModel):
-    """Everything that decides what a run learns; kept beside its checkpoint, and a differing one is refused."""
+    """Everything that decides what a run learns.
+
+    The run keeps it beside its checkpoint. A run refuses to go on with another configuration.
+
+    Attributes:
+        steps: training steps.
+        pairs: pairs per batch.
+        optimiser: AdamW, or SGD with Nesterov momentum.
+        learning_rate: greatest learning rate.
+        weight_decay: of the optimiser.
+        momentum: of ``sgdm``.
+        warm_up_steps: steps of the linear warm-up.
+        gradient_norm: the gradient is clipped to this norm.
+        largest_scale: greatest inverse temperature of the loss.
+        seed: seed of all random numbers.
+        turn_deg: greatest rotation between a query and its map view, degrees.
+        memory_after: step from which descriptors of earlier batches are used; None never uses them.
+        memory_steps: age in steps beyond which a descriptor is not used.
+        stale_negatives: use remembered descriptors as negatives too. Otherwise they only choose hard negatives.
+        alike_seeds: pairs of a batch whose hard negatives are drawn with them.
+        alike_each: hard negatives per such pair.
+        loss: InfoNCE or triplet loss.
+        blind: planes (``service.imaging.view_grid.PLANES``) that are set to 0 in queries.
+        precision: of the forward pass. bfloat16 takes half the time if the processor supports it.
+        encoder: sizes of the encoder.
+        augmentation: errors of the views.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -44,31 +71,35 @@ class TrainingConfig(BaseModel):
     optimiser: Literal["adamw", "sgdm"] = "adamw"
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3
-    momentum: float = 0.9  # of sgdm
+    momentum: float = 0.9
     warm_up_steps: int = 100
     gradient_norm: float = 2.0
     largest_scale: float = 60.0
     seed: int = 0
-    turn_deg: float = 9.0  # between a query and its map view, at most: a fan of 24 headings is off by up to 7.5
-    memory_after: int | None = (
-        300  # steps before earlier batches' descriptors are used, which drift too fast at first; None: never
-    )
-    memory_steps: int = 400  # a descriptor older than this is forgotten
-    stale_negatives: bool = (
-        True  # whether remembered descriptors are negatives too; otherwise they choose look-alikes alone
-    )
-    alike_seeds: int = 8  # pairs of a batch whose look-alikes are drawn with them
+    turn_deg: float = 9.0  # a fan of 24 headings is off by up to 7.5 degrees
+    memory_after: int | None = 300  # at first descriptors drift too fast
+    memory_steps: int = 400
+    stale_negatives: bool = True
+    alike_seeds: int = 8
     alike_each: int = 7
     loss: Literal["info_nce", "triplet"] = "info_nce"
-    blind: tuple[str, ...] = ()  # planes (``service.imaging.view_grid.PLANES``) that queries are trained without
-    precision: Precision = "float32"  # of the forward pass; bfloat16 takes half the time where the processor has it
+    blind: tuple[str, ...] = ()
+    precision: Precision = "float32"
     encoder: EncoderShape = EncoderShape()
     augmentation: Augmentation = Augmentation()
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """State after a step, for bars and logs; ``accuracy`` is the share of pairs whose own survey view came first."""
+    """State after a step, for progress bars and logs.
+
+    Attributes:
+        step: steps done.
+        steps: all steps.
+        loss: mean loss of the batch.
+        accuracy: share of the pairs whose own survey view is the most similar one.
+        images_per_s: views per second since this call began.
+    """
 
     step: int
     steps: int
@@ -78,10 +109,13 @@ class Progress:
 
 
 def device_of(name: str) -> torch.device:
-    """``auto`` takes CUDA where there is one.
+    """Return the torch device of a name.
+
+    Args:
+        name: ``cpu``, ``cuda``, or ``auto``, which takes CUDA if there is a CUDA device.
 
     Raises:
-        DatasetError: no such device here.
+        DatasetError: the name is unknown, or there is no such device.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise DatasetError(f"device: {name!r} is not auto, cpu or cuda", field="device")
@@ -95,13 +129,24 @@ def train(
     start_from: Path | None = None,
     report: Callable[[Progress], None] = lambda _: None,
 ) -> EncoderNet:  # fmt: skip
-    """Train an encoder on packs; the run's folder holds ``config.json``, ``checkpoint.pt`` and TensorBoard's log.
+    """Train an encoder on packs.
 
-    The first Ctrl-C saves a checkpoint and ends; the same call goes on from there. ``start_from`` is a run's folder or an exported encoder.
+    The folder of the run holds ``config.json``, ``checkpoint.pt`` and the TensorBoard log.
+    The first Ctrl-C saves a checkpoint and ends. The same call continues from there.
+
+    Args:
+        packs: folders of the training cities.
+        run: folder of the run.
+        config: everything that decides what the run learns.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        resume: continue from the checkpoint in ``run`` if there is one.
+        save_every: steps between checkpoints.
+        start_from: folder of a run, or an exported encoder, whose weights the run starts from.
+        report: called after every step.
 
     Raises:
-        DatasetError: the run's folder belongs to another configuration.
-        EncoderError: ``start_from`` is a file, but no encoder of the configuration's shape.
+        DatasetError: the folder belongs to another configuration or other cities, or a pack or checkpoint is unusable.
+        EncoderError: ``start_from`` is a file, but no encoder of the configured shape.
         KeyboardInterrupt: after the checkpoint was saved.
     """
     grid, place = ViewGrid(rows=config.encoder.rows, columns=config.encoder.columns), device_of(device)
@@ -206,10 +251,14 @@ def train(
 
 
 def require_start(start_from: Path, shape: EncoderShape) -> None:
-    """Refuse what no training can start from, before anything is simulated or written.
+    """Check ``start_from`` before anything is simulated or written.
+
+    Args:
+        start_from: folder of a run, or an exported encoder.
+        shape: shape that the encoder must have.
 
     Raises:
-        DatasetError: it is not there, or a run's folder without a checkpoint, or of another shape.
+        DatasetError: it does not exist, or is a folder without a checkpoint or with an encoder of another shape.
         EncoderError: it is a file, but no encoder of this shape.
     """
     if not start_from.exists():
@@ -245,9 +294,18 @@ def _views_of_all(
 
 
 def views_of(batch: Batch, augment: Augmenter, place: torch.device, *, blind: tuple[str, ...] = ()) -> torch.Tensor:
-    """A batch as the network sees it: augmented planes, queries before survey views; queries without the planes in ``blind``.
+    """Return the augmented planes of a batch, queries before survey views.
 
-    On a processor in parts of ``PAIRS_AT_ONCE`` pairs, whose planes stay in its cache: little more than half the time.
+    A CPU works on parts of ``PAIRS_AT_ONCE`` pairs: their planes stay in its cache. That takes little more than half the time.
+
+    Args:
+        batch: B pairs.
+        augment: draws the errors.
+        place: device of the result.
+        blind: planes that are set to 0 in queries.
+
+    Returns:
+        Planes (2 B, 6, rows, columns).
     """
     count = len(batch.query_xy)
     size = PAIRS_AT_ONCE if place.type == "cpu" else count
@@ -269,7 +327,11 @@ def views_of(batch: Batch, augment: Augmenter, place: torch.device, *, blind: tu
 
 
 def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:
-    """The network of a run's last checkpoint, ready for use.
+    """Load the network of a run's last checkpoint, in evaluation mode.
+
+    Args:
+        run: folder of the run.
+        device: torch device that the checkpoint is loaded on.
 
     Raises:
         DatasetError: the folder holds no run.
@@ -282,7 +344,11 @@ def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:
 
 
 def read_checkpoint(run: Path, device: str | torch.device) -> dict[str, Any]:
-    """The last checkpoint of a run.
+    """Read the last checkpoint of a run.
+
+    Args:
+        run: folder of the run.
+        device: torch device of the tensors.
 
     Raises:
         DatasetError: it is missing or damaged.
@@ -299,10 +365,13 @@ def read_checkpoint(run: Path, device: str | torch.device) -> dict[str, Any]:
 
 
 def read_config(run: Path) -> TrainingConfig:
-    """What a run was trained with.
+    """Read the configuration of a run.
+
+    Args:
+        run: folder of the run.
 
     Raises:
-        DatasetError: ``config.json`` is missing, or is not of this release.
+        DatasetError: ``config.json`` is missing, or another release wrote it.
     """
     path = run / "config.json"
     try:
@@ -316,7 +385,10 @@ def read_config(run: Path) -> TrainingConfig:
 
 
 def read_packs(run: Path) -> list[str]:
-    """Names of the packs that a run learnt from.
+    """Read the names of the packs that a run learnt from.
+
+    Args:
+        run: folder of the run.
 
     Raises:
         DatasetError: ``packs.json`` is missing or damaged.
@@ -332,12 +404,18 @@ def read_packs(run: Path) -> list[str]:
 
 
 def trained_on(run: Path) -> tuple[str, ...]:
-    """Cities that a run was trained on, ``KIND-SEED``, those of the run that it started from included."""
+    """Return the cities that a run was trained on, as ``KIND-SEED``.
+
+    Cities of the run that it started from are included.
+
+    Args:
+        run: folder of the run.
+    """
     return tuple("-".join(name.split("-")[1:3]) for name in read_packs(run))
 
 
 def _keep_packs(run: Path, packs: list[Path], start_from: Path | None) -> None:
-    """Write down what the run learns from, and what the run before it did; refuse to go on with other cities."""
+    """Write the names of the packs of this run and of the run before it. Refuse to continue with other cities."""
     path = run / "packs.json"
     if start_from is None:
         earlier = []
@@ -375,7 +453,7 @@ def _optimiser(parameters: list[torch.nn.Parameter], config: TrainingConfig) -> 
 
 
 def _set_rate(optimiser: torch.optim.Optimizer, config: TrainingConfig, step: int) -> None:
-    """Linear warm-up, then half a cosine down to a hundredth."""
+    """Set the learning rate: linear warm-up, then half a cosine down to a hundredth."""
     warm = min(1.0, (step + 1) / max(1, config.warm_up_steps))
     rate = float(config.learning_rate * warm * (0.5 * (1 + np.cos(np.pi * step / config.steps)) + 0.01))
     for group in optimiser.param_groups:
@@ -383,7 +461,7 @@ def _set_rate(optimiser: torch.optim.Optimizer, config: TrainingConfig, step: in
 
 
 class _Interrupt:
-    """Turns the first Ctrl-C into a wish to end after the step; the second ends at once."""
+    """Handle Ctrl-C: the first ends the run after the step, the second ends it at once."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -391,7 +469,7 @@ class _Interrupt:
     def __enter__(self) -> "_Interrupt":
         try:
             self._before = signal.signal(signal.SIGINT, self._note)
-        except ValueError:  # not in the main thread: Ctrl-C is not ours to take
+        except ValueError:  # only the main thread may set a signal handler
             self._before = None
         return self
 

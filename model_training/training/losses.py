@@ -1,4 +1,4 @@
-"""The contrastive loss of paired views."""
+"""Contrastive losses of paired views."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+#: Positions closer than this are not used as negatives, metres.
 SAME_PLACE_M = 6.0
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """Unit descriptors (N, D) of one side and where they were taken (N, 2), metres."""
+    """Descriptors of the queries or of the survey views.
+
+    Attributes:
+        descriptors: unit descriptors (N, D).
+        xy: positions (N, 2), map frame, metres.
+    """
 
     descriptors: Tensor
     xy: Tensor
@@ -20,17 +26,19 @@ class Side:
 def paired_info_nce(
     queries: Side, surveys: Side, *, scale: Tensor, more_queries: Side | None = None, more_surveys: Side | None = None
 ) -> tuple[Tensor, Tensor]:
-    """InfoNCE both ways over a batch of pairs (van den Oord et al., 2018), places too near to be told apart left out.
+    """Compute InfoNCE in both directions over a batch of pairs (van den Oord et al., 2018).
+
+    Views closer than ``SAME_PLACE_M`` to each other are not used as negatives.
 
     Args:
-        queries: row k belongs to row k of ``surveys`` (B).
-        surveys: (B).
-        scale: inverse temperature, learned.
-        more_queries: further negatives for the surveys, such as those of earlier batches.
-        more_surveys: further negatives for the queries.
+        queries: B queries; row k belongs to row k of ``surveys``.
+        surveys: B survey views.
+        scale: inverse temperature, learned; a scalar.
+        more_queries: N further negatives for the survey views, such as those of earlier batches.
+        more_surveys: N further negatives for the queries.
 
     Returns:
-        Loss of each pair (B) and whether its own survey view came first (B).
+        Loss of each pair (B), and whether its own survey view is the most similar one (B).
     """
     forward = _logits(queries, surveys, scale, more_surveys)
     backward = _logits(surveys, queries, scale, more_queries)
@@ -45,9 +53,17 @@ def paired_info_nce(
 def hardest_triplet(
     queries: Side, surveys: Side, *, scale: Tensor, more_queries: Side | None = None, more_surveys: Side | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The soft-margin triplet loss of each pair's hardest negative, both ways (Hermans et al., 2017), instead of all of them.
+    """Compute the soft-margin triplet loss of the hardest negative in both directions (Hermans et al., 2017).
 
-    Arguments and result as ``paired_info_nce`` has them.
+    Args:
+        queries: B queries; row k belongs to row k of ``surveys``.
+        surveys: B survey views.
+        scale: factor of the similarities, learned; a scalar.
+        more_queries: N further negatives for the survey views.
+        more_surveys: N further negatives for the queries.
+
+    Returns:
+        Loss of each pair (B), and whether its own survey view is the most similar one (B).
     """
     forward = _logits(queries, surveys, scale, more_surveys)
     backward = _logits(surveys, queries, scale, more_queries)
@@ -61,7 +77,7 @@ def hardest_triplet(
 
 
 def _logits(asked: Side, answers: Side, scale: Tensor, more: Side | None) -> Tensor:
-    """Scaled similarities (B, B + N) of what is asked to its answers and to further negatives."""
+    """Scaled similarities (B, B + N) of one side to the other side and to further negatives."""
     near = torch.cdist(asked.xy, answers.xy) < SAME_PLACE_M
     near.fill_diagonal_(False)
     similarity = asked.descriptors @ answers.descriptors.T

@@ -1,8 +1,8 @@
 """Query views of the training set whose depth comes from matching a rendered stereo pair.
 
-Drawn errors (``augment``) err in another way than matching does: surfaces that a matcher smooths, edges that it fattens, streaks and
-holes. An encoder that has only met drawn errors finds 0.75 to 0.81 of the places of simulated pairs, and 0.77 on KITTI's drive 0005
-(decision log, 2026-11-25).
+A matcher errs in another way than the modelled errors of ``augment``: it smooths surfaces, widens edges, and leaves
+streaks and holes. With an encoder that was trained only with modelled errors, R@1 is 0.75 to 0.81 on simulated pairs.
+On KITTI drive 0005 it is 0.77 (decision 0140).
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,8 @@ from service.imaging.gather import gather
 from service.imaging.level import level_camera
 from service.imaging.view_grid import ViewGrid
 
-NOMINAL_HEIGHT_M = 1.5  # of a camera, as the service takes it where the picture shows no ground
+#: Camera height if the image shows no ground, metres; the same value as in the service.
+NOMINAL_HEIGHT_M = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +33,12 @@ class MatchedRig:
     """A stereo rig of the training set.
 
     Attributes:
-        camera: of the left picture.
-        height_m: of the camera above the ground, least and greatest.
-        model: matcher, focal length times baseline, and how badly the rig is rectified.
-        rgb: how both cameras turn light into values.
-        condition: of the light.
-        exposure_ev: stops that the pictures of a drive are brighter than metered, least and greatest.
+        camera: intrinsics of the left image.
+        height_m: least and greatest height of the camera above the ground, metres.
+        model: matcher, focal length times baseline, and rectification errors.
+        rgb: how both cameras turn light into pixel values.
+        condition: name of the light condition.
+        exposure_ev: least and greatest exposure above the metered one, stops; drawn once per traversal.
     """
 
     camera: PinholeCamera
@@ -50,14 +51,14 @@ class MatchedRig:
 
 @dataclass(frozen=True, slots=True)
 class MatchedView:
-    """What a rig shows of one pose on the view grid.
+    """A view of a rig on the view grid.
 
     Attributes:
-        ranges: metres (rows, columns), 0 for no measurement.
+        ranges: (rows, columns), metres; 0 where nothing was measured.
         rgb: sRGB (rows, columns, 3).
         seen: cells that the camera looks at (rows, columns).
-        heading_rad: of the view, map frame.
-        height_m: of the camera above the ground, as levelling finds it.
+        heading_rad: heading of the view, map frame, radians.
+        height_m: estimated height of the camera above the ground, metres.
     """
 
     ranges: NDArray[np.float32]
@@ -68,12 +69,12 @@ class MatchedView:
 
 
 class RigOfADrive:
-    """One rig, rectified as well as one drive's was, on a scene.
+    """A rig in a scene, with the rectification errors of one traversal.
 
     Args:
         rig: camera and matcher.
-        scene: what stands there.
-        city: of the scene.
+        scene: all objects.
+        city: city of the scene.
         rng: draws rectification, light and exposure.
     """
 
@@ -84,18 +85,18 @@ class RigOfADrive:
         self._condition = CONDITIONS[rig.condition]
         self._light = Light.of(self._condition, rng)
         self._rgb = replace(rig.rgb, exposure_ev=rng.uniform(*rig.exposure_ev))
-        cv2.setNumThreads(1)  # a process a city: more threads would only wait for each other
+        cv2.setNumThreads(1)  # there is one process per city: more threads would only wait for each other
 
     def view(self, T_map_body: Transform, grid: ViewGrid) -> MatchedView:
-        """Render both pictures, match them, level and resample as the service does.
+        """Render both images, match them, level and resample as the service does.
 
         Args:
-            T_map_body: the left camera's position, x forward, y left, z up.
-            grid: of the views.
+            T_map_body: pose of the left camera; body axes x forward, y left, z up.
+            grid: the view grid.
         """
         T_map_camera = T_map_body.copy()
         T_map_camera[:3, :3] = T_map_body[:3, :3] @ R_BODY_OPTICAL
-        metering = float(self._rng.uniform(*METERING))  # both cameras of a rig are exposed alike
+        metering = float(self._rng.uniform(*METERING))  # both cameras of a rig have the same exposure
         left, right = (
             take(
                 self._scene, self._city.ground, self._rig.camera, T, self._light, self._condition, self._rgb, self._rng,

@@ -1,8 +1,9 @@
-"""What a city's pairs looked like when they were last drawn: more negatives than a batch holds, and the hard ones among them.
+"""Remember the last descriptors of a city's pairs: they give more negatives, and they find the hard ones.
 
-A batch of a hundred pairs rarely holds the street that a query is mistaken for. Descriptors drift slowly, so those of the
-last steps serve as negatives that cost no forward pass (cross-batch memory, Wang et al., CVPR 2020), and they tell which
-pairs of a city are alike, so that a batch can be drawn from look-alikes.
+A batch of a hundred pairs rarely holds the street that a query is confused with.
+Descriptors drift slowly. So descriptors of recent steps serve as negatives without a forward pass
+(cross-batch memory, Wang et al., CVPR 2020).
+They also show which pairs of a city look alike. A batch can then be drawn from hard negatives.
 """
 
 import numpy as np
@@ -16,7 +17,20 @@ _NEVER = -(10**9)
 
 
 class DescriptorMemory:
-    """Last descriptors of every pair of one city, by the number of its query."""
+    """Last descriptors of every pair of one city, indexed by the number of its query.
+
+    Args:
+        pairs: queries of the city, N.
+        descriptor: length of a descriptor, D.
+        device: device of the descriptors.
+
+    Attributes:
+        queries: query descriptors (N, D).
+        surveys: descriptors of the paired survey views (N, D).
+        queries_xy: positions of the queries (N, 2), map frame, metres.
+        surveys_xy: positions of the survey views (N, 2), map frame, metres.
+        step: step at which the pair was last drawn (N); very negative if never.
+    """
 
     def __init__(self, pairs: int, descriptor: int, device: torch.device) -> None:
         self.queries = torch.zeros(pairs, descriptor, device=device)
@@ -28,19 +42,42 @@ class DescriptorMemory:
     def keep(
         self, pairs: NDArray[np.int64], queries: Tensor, surveys: Tensor, queries_xy: Tensor, surveys_xy: Tensor, step: int
     ) -> None:  # fmt: skip
-        """Remember the descriptors (B, D) and positions (B, 2) that ``pairs`` (B) had at a step."""
+        """Store what a batch of pairs had at a step.
+
+        Args:
+            pairs: numbers of the queries (B).
+            queries: query descriptors (B, D).
+            surveys: descriptors of the survey views (B, D).
+            queries_xy: positions of the queries (B, 2), map frame, metres.
+            surveys_xy: positions of the survey views (B, 2), map frame, metres.
+            step: number of the step.
+        """
         rows = torch.from_numpy(pairs).to(self.queries.device)
         self.queries[rows], self.surveys[rows] = queries.detach(), surveys.detach()
         self.queries_xy[rows], self.surveys_xy[rows] = queries_xy, surveys_xy
         self.step[torch.from_numpy(pairs)] = step
 
     def recent(self, step: int, oldest: int) -> NDArray[np.int64]:
-        """Pairs (N) seen in the last ``oldest`` steps."""
+        """Return the pairs (N,) of the last steps.
+
+        Args:
+            step: number of the current step.
+            oldest: greatest age of a descriptor, steps.
+        """
         rows: NDArray[np.int64] = np.flatnonzero((step - self.step.numpy()) <= oldest)
         return rows
 
     def alike(self, seeds: NDArray[np.int64], among: NDArray[np.int64], each: int) -> NDArray[np.int64]:
-        """For each seed the ``each`` pairs of other places whose survey views are most like its query; seeds included."""
+        """Find hard negatives: pairs of other places whose survey views are most similar to a query.
+
+        Args:
+            seeds: numbers of the queries (S,).
+            among: pairs to search (N,).
+            each: pairs per seed.
+
+        Returns:
+            Numbers of the seeds and their hard negatives, sorted, without duplicates (M,).
+        """
         rows = torch.from_numpy(among).to(self.queries.device)
         chosen = torch.from_numpy(seeds).to(self.queries.device)
         likeness = self.queries[chosen] @ self.surveys[rows].T
@@ -50,10 +87,14 @@ class DescriptorMemory:
         return found
 
     def state(self) -> dict[str, Tensor]:
-        """Arrays for a checkpoint."""
+        """Return the tensors for a checkpoint."""
         return {name: getattr(self, name) for name in ("queries", "surveys", "queries_xy", "surveys_xy", "step")}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take back what ``state`` gave."""
+        """Set the tensors from a checkpoint.
+
+        Args:
+            state: result of ``state``.
+        """
         for name, array in state.items():
             getattr(self, name).copy_(array)

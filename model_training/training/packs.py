@@ -1,7 +1,8 @@
 """Training data: a simulated city as levelled panoramas and clean query views on the view grid.
 
-A pack is what one city gives: small enough to keep many, and free of the errors that training draws anew each time it
-shows a pair (``augment``). Panoramas go through the same levelling and resampling as those of a real survey.
+A pack holds the views of one city. It is small, so that many can be kept.
+It holds no sensor errors: training draws new ones each time that it uses a pair (``augment``).
+The panoramas are levelled and resampled like those of a real survey.
 """
 
 import hashlib
@@ -28,17 +29,31 @@ from service.geometry.rigid import heading_of_body, rotation_x, rotation_y, rota
 from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
+#: Version of the pack format; part of the folder's name.
 FORMAT = 2
-DRIVE_VIEWS = 60  # after so many matched views the next rig is taken, with new errors of rectification and another sun
-#: Rays ahead that tell whether something stands right before the camera.
+#: Matched views per traversal. Then the next rig follows, with new rectification errors and another sun.
+DRIVE_VIEWS = 60
+#: Rays that show whether an object stands directly in front of the camera (128, 3).
 _COARSE = ViewGrid(rows=8, columns=16).rays_level().reshape(-1, 3)
-MATCHED = "-matched"  # in the names of packs of matched pairs
-OWN_DRIVES = 1000  # traversals of the training set: no dataset's drive has the same vehicles and people
+#: Part of the names of packs with stereo-matched depth.
+MATCHED = "-matched"
+#: First traversal of the training set. No dataset uses these numbers, so its vehicles and people differ.
+OWN_DRIVES = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class PackPlan:
-    """What one city of the training set holds; the numbers that change a pack are in its file name."""
+    """Plan of one city of the training set. Numbers that change the pack are part of its name.
+
+    Attributes:
+        seed: seed of the city.
+        name: kind of city.
+        places: number of places.
+        queries_a_place: queries per place.
+        lidar: name of the survey LiDAR.
+        size_m: size of the city, metres.
+        rigs: stereo rigs of the queries, used in turn; empty for clean depth.
+    """
 
     seed: int
     name: str = "city"
@@ -46,24 +61,29 @@ class PackPlan:
     queries_a_place: int = 3
     lidar: str = "paper_32"
     size_m: tuple[float, float] = (300.0, 400.0)
-    rigs: tuple[MatchedRig, ...] = ()  # stereo rigs of the queries, in turn; none: clean depth
+    rigs: tuple[MatchedRig, ...] = ()
 
     @property
     def stem(self) -> str:
-        """File name of the pack, without its ending."""
+        """Folder name of the pack."""
         matched = f"{MATCHED}-{_digest(self.rigs)}" if self.rigs else ""
         return f"pack{FORMAT}-{self.name}-{self.seed}-{self.places}x{self.queries_a_place}-{self.lidar}{matched}"
 
 
 @dataclass(frozen=True)
 class Pack:
-    """One city, memory-mapped.
+    """One city, memory-mapped: P places and Q queries.
 
-    ``panoramas`` (P, rows, around) metres; ``intensities`` of the same shape, 255 times the root of 0..1;
-    ``places`` (P, 4): x, y, heading of the panorama's x axis, LiDAR height (m, rad);
-    ``rows_seen`` (rows); ``ranges`` (Q, rows, columns) metres; ``rgb`` (Q, rows, columns, 3); ``queries`` (Q, 4): x, y,
-    heading, camera height; ``seen`` (Q, rows, columns) cells that the camera looks at, where depth comes from matching and has
-    its errors already, else None.
+    Attributes:
+        panoramas: (P, rows, around), metres; 0 where nothing was measured.
+        intensities: (P, rows, around), 255 times the square root of the intensity 0..1.
+        places: (P, 4): x, y (m), heading of the panorama's x axis (rad), LiDAR height (m); map frame.
+        rows_seen: rows that the LiDAR covers (rows).
+        ranges: (Q, rows, columns), metres; 0 where nothing was measured.
+        rgb: sRGB (Q, rows, columns, 3).
+        queries: (Q, 4): x, y (m), heading (rad), camera height (m); map frame.
+        seen: cells that the camera looks at (Q, rows, columns), if depth comes from stereo matching and already has
+            errors; otherwise None.
     """
 
     panoramas: NDArray[np.float16]
@@ -77,7 +97,10 @@ class Pack:
 
     @staticmethod
     def open(folder: Path) -> "Pack":
-        """Map a pack's arrays; they are read as they are needed.
+        """Map the arrays of a pack; they are read when they are needed.
+
+        Args:
+            folder: the pack.
 
         Raises:
             DatasetError: an array is missing or damaged.
@@ -92,12 +115,17 @@ class Pack:
 
 
 def _digest(rigs: tuple[MatchedRig, ...]) -> str:
-    """Eight digits that change with every number of the rigs."""
+    """Eight hexadecimal digits that change with every number of the rigs."""
     return hashlib.sha256(repr((DRIVE_VIEWS, rigs)).encode()).hexdigest()[:8]
 
 
 def rows_seen_by(panoramas: NDArray[np.float16], *, least: float = 0.02) -> NDArray[np.bool_]:
-    """Rows that a survey's sensor covers: those with a share of measured cells that is not negligible."""
+    """Return the rows (rows,) that the survey LiDAR covers.
+
+    Args:
+        panoramas: (P, rows, around), metres; 0 where nothing was measured.
+        least: share of measured cells above which a row counts as covered.
+    """
     measured = (np.asarray(panoramas[:: max(1, len(panoramas) // 200)]) > 0).mean(axis=(0, 2))
     seen: NDArray[np.bool_] = measured > least
     return seen
@@ -107,7 +135,15 @@ def make_packs(
     plans: list[PackPlan], root: Path, grid: ViewGrid, *, workers: int | None = None,
     report: Callable[[str, int, int], None] = lambda *_: None,
 ) -> list[Path]:  # fmt: skip
-    """Make the packs that are not there yet, a city a process, and say where all of them lie."""
+    """Make the packs that do not exist yet, one city per process, and return all folders.
+
+    Args:
+        plans: the cities.
+        root: folder of the packs.
+        grid: the view grid.
+        workers: number of processes; None for one per core.
+        report: called with the name of the stage, cities done, and all cities to make.
+    """
     root.mkdir(parents=True, exist_ok=True)
     folders = [root / plan.stem for plan in plans]
     missing = [plan for plan, folder in zip(plans, folders, strict=True) if not folder.exists()]
@@ -124,7 +160,15 @@ def _make_in(plan: PackPlan, root: Path, grid: ViewGrid) -> None:
 
 
 def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
-    """Simulate a city and write its pack; the folder appears whole or not at all."""
+    """Simulate a city and write its pack.
+
+    The folder appears only when it is complete.
+
+    Args:
+        plan: the city.
+        folder: folder to write.
+        grid: the view grid.
+    """
     city = City(seed=plan.seed, name=plan.name, size_m=plan.size_m)
     rng = np.random.default_rng([104729, plan.seed, plan.places])
     model, clear = LIDARS[plan.lidar], CONDITIONS["clear"]
@@ -162,7 +206,7 @@ def make_pack(plan: PackPlan, folder: Path, grid: ViewGrid) -> None:
 def _matched_queries(
     city: City, plan: PackPlan, places: NDArray[np.float64], grid: ViewGrid, rng: np.random.Generator
 ) -> dict[str, NDArray[np.generic]]:
-    """Range and colour as stereo rigs give them; every rig and every ``DRIVE_VIEWS`` views are rectified anew."""
+    """Ranges and colour of stereo rigs. Every ``DRIVE_VIEWS`` views get new rectification errors."""
     total = len(places) * plan.queries_a_place
     ranges, queries = np.zeros((total, grid.rows, grid.columns), np.float16), np.zeros((total, 4))
     rgb, seen = np.zeros((*ranges.shape, 3), np.uint8), np.zeros(ranges.shape, np.bool_)
@@ -193,7 +237,7 @@ def _matched_queries(
 def _queries(
     city: City, plan: PackPlan, places: NDArray[np.float64], grid: ViewGrid, rng: np.random.Generator
 ) -> dict[str, NDArray[np.generic]]:
-    """Clean range and colour of query views, each ray of a cell its centre's, shaken a little."""
+    """Clean ranges and colour of query views: one ray per cell, near the cell's centre."""
     drives = max(1, plan.queries_a_place)
     total = len(places) * plan.queries_a_place
     ranges = np.zeros((total, grid.rows, grid.columns), np.float16)
@@ -201,7 +245,7 @@ def _queries(
     queries = np.zeros((total, 4))
     cells = grid.rays_level().reshape(-1, 3)
     row = 0
-    for drive in range(OWN_DRIVES, OWN_DRIVES + drives):  # each with its own vehicles and people, sun and clouds
+    for drive in range(OWN_DRIVES, OWN_DRIVES + drives):  # each traversal has other vehicles, people, sun and clouds
         scene = Scene(joined([city.static, city.occupants(drive)]))
         light, clear = Light.of(CONDITIONS["clear"], rng), CONDITIONS["clear"]
         for place in places:
@@ -228,7 +272,7 @@ def _queries(
 
 
 def _near(place: NDArray[np.float64], rng: np.random.Generator) -> tuple[float, float, float]:
-    """A query pose within 2 m of a place; mostly along the street, either way."""
+    """A query pose within 2 m of a place, mostly along the street in either direction."""
     angle, distance = rng.uniform(0, 2 * np.pi), 2.0 * np.sqrt(rng.random())
     x, y = place[0] + distance * np.cos(angle), place[1] + distance * np.sin(angle)
     heading = rng.uniform(-np.pi, np.pi)

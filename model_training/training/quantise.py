@@ -1,8 +1,9 @@
-"""An encoder in eight bits: a quarter of the bytes, less than half of the time, descriptors that hardly move.
+"""Quantise an encoder to eight bits: a quarter of the bytes, less than half of the time, nearly the same descriptors.
 
-Weights are whole numbers a filter, activations a tensor; normalisation at the front and the unit vector at the end stay float32
-(Jacob et al., CVPR 2018). Weights keep to seven bits: on processors without VNNI the sum of two products of eight would
-overflow its sixteen bits, and descriptors would depend on the processor.
+Weights are integers with one scale per filter, activations with one scale per tensor (Jacob et al., CVPR 2018).
+The normalisation at the start and the unit vector at the end stay float32.
+Weights use only seven bits. On processors without VNNI the sum of two eight-bit products would overflow 16 bits.
+Then descriptors would depend on the processor.
 """
 
 import tempfile
@@ -18,8 +19,9 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from service.errors import EncoderError
 from service.localization.encoder import Descriptors, Encoder
 
+#: ONNX operators that are quantised.
 QUANTISED = ("Conv", "Gemm", "MatMul", "Add", "Relu")
-#: Least cosine between a view's two descriptors, in the mean over views and of the worst hundredth.
+#: Least cosine between the two descriptors of a view: the mean, and the 1 % quantile over all views.
 LEAST_MEAN, LEAST_OF_HUNDRED = 0.999, 0.998
 
 Planes = NDArray[np.float32]
@@ -27,18 +29,27 @@ Planes = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """Planes (B, 6, rows, columns), the first ``queries`` of them of queries, the others of the survey."""
+    """Views of queries and of the survey.
+
+    Attributes:
+        planes: (B, 6, rows, columns); queries come first.
+        queries: number of query views.
+    """
 
     planes: Planes
     queries: int
 
     @property
     def side(self) -> NDArray[np.float32]:
-        """1 for queries, 0 for survey views (B)."""
+        """1 for queries, 0 for survey views (B,)."""
         return (np.arange(len(self.planes)) < self.queries).astype(np.float32)
 
     def encoded(self, encoder: Encoder) -> Descriptors:
-        """Descriptors (B, D) of all."""
+        """Return the descriptors (B, D) of all views.
+
+        Args:
+            encoder: encodes the views.
+        """
         split = self.queries
         found: Descriptors = np.concatenate(
             [encoder.encode(self.planes[:split], "query"), encoder.encode(self.planes[split:], "survey")]
@@ -48,7 +59,13 @@ class Views:
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Cosines between descriptors in float32 and in eight bits over ``views`` that ranges were not taken from."""
+    """Cosines between float32 and eight-bit descriptors, over views that did not set the ranges.
+
+    Attributes:
+        mean: mean cosine.
+        of_hundred: 1 % quantile of the cosine.
+        views: number of views.
+    """
 
     mean: float
     of_hundred: float
@@ -56,16 +73,16 @@ class Agreement:
 
 
 def quantise(encoder: Path, out: Path, ranges: Iterable[Views], checks: Iterable[Views]) -> Agreement:
-    """Write an encoder in eight bits and prove that it says nearly the same.
+    """Write an encoder in eight bits, and check that its descriptors are nearly the same.
 
     Args:
-        encoder: ONNX file of ``export``.
-        out: file to write, renamed when whole.
-        ranges: views, of training cities, that the activations' ranges are taken from.
-        checks: other views.
+        encoder: ONNX file that ``export`` wrote.
+        out: file to write; renamed when it is complete.
+        ranges: views of training cities that set the ranges of the activations.
+        checks: other views, for the check.
 
     Raises:
-        EncoderError: the encoder cannot be read, is in eight bits already, or descriptors differ by more than
+        EncoderError: the encoder cannot be read or already has eight bits, or the descriptors differ by more than
             ``LEAST_MEAN`` and ``LEAST_OF_HUNDRED`` allow; nothing is written.
     """
     before = Encoder.open(encoder)
@@ -103,7 +120,7 @@ def _in_eight_bits(encoder: Path, model: onnx.ModelProto, ranges: Iterable[Views
         plain, whole = Path(folder) / "plain.onnx", Path(folder) / "whole.onnx"
         quant_pre_process(
             str(encoder), str(plain), skip_symbolic_shape=True
-        )  # constants where the next step wants them
+        )  # folds constants, which the next step needs
         quantize_static(
             str(plain), str(whole), Reader(), quant_format=QuantFormat.QDQ, activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8, per_channel=True, reduce_range=True, op_types_to_quantize=list(QUANTISED),

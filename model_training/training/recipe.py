@@ -1,7 +1,8 @@
-"""What the stock encoder is trained on: cities, sensors and seeds that no bar is measured on.
+"""What the stock encoder is trained on: cities, sensors and seeds that no evaluation uses.
 
-Seeds by use, so that nothing is tuned on what is reported (a test holds them apart): training 1000-1999, watching the
-training 2000-2999, calibrating confidence 3000-3999, evaluation 9000-9999; the paper's city is evaluation too.
+Each use has its own range of seeds, so that we tune nothing on what we report. A test checks that they do not overlap:
+training 1000-1999, validation 2000-2999, calibration of confidence 3000-3999, evaluation 9000-9999.
+The paper's city belongs to the evaluation too.
 """
 
 from collections.abc import Callable
@@ -13,12 +14,16 @@ from model_training.simulation.stereo_pair import STEREOS
 from model_training.training.matched_views import MatchedRig
 from model_training.training.packs import PackPlan
 
+#: Seeds of the training cities.
 TRAINING_SEEDS = range(1000, 2000)
+#: Seeds of the validation cities.
 WATCH_SEEDS = range(2000, 3000)
+#: Seeds of the calibration cities.
 CALIBRATION_SEEDS = range(3000, 4000)
+#: Seeds of the evaluation cities.
 EVALUATION_SEEDS = range(9000, 10000)
 
-#: One LiDAR a city, so that the encoder meets 16 to 128 beams and sensors that do not look up.
+#: One LiDAR per city. So the encoder learns from 16 to 128 beams, and from sensors that do not look up.
 _LIDARS = (
     "paper_32",
     "paper_32",
@@ -33,18 +38,23 @@ _LIDARS = (
 )
 
 
+#: Training cities of the stock encoder.
 STOCK_CITIES = 26
 
 
 def stock_plans(cities: int) -> list[PackPlan]:
-    """The training set of the stock encoder."""
+    """Plan the training set of the stock encoder.
+
+    Args:
+        cities: number of cities.
+    """
     return [PackPlan(seed=TRAINING_SEEDS[k], lidar=_LIDARS[k % len(_LIDARS)]) for k in range(cities)]
 
 
-#: A machine-vision camera, its light, and stops of exposure: more for the shade, so that sunlit roads clip.
+#: A machine-vision camera, its light, and its exposure in stops. It exposes for the shade, so sunlit roads clip.
 _MACHINE = (RGBS["machine"], "hard_light", (-0.3, 1.0))
-#: Rigs whose pairs are rendered and matched. A car's as KITTI's at half the pixels, half the errors of rectification with it, by two
-#: matchers; a small robot's; and a hand-held one.
+#: Rigs whose pairs are rendered and matched: a car's rig with two matchers, a hand-held rig and a small robot's rig.
+#: The car's rig is KITTI's with half the pixels, and therefore half the rectification errors in pixels.
 MATCHED_RIGS = (
     MatchedRig(
         CameraPlan(width=621, height=188, horizontal_deg=81.4).pinhole(), (1.5, 1.8),
@@ -63,17 +73,21 @@ MATCHED_RIGS = (
         replace(STEREOS["bm"], focal_baseline_px_m=76.0, offset_px=0.22, vertical_px=0.16, roll_px=0.16), *_MACHINE,
     ),
 )  # fmt: skip
-#: The first seed of ``matched_plans``: after those of the stock recipe.
+#: Index of the first seed of ``matched_plans``, after those of the stock recipe.
 _MATCHED_FROM = 40
 _MATCHED_LIDARS = ("hdl_64", "hdl_32", "hdl_64", "os1_64", "hdl_64")
 
 
-#: Clean cities beside them in the matched recipe, so that what the encoder knows is not unlearnt.
+#: Clean and matched cities of the matched recipe. The clean ones keep the encoder from forgetting what it learnt.
 _CLEAN_BESIDE, _MATCHED = 6, 5
 
 
 def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
-    """Cities of all kinds of districts whose queries have depth of matched stereo pairs."""
+    """Plan cities of mixed districts whose queries have stereo-matched depth.
+
+    Args:
+        cities: number of cities.
+    """
     return [
         PackPlan(
             seed=TRAINING_SEEDS[_MATCHED_FROM + k], name="mixed", places=1000, queries_a_place=1,
@@ -84,16 +98,16 @@ def matched_plans(cities: int = _MATCHED) -> list[PackPlan]:
 
 
 def watch_plans() -> list[PackPlan]:
-    """One city that training is watched on."""
+    """Plan the validation city of the training."""
     return [PackPlan(seed=WATCH_SEEDS[0], places=900, queries_a_place=1)]
 
 
 def paper_plans() -> list[PackPlan]:
-    """The paper's city itself, for the encoder that is trained on it (its own drives and vehicles)."""
+    """Plan the paper's city, for the encoder that is trained on it with its own traversals and vehicles."""
     return [PackPlan(seed=0, name="paper", places=2000)]
 
 
-#: Recipes by name. Each is given the number of cities, which the stock one alone uses.
+#: Recipes by name. Each gets the number of cities; only the stock recipe uses it.
 RECIPES: dict[str, Callable[[int], list[PackPlan]]] = {
     "stock": stock_plans,
     "matched": lambda _: [*stock_plans(_CLEAN_BESIDE), *matched_plans()],
