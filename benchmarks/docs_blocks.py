@@ -26,7 +26,7 @@ from benchmarks.report import ROOT, Report
 
 #: The README first: it makes the dataset and the map that the other pages ask.
 PAGES = ("README.md", "start", "survey", "recordings", "maps", "robot", "python", "deploy", "serving", "console", "confidence", "measuring",
-         "api", "problems", "formats", "how_it_works", "paper", "limits", "faq", "index", "contributing", "development",
+         "api", "problems", "formats", "how_it_works", "architecture", "paper", "limits", "faq", "index", "contributing", "development",
          "decisions/index")  # fmt: skip
 KINDS = ("sh", "python", "json", "yaml", "text")
 _MARK = re.compile(r"<!-- (not run|file): (.+) -->")

@@ -1,4 +1,7 @@
-"""Ask calibration queries: of their own city's map, of another's, of sparse ones, of one without some streets; and walls and rooms."""
+"""Localize the calibration queries in several maps: of their own city, of another city, sparse ones, and one without some streets.
+
+Walls and rooms serve as out-of-map queries too.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -16,13 +19,22 @@ from service.localization.localizer import Localizer
 from service.localization.query import Query
 from service.maps.calibration import FEATURES
 
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 def in_the_map(
     localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = (), *, rig: Rig | None = None
 ) -> list[Asked]:
-    """Query sets of the map's own city, by the simulated camera or another rig; all of them, where none are named."""
+    """Localize query sets of the map's own city.
+
+    Args:
+        localizer: the localizer of the map.
+        dataset: the dataset with the queries.
+        report: called after every query.
+        names: names of the query sets; empty for all sets with ground truth.
+        rig: rig of the queries; None for the dataset's own camera.
+    """
     return [
         asked_of(_predicted(localizer, dataset, name, report, rig), _by(rig, name), known=True)
         for name in names or dataset.query_sets(with_truth=True)
@@ -32,7 +44,15 @@ def in_the_map(
 def of_another_city(
     localizer: Localizer, dataset: Dataset, report: Report, names: Sequence[str] = (), *, rig: Rig | None = None
 ) -> list[Asked]:
-    """Query sets of a city that the map does not show, by the simulated camera or another rig; all of them, where none are named."""
+    """Localize query sets of a city that the map does not cover: out-of-map queries.
+
+    Args:
+        localizer: the localizer of the map of another city.
+        dataset: the dataset with the queries.
+        report: called after every query.
+        names: names of the query sets; empty for all sets with ground truth.
+        rig: rig of the queries; None for the dataset's own camera.
+    """
     return [
         asked_of(
             _predicted(localizer, dataset, name, report, rig), _by(rig, f"other_city.{preset_of(name)}"), known=False
@@ -44,7 +64,18 @@ def of_another_city(
 def where_streets_are_missing(
     localizer: Localizer, dataset: Dataset, names: list[str], is_outside: Callable[[np.ndarray], np.ndarray], report: Report
 ) -> list[Asked]:  # fmt: skip
-    """Query sets of a city whose map left streets out: those taken there, and the others."""
+    """Localize query sets in a map of their city without some streets.
+
+    Args:
+        localizer: the localizer of the map without these streets.
+        dataset: the dataset with the queries.
+        names: names of the query sets.
+        is_outside: returns for each position (n, 2), metres, map frame, whether it lies in a missing street (n,).
+        report: called after every query.
+
+    Returns:
+        For each set its out-of-map queries, from the missing streets, then its other queries.
+    """
     found = []
     for name in names:
         predictions = predict(localizer, dataset, name, report=report)
@@ -58,7 +89,16 @@ def where_streets_are_missing(
 def walls_and_rooms(
     localizer: Localizer, camera: PinholeCamera, seed: int, report: Report, *, count: int = 100, rig: Rig | None = None
 ) -> list[Asked]:
-    """Pictures of what is in no map, so many of each kind and depth preset, by the simulated camera or another rig."""
+    """Localize simulated walls and rooms, which no map contains.
+
+    Args:
+        localizer: the localizer of a map.
+        camera: camera of the images.
+        seed: seed of the random generator.
+        report: called after every query.
+        count: number of queries of each kind and depth preset.
+        rig: rig of the queries; None for the camera itself.
+    """
     found = []
     for number, kind in enumerate(KINDS):
         for preset in BOTH:
@@ -73,7 +113,7 @@ def walls_and_rooms(
 
 
 def _evidence(localizer: Localizer, query: Query) -> np.ndarray | float:
-    """NaN where nothing was registered."""
+    """Return the confidence features of the answer; NaN without registration."""
     try:
         evidence = localizer.localize(query).evidence
     except NoDepthError:
@@ -84,7 +124,7 @@ def _evidence(localizer: Localizer, query: Query) -> np.ndarray | float:
 def _predicted(
     localizer: Localizer, dataset: Dataset, name: str, report: Report, rig: Rig | None = None
 ) -> Predictions:
-    """Sets of sequences are asked sequence by sequence."""
+    """Localize a query set; a set of sequences takes each sequence as one query."""
     return predict(
         localizer, dataset, name, frames_each=SEQUENCE if name.startswith("sequences_") else 1,
         seen_by=None if rig is None else rig.seen, report=report,
@@ -92,17 +132,29 @@ def _predicted(
 
 
 def _by(rig: Rig | None, kind: str) -> str:
-    """Kinds of other rigs are kinds of their own; the preset stays their last part."""
+    """Return the name of a kind of queries for a rig. The depth preset stays its last part."""
     return kind if rig is None else f"{rig.name}_{kind}"
 
 
 def preset_of(query_set: str) -> str:
-    """Depth preset, the last part of a query set's name."""
+    """Return the depth preset of a query set: the last part of its name.
+
+    Args:
+        query_set: name of the set.
+    """
     return query_set.rsplit("_", 1)[-1]
 
 
 def asked_of(predictions: Predictions, kind: str, *, known: bool) -> Asked:
-    """Rows of the calibration; a pose that was found outside the map by accident is wrong there."""
+    """Return the rows of the calibration data for the predictions of a query set.
+
+    The answer to an out-of-map query always counts as wrong, even if its position is close by accident.
+
+    Args:
+        predictions: the answers.
+        kind: kind of the queries.
+        known: whether the queries lie in the map.
+    """
     distance = np.linalg.norm(predictions.T_answer[:, :2, 3] - predictions.T_true[:, :2, 3], axis=1)
     right = (np.nan_to_num(distance, nan=np.inf) <= RIGHT_M) & known
     count = len(right)

@@ -1,4 +1,4 @@
-"""Fit ``Calibration`` to asked queries: logistic regression by Newton's method, thresholds from the queries outside the map."""
+"""Fit a ``Calibration``: logistic regression by Newton's method, and thresholds from the out-of-map queries."""
 
 from dataclasses import dataclass
 
@@ -18,21 +18,23 @@ from service.maps.calibration import (
     terms,
 )
 
+#: Largest distance of a right answer, metres on the ground.
 RIGHT_M = 1.0
+#: False-accept rates with a threshold.
 RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
-#: Strength of the ridge, in queries; the one that lost least when each city was predicted from the other.
+#: Strength of the ridge penalty, in queries. It had the smallest loss when each city was predicted from the others (decision 0084).
 RIDGE = 10.0
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Queries with the truth about them.
+    """Calibration data: the confidence features of localized queries and their labels.
 
     Attributes:
-        evidence: (n, F); NaN where nothing was registered.
-        right: (n) whether the position was within 1 m.
-        known: (n) whether the query was taken in the map.
-        kind: (n) what sort of query it was, for thresholds and tables.
+        evidence: confidence features in the order of ``FEATURES``; NaN without registration (n, F).
+        right: whether the position of the answer is right, within ``RIGHT_M`` (n,).
+        known: whether the query lies in the map (n,).
+        kind: kind of the query, for thresholds and tables (n,).
     """
 
     evidence: NDArray[np.float64]
@@ -44,28 +46,32 @@ class Asked:
         return len(self.right)
 
     def registered(self) -> "Asked":
-        """Those that have evidence; the others' confidence is 0 without any calibration."""
+        """Return the queries with confidence features. The confidence of the others is always 0."""
         keep = np.isfinite(self.evidence).all(axis=1)
         return Asked(self.evidence[keep], self.right[keep], self.known[keep], self.kind[keep])
 
 
 def pooled(parts: list[Asked]) -> Asked:
-    """Several as one."""
+    """Join calibration data.
+
+    Args:
+        parts: the data to join.
+    """
     return Asked(*(np.concatenate([getattr(part, name) for part in parts]) for name in Asked.__dataclass_fields__))
 
 
 def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RIDGE) -> Calibration:
-    """Calibrate.
+    """Fit a calibration.
 
-    Queries in the map and outside it get the same weight in all, whatever their numbers.
+    The queries in the map and the out-of-map queries have the same total weight, whatever their numbers.
 
     Args:
-        asked: of calibration cities.
-        measured_on: for people.
-        ridge: strength of the penalty on weights.
+        asked: the calibration data.
+        measured_on: description of the data for the calibration file; ``calibration_for`` compares its ``encoder_sha256``.
+        ridge: strength of the penalty on the weights, in queries.
 
     Raises:
-        DatasetError: one sort of queries is missing.
+        DatasetError: the data lack right answers, wrong answers, queries in the map or out-of-map queries.
     """
     used = asked.registered()
     if used.known.all() or not used.known.any() or used.right.all() or not used.right.any():
@@ -97,17 +103,17 @@ def _logistic(
         gradient = design.T @ (weight * (p - label)) + penalty * w
         curvature = (design * (weight * p * (1 - p))[:, None]).T @ design + np.diag(penalty)
         step = np.linalg.solve(curvature, gradient)
-        w -= step * min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-12))  # far from the end full steps overshoot
+        w -= step * min(1.0, 5.0 / max(float(np.abs(step).max()), 1e-12))  # a full step far from the optimum overshoots
         if np.abs(step).max() < 1e-9:
             break
     return Logistic(mean=tuple(mean), spread=tuple(spread), weights=tuple(w[:-1]), bias=float(w[-1]))
 
 
 def _thresholds(asked: Asked, right: Logistic) -> tuple[Threshold, ...]:
-    """For each rate the confidence that no more than this share of the queries outside the map reach, every kind weighing alike.
+    """Return for each rate the confidence that at most this share of the out-of-map queries reaches.
 
-    What is true of a user's robot is one camera and one map; which kind is the worst differs between cities by more than between
-    kinds, so the worst kind's threshold would only be the highest of four noisy ones (decision log).
+    All kinds of out-of-map queries have equal weight (decision 0039). The worst kind differs between cities, so its threshold would only be
+    the highest of several noisy ones.
     """
     confidence = np.zeros(len(asked))
     has = np.isfinite(asked.evidence).all(axis=1)
@@ -126,7 +132,15 @@ def _thresholds(asked: Asked, right: Logistic) -> tuple[Threshold, ...]:
 
 
 def expected_calibration_error(confidence: NDArray[np.float64], right: NDArray[np.bool_], *, bins: int = 15) -> float:
-    """Mean distance of confidence and share right over bins of equal mass (Naeini, Cooper and Hauskrecht, AAAI 2015)."""
+    """Compute the expected calibration error with bins of equal mass (Naeini, Cooper and Hauskrecht, AAAI 2015).
+
+    It is the mean absolute difference between the mean confidence and the share of right answers in a bin, weighted by the bin's size.
+
+    Args:
+        confidence: confidence of each answer (n,).
+        right: whether each answer is right (n,).
+        bins: number of bins.
+    """
     order = np.argsort(confidence, kind="stable")
     parts = np.array_split(order, bins)
     gaps = [len(part) * abs(confidence[part].mean() - right[part].mean()) for part in parts if len(part)]

@@ -1,4 +1,4 @@
-"""Ask the calibration cities' queries and fit; cities, maps and answers are kept and taken as they are the next time."""
+"""Localize the queries of the calibration cities and fit the calibration. Cities, maps and answers are stored and reused."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -29,33 +29,36 @@ from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration
 from service.maps.reader import MapBundle
 
+#: The query sets of the clear day.
 CLEAR_SETS = ("clear_precise", "clear_stereo")
-#: Distance of a map's places; and of a sparse survey's, whose queries look less alike, and must not be taken for strangers.
+#: Spacing of a map, and of a map from a sparse survey, metres. In a sparse map queries are less similar to the places. The confidence
+#: must not take them for out-of-map queries (decision 0038).
 PLACES_M, SPARSE_M = 1.0, 5.0
-#: Kinds of queries that are in no map, but for their depth preset.
+#: Kinds of out-of-map queries, without their depth preset.
 STRANGERS = ("other_city", "removed_streets", *KINDS)
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 def calibrate(
     work: Path, encoder: Path, *, anew: bool = False, report: Report = lambda *_: None
 ) -> tuple[Calibration, list[str]]:
-    """Fit confidence for an encoder.
+    """Fit the confidence for an encoder.
 
     Args:
-        work: where cities, maps and answers are kept; those of this encoder are taken as they are.
-        encoder: ONNX.
-        anew: ask the queries again, since the code that answers them has changed.
-        report: told after every frame, place and query.
+        work: folder of cities, maps and answers. The maps and answers of this encoder are reused.
+        encoder: the encoder, ONNX.
+        anew: localize the queries again, for example after a change of the code.
+        report: called after every frame, place and query.
 
     Raises:
         EncoderError: the encoder cannot be used.
-        DatasetError: the cities' queries are all of one sort, so there is nothing to fit.
+        DatasetError: the data lack right answers, wrong answers, queries in the map or out-of-map queries.
 
     Returns:
-        The calibration, and for people how well each city is predicted from the others.
+        The calibration, and lines of text on how well each city is predicted from the others.
     """
-    sha256 = Encoder.open(encoder).sha256  # said before the work, not after it
+    sha256 = Encoder.open(encoder).sha256  # refuse a bad encoder before the work
     cities = []
     for index in range(CITIES):
         plan = calibration_plan(index)
@@ -92,12 +95,16 @@ def _sparse(work: Path, encoder: Path, dataset: Dataset, report: Report) -> Loca
 
 
 def _asked(work: Path, encoder: Path, cities: list[Dataset], index: int, *, anew: bool, report: Report) -> Asked:
-    """One city: its queries of its map, the next city's, sparse ones of both, its own without a third of the streets; walls and rooms."""
+    """Return the calibration data of one city.
+
+    Its queries are localized in its own map, in the map of the next city, and in sparse maps of both. They are also localized in its own
+    map without a third of the streets. Walls and rooms are added.
+    """
     return _kept(work, encoder, cities[index], lambda: _ask(work, encoder, cities, index, report), anew=anew)
 
 
 def _asked_pairs(work: Path, encoder: Path, rig: PairRig, *, anew: bool, report: Report) -> Asked:
-    """A stereo rig: its cities' queries of their own maps and of each other's; walls and rooms."""
+    """Return the calibration data of a stereo rig: queries of its cities in their own and each other's maps, and walls and rooms."""
     cities = []
     for index in range(PAIR_CITIES):
         plan = pair_plan(rig, index)
@@ -121,7 +128,7 @@ def _asked_pairs(work: Path, encoder: Path, rig: PairRig, *, anew: bool, report:
 
 
 def _asked_repeating(work: Path, encoder: Path, street: Dataset, *, anew: bool, report: Report) -> Asked:
-    """A street whose blocks repeat, of its own map, picture by picture and in sequences: what is wrong there looks right."""
+    """Return the calibration data of a street with repeating blocks, where wrong places look right: single queries and sequences."""
 
     def ask() -> list[Asked]:
         return in_the_map(_localizer(work, encoder, street, street.name, report), street, report)
@@ -130,7 +137,7 @@ def _asked_repeating(work: Path, encoder: Path, street: Dataset, *, anew: bool, 
 
 
 def _kept(work: Path, encoder: Path, city: Dataset, ask: Callable[[], list[Asked]], *, anew: bool) -> Asked:
-    """Answers of an earlier run, or those of a new one."""
+    """Return the stored calibration data of an earlier run, or compute and store them."""
     kept = work / f"asked-{city.name}-{Encoder.open(encoder).sha256[:12]}.npz"
     if not kept.exists() or anew:
         asked, part = pooled(ask()), kept.with_suffix(".part.npz")
@@ -164,7 +171,14 @@ def _ask(work: Path, encoder: Path, cities: list[Dataset], index: int, report: R
 
 
 def cross_checks(parts: list[Asked], alike: Asked) -> list[str]:
-    """How well each city is predicted from the others: what calibration can be believed to do elsewhere."""
+    """Return lines of text on how well each city is predicted from the others.
+
+    These figures show how well the calibration transfers to unseen cities.
+
+    Args:
+        parts: calibration data of each city.
+        alike: further data that take part in every fit: the stereo rigs and the repeating blocks.
+    """
     lines = []
     for index, held_out in enumerate(parts):
         calibration = fit(pooled([alike, *(part for k, part in enumerate(parts) if k != index)]), measured_on={})
@@ -183,7 +197,12 @@ def cross_checks(parts: list[Asked], alike: Asked) -> list[str]:
 
 
 def confidences(calibration: Calibration, asked: Asked) -> NDArray[np.float64]:
-    """Of every row; 0 where nothing was registered."""
+    """Compute the confidence of every row (n,); 0 without registration.
+
+    Args:
+        calibration: the calibration.
+        asked: the data.
+    """
     found = np.zeros(len(asked))
     has = np.isfinite(asked.evidence).all(axis=1)
     found[has] = calibration.confidence(asked.evidence[has])

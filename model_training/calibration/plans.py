@@ -1,4 +1,4 @@
-"""The cities that confidence is calibrated on: neither trained on, nor watched, nor evaluated."""
+"""Plan the calibration cities: they serve neither training nor validation nor evaluation."""
 
 from dataclasses import dataclass
 
@@ -7,26 +7,31 @@ from model_training.simulation.plan import CameraPlan, QueryPlan, SimulationPlan
 from model_training.simulation.sensor_parameters import RgbParameters, StereoParameters, SurveyParameters
 from model_training.training.recipe import CALIBRATION_SEEDS
 
+#: Number of cities with modelled depth errors.
 CITIES = 3
+#: Number of frames in a sequence.
 SEQUENCE = 5
-#: Seed of the street of blocks that repeat, among the calibration's.
+#: Index of the seed of the street with repeating blocks in ``CALIBRATION_SEEDS``.
 _REPEATING = 50
-#: Seeds of the cities of ``PAIR_RIGS``, among the calibration's: so many each, from here on.
+#: Index of the first seed of the cities of ``PAIR_RIGS`` in ``CALIBRATION_SEEDS``, and number of cities for each rig.
 _PAIRS, PAIR_CITIES = 10, 2
-#: Stops brighter than metered, of the drives in hard light. Sunlit road clips there, and what has no texture is matched badly: half of
-#: the outliers of KITTI's drive 0005 (decision log, 2026-11-25).
+#: Exposure above the metered one in the traversals in hard light, stops. Sunlit roads clip there, and stereo matching fails without
+#: texture. On KITTI drive 0005 half of the outliers without texture lie in such pixels (decision 0138).
 HARD_LIGHT_EV = (0.0, 0.4, 0.8)
+#: The depth presets.
 BOTH = ("precise", "stereo")
 
 
 def calibration_plan(index: int, *, queries: int = 350, hard: int = 40, sequences: int = 80) -> SimulationPlan:
-    """One of ``CITIES``: a clear day's drive and every hard condition, with both depth presets; the last has sequences too.
+    """Plan one of the ``CITIES``: a traversal on a clear day and one in each hard condition, with both depth presets.
+
+    The last city has sequences too.
 
     Args:
-        index: of the city.
-        queries: of the clear day's drive.
-        hard: of each hard condition.
-        sequences: of ``SEQUENCE`` frames, in the last city.
+        index: index of the city, from 0.
+        queries: number of queries on the clear day.
+        hard: number of queries in each hard condition.
+        sequences: number of sequences of ``SEQUENCE`` frames in the last city.
     """
     drives = [QueryPlan(name="clear", traversal=1, count=queries, depths=BOTH)]
     drives += [hard_query(name, traversal=2 + k, count=hard, depths=BOTH) for k, name in enumerate(HARD)]
@@ -41,7 +46,12 @@ def calibration_plan(index: int, *, queries: int = 350, hard: int = 40, sequence
 
 
 def repeating_plan(*, singles: int = 150, sequences: int = 100) -> SimulationPlan:
-    """A street of blocks that are all alike but for a landmark every few of them: what is there cannot always be told."""
+    """Plan a street of equal blocks with a landmark every few blocks. The place is often ambiguous there.
+
+    Args:
+        singles: number of single queries.
+        sequences: number of sequences of ``SEQUENCE`` frames.
+    """
     drives = (
         QueryPlan(name="clear", traversal=1, count=singles, depths=BOTH, aside_m=1.5),
         QueryPlan(
@@ -55,20 +65,21 @@ def repeating_plan(*, singles: int = 150, sequences: int = 100) -> SimulationPla
 
 @dataclass(frozen=True)
 class PairRig:
-    """A stereo rig whose pairs are rendered and matched, and the survey that it asks.
+    """A stereo rig with rendered and matched image pairs, and the survey of its map.
 
-    A calibration on drawn errors alone takes real stereo depth for a stranger's (decision log): matching errs in another way.
+    Stereo-matched depth has other errors than modelled ones. A calibration on modelled errors alone takes real stereo depth for that of
+    out-of-map queries (decision 0134).
 
     Attributes:
-        name: of its kinds of queries.
-        camera: of the left picture.
-        camera_height_m: above the ground.
-        stereo: focal length times baseline, and how badly it is rectified.
-        depths: matchers.
-        lidar: of the survey.
-        lidar_height_m: above the ground.
-        spacing_m: between scans.
-        survey: how it drove.
+        name: name of the rig in its kinds of queries.
+        camera: camera of the left image.
+        camera_height_m: height of the camera above the ground, metres.
+        stereo: focal length times baseline, and errors of the rectification.
+        depths: names of the stereo matchers.
+        lidar: name of the survey's LiDAR model.
+        lidar_height_m: height of the LiDAR above the ground, metres.
+        spacing_m: distance between scans, metres.
+        survey: errors and speed of the survey, and the share of it behind other vehicles.
     """
 
     name: str
@@ -82,14 +93,15 @@ class PairRig:
     survey: SurveyParameters
 
 
+#: The stereo rigs of the calibration.
 PAIR_RIGS = (
-    # A car as KITTI's: Geiger et al., Vision meets Robotics, IJRR 2013. Poses of GNSS and inertial sensors err by a decimetre.
+    # A car like KITTI's (Geiger et al., Vision meets Robotics, IJRR 2013). Poses of GNSS and inertial sensors have errors of about 0.1 m.
     PairRig(
         "car", CameraPlan(width=1242, height=376, horizontal_deg=81.4), 1.65, StereoParameters(focal_baseline_px_m=384.0), ("sgbm",),
         "hdl_64", 1.73, 2.5, SurveyParameters(position_m=0.08, angle_deg=0.1, speed_m_s=8.0, followed=0.3),
     ),
-    # A small robot: stereo of 0.2 m baseline matched by blocks or along scan lines, in a survey by a LiDAR of 32 beams. It is rectified as
-    # well as the car's: the same angles are half as many of its pixels.
+    # A small robot with a stereo baseline of 0.2 m, block matching or semi-global matching, and a survey by a LiDAR with 32 beams. Its
+    # rectification errors equal the car's in angle, so they are half as many pixels.
     PairRig(
         "robot", CameraPlan(width=640, height=400, horizontal_deg=80.0), 0.9,
         StereoParameters(focal_baseline_px_m=76.0, offset_px=0.29, vertical_px=0.21, roll_px=0.21), ("bm", "sgbm3way"), "hdl_32", 1.6, 1.5,
@@ -99,16 +111,16 @@ PAIR_RIGS = (
 
 
 def pair_plan(rig: PairRig, index: int, *, drives: int = 6, queries: int = 25, sequences: int = 30) -> SimulationPlan:
-    """One of ``PAIR_CITIES`` of a rig; the last has sequences too. Every drive draws how well the rig is rectified.
+    """Plan one of the ``PAIR_CITIES`` of a rig; the last one has sequences too.
 
-    Every second drive is in hard light, whose pictures clip.
+    Each traversal draws its own rectification errors. Every second traversal is in hard light, where images clip.
 
     Args:
-        rig: what asks, and the survey that it asks.
-        index: of the city.
-        drives: with ``queries`` pictures each.
-        queries: of each drive.
-        sequences: of ``SEQUENCE`` frames, in the last city.
+        rig: the stereo rig, one of ``PAIR_RIGS``, with its survey.
+        index: index of the city, from 0.
+        drives: number of traversals with single queries.
+        queries: number of queries in each traversal.
+        sequences: number of sequences of ``SEQUENCE`` frames in the last city.
     """
 
     def drive(traversal: int, name: str, count: int, sequence: int | None = None) -> QueryPlan:

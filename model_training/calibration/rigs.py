@@ -1,7 +1,7 @@
-"""Cameras of other shapes than the simulated one, cut out of its pictures: confidence must hold for what robots carry.
+"""Simulate cameras with other fields of view by cropping images, because confidence must hold for the cameras of real robots.
 
-A rig that sees less of the view grid shows less evidence at the same place. A calibration that has only met one shape takes every
-other one for a stranger. Stereo rigs of other shapes are simulated as they are (``plans.PAIR_RIGS``).
+A camera that covers less of the view grid has other confidence features at the same place. A calibration with a single field of view takes
+queries of every other one for out-of-map queries (decision 0126). Stereo rigs are simulated directly (``plans.PAIR_RIGS``).
 """
 
 from dataclasses import dataclass, replace
@@ -16,13 +16,16 @@ FOCAL_BASELINE_PX_M = 80.0
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A window in the middle of a picture.
+    """A camera that sees a window in the middle of the simulated image.
 
     Attributes:
-        name: of the kinds of queries.
-        width: share of the picture's width;
-        height: and of its height.
-        stereo: the request says that depth is from a stereo rig, so it is registered with the noise of matching and a free offset.
+        name: name of the rig in its kinds of queries.
+        width: width of the window, as a share of the image's width.
+        height: height of the window, as a share of the image's height.
+        stereo: the query states a stereo baseline. Registration then uses the noise of stereo matching and a free disparity offset.
+
+    Raises:
+        ValueError: the window is empty or exceeds the image.
     """
 
     name: str
@@ -31,14 +34,18 @@ class Rig:
     stereo: bool
 
     def __post_init__(self) -> None:
-        """Refuse a window beyond the picture."""
+        """Refuse an empty window, and one that exceeds the image."""
         if not (0 < self.width <= 1 and 0 < self.height <= 1):
             raise ValueError(
                 f"rig {self.name}: a window of {self.width:g} x {self.height:g} of the picture does not exist"
             )
 
     def seen(self, query: Query) -> Query:
-        """The same query by this rig: both pictures, of one size, are cut, and the camera's principal point moves with them."""
+        """Return the query as this rig would take it: cropped images, and the principal point moved accordingly.
+
+        Args:
+            query: a query whose RGB and depth images have the same size.
+        """
         camera = query.camera
         left, width = _window(camera.width, self.width)
         top, height = _window(camera.height, self.height)
@@ -49,11 +56,11 @@ class Rig:
         return replace(query, rgb=rgb, depth_m=depth_m, camera=cut, baseline_m=baseline_m)
 
 
-#: Small RGB-D cameras see 69 x 42 of the simulated 90 x 74 degrees (640 x 480 pixels).
+#: The rigs of the calibration. Small RGB-D cameras see 69 x 42 of the simulated 90 x 74 degrees (640 x 480 pixels; decision 0126).
 RIGS = (Rig("narrow", 0.69, 0.51, stereo=False),)
 
 
 def _window(pixels: int, share: float) -> tuple[int, int]:
-    """First pixel and number of pixels of the middle part."""
+    """Return the first pixel and the number of pixels of the middle part."""
     kept = max(1, round(pixels * share))
     return (pixels - kept) // 2, kept

@@ -1,7 +1,7 @@
-"""Places that are in no map: plain walls near by, and rooms. Drawn of boxes, since no city of the simulator has their like.
+"""Render out-of-map queries that no simulated city has: plain walls at close range, and rooms. Both consist of boxes.
 
-A city's own strangers (another city, streets that the map lacks) are as rich in shape as its queries. What is flat fits anywhere
-in a city along its façades, so it has to be asked for by itself. The evaluation draws its own walls and rooms (``benchmarks``).
+Other out-of-map queries (another city, streets that the map lacks) are as rich in shape as the queries in the map. A flat wall fits many
+facades of a city. So the calibration needs walls of its own (decision 0084). The evaluation has other walls and rooms (``benchmarks``).
 """
 
 from collections.abc import Callable, Iterator
@@ -16,17 +16,18 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import rotation_x, rotation_z
 from service.localization.query import Query
 
-_FAR = 80.0  # metres: as good as without end
+#: Distance that counts as infinite, metres.
+_FAR = 80.0
 
 
 @dataclass(frozen=True)
 class Box:
-    """A solid block that stands upright, in the level frame: x right, y down, z forward, the camera at its origin.
+    """An upright solid box, in the level frame of the camera: x right, y down, z forward, the camera at the origin.
 
     Attributes:
-        low: (3) corner, metres, in that frame turned by ``yaw_rad`` about the vertical.
-        high: (3) the opposite one.
-        yaw_rad: to the right.
+        low: corner with the smallest coordinates, metres, in the frame of the camera turned by ``yaw_rad`` about the vertical.
+        high: the opposite corner, metres, same frame.
+        yaw_rad: turn to the right, radians.
     """
 
     low: tuple[float, float, float]
@@ -34,7 +35,11 @@ class Box:
     yaw_rad: float = 0.0
 
     def entered(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where rays (H, W, 3) from the camera meet it, as multiples of the ray; infinity where they do not (slab method)."""
+        """Intersect rays from the camera with the box (slab method); return multiples of the ray (H, W), infinite without intersection.
+
+        Args:
+            rays: directions of the rays, level frame (H, W, 3).
+        """
         sine, cosine = np.sin(self.yaw_rad), np.cos(self.yaw_rad)
         x, z = rays[..., 0] * cosine - rays[..., 2] * sine, rays[..., 0] * sine + rays[..., 2] * cosine
         near, far = np.full(x.shape, -np.inf), np.full(x.shape, np.inf)
@@ -46,7 +51,11 @@ class Box:
 
 
 def wall(rng: np.random.Generator) -> list[Box]:
-    """What stands close before the camera: a wall, often bare, sometimes with another one beside it."""
+    """Draw a wall close to the camera, often bare, sometimes with another wall beside it.
+
+    Args:
+        rng: random generator.
+    """
     distance, yaw = float(rng.uniform(0.7, 12.0)), float(np.deg2rad(rng.uniform(-50, 50)))
     height = _FAR if rng.random() < 0.5 else float(rng.uniform(2.0, 9.0))
     ground = _ground(rng)
@@ -67,7 +76,11 @@ def wall(rng: np.random.Generator) -> list[Box]:
 
 
 def room(rng: np.random.Generator) -> list[Box]:
-    """The inside of a room, a corridor or a hall, with what stands in it; one wall may be missing."""
+    """Draw the inside of a room, a corridor or a hall with objects in it; one wall may be missing.
+
+    Args:
+        rng: random generator.
+    """
     yaw, ground = float(rng.uniform(-np.pi, np.pi)), _ground(rng)
     ceiling = ground - float(rng.uniform(2.2, 5.0))
     left, back, right, front = (float(value) for value in np.exp(rng.uniform(np.log(0.8), np.log(14.0), 4)))
@@ -82,29 +95,29 @@ def room(rng: np.random.Generator) -> list[Box]:
     for _ in range(int(rng.integers(0, 9))):
         x, z = float(rng.uniform(-left, right)), float(rng.uniform(-back, front))
         wide, deep, tall = (float(value) for value in rng.uniform(0.2, (1.6, 1.6, 2.2)))
-        if max(abs(x) - wide, abs(z) - deep) > 0.4:  # not around the camera
+        if max(abs(x) - wide, abs(z) - deep) > 0.4:  # keep the camera outside of the object
             boxes.append(Box((x, ground - tall, z), (x + wide, ground, z + deep), yaw))
     return boxes
 
 
 def _ground(rng: np.random.Generator) -> float:
-    """Height of the camera above it, metres."""
+    """Draw the height of the camera above the ground, metres."""
     return float(rng.uniform(0.4, 2.2))
 
 
-#: Strangers by the name that their kind has in the calibration.
+#: Functions that draw a scene, by the name of its kind in the calibration.
 KINDS: dict[str, Callable[[np.random.Generator], list[Box]]] = {"wall": wall, "room": room}
 
 
 def strangers(kind: str, camera: PinholeCamera, preset: str, count: int, rng: np.random.Generator) -> Iterator[Query]:
-    """Pictures of one kind, as the preset's depth camera measures them, tilted by a few degrees as a robot's are.
+    """Yield out-of-map queries of one kind, with the depth noise of a preset, tilted by a few degrees like a robot's camera.
 
     Args:
         kind: one of ``KINDS``.
-        camera: of the colour and of the depth picture.
-        preset: one of ``DEPTHS``.
-        count: of pictures.
-        rng: chance.
+        camera: camera of the RGB and the depth image.
+        preset: depth preset, one of ``DEPTHS``.
+        count: number of queries.
+        rng: random generator.
     """
     for _ in range(count):
         yield _picture(KINDS[kind](rng), camera, preset, rng)
@@ -117,7 +130,7 @@ def _picture(boxes: list[Box], camera: PinholeCamera, preset: str, rng: np.rando
     seen = depths.argmin(axis=0)
     depth = depths.min(axis=0)
     there = depth < _FAR
-    bare = rng.random(len(boxes)) < 0.5  # without texture, so that stereo makes depth up there
+    bare = rng.random(len(boxes)) < 0.5  # without texture, so stereo matching returns wrong depth there
     measured = measured_depth(
         np.where(there, depth, 0).astype(np.float32), bare[seen] & there, DEPTHS[preset], CONDITIONS["clear"], rng
     )

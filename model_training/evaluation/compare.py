@@ -14,24 +14,24 @@ from model_training.evaluation.predict import RANKED, Predictions, joined
 from model_training.evaluation.saved_run import SavedRun
 from service.errors import DatasetError
 
-#: Below it, chance alone is called an unlikely reason.
+#: A difference is significant if its p-value is below this.
 _P = 0.05
-#: Truths nearer than this are the same pose; files keep nine digits.
+#: Largest difference of equal ground-truth poses, in each number of the matrix. Files store nine digits.
 _SAME_M = 1e-6
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What differs between two runs A and B.
+    """The differences between two runs A and B.
 
     Attributes:
-        shares: by measure, over all queries.
-        sets: within 1 m and accepted, by query set.
-        errors: distances of answers, accepted or not, that both have.
-        gained: rows (of the joined sets) that only B has within 1 m and accepted.
-        lost: rows that only A has.
+        shares: comparison of each share over all queries, by the name of the measure.
+        sets: comparison of the share within 1 m and accepted, by query set.
+        errors: comparison of the distances of answers that both runs have, accepted or not. None if there are none.
+        gained: rows of the joined sets for which only B is within 1 m and accepted.
+        lost: rows for which only A is.
         first: answers of A, all sets joined.
-        second: answers of B.
+        second: answers of B, all sets joined.
     """
 
     shares: dict[str, PairedShares]
@@ -44,10 +44,10 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """What the queries say, and no more.
+        """Return a sentence that says which run is better.
 
-        A run is better only if it has more right answers without more wrong ones that are accepted, or fewer wrong ones that are
-        accepted without fewer right ones; at least one of the two by more than chance explains.
+        B is better in two cases: it has significantly more right answers, and the share of wrong accepted answers does not rise. Or it has
+        significantly fewer wrong accepted answers, and not significantly fewer right ones. The same holds for worse, the other way round.
         """
         right, wrong = self.shares["within_1_m"], self.shares["accepted_but_wrong"]
         told = f"{_told(right, 'accepted and within 1 m')}; {_told(wrong, 'accepted and wrong')}"
@@ -68,7 +68,7 @@ class Comparison:
         return f"No difference can be told from chance: {told}."
 
     def as_json(self) -> dict[str, Any]:
-        """All figures as plain values."""
+        """Return all figures as JSON values."""
         return {
             "verdict": self.verdict,
             "shares": {name: asdict(each) | {"difference": each.difference} for name, each in self.shares.items()},
@@ -95,15 +95,23 @@ def _told(each: PairedShares, what: str) -> str:
 
 
 def p_text(p: float) -> str:
-    """A probability as one says it."""
+    """Format a p-value with three decimals, or as ``<0.001``.
+
+    Args:
+        p: the p-value.
+    """
     return "<0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def compare(first: SavedRun, second: SavedRun) -> Comparison:
-    """Compare B (``second``) with A (``first``).
+    """Compare run B with run A over the same queries.
+
+    Args:
+        first: run A.
+        second: run B.
 
     Raises:
-        DatasetError: they did not ask the same queries; says which set and what differs.
+        DatasetError: the runs have different queries. The message names the query set and the difference.
     """
     _require_same_queries(first, second)
     names = list(first.predictions)

@@ -1,7 +1,8 @@
-"""How stereo matching errs: disparities against the scans of a survey that passed the same way.
+"""Measure the errors of stereo matching: compare disparities with the scans of a survey along the same path.
 
-A point of the scan ahead counts where the scan behind says the same, which drops what moves and what only one of them sees. So real and
-simulated recordings are measured alike, by sensors and not by a truth that only the simulator has.
+A point of the scan ahead counts if the scan behind has the same disparity there. This removes dynamic objects and points that only one
+scan sees. The reference comes from sensors, not from a ground truth that only the simulator has. So real and simulated recordings are
+measured in the same way.
 """
 
 from dataclasses import dataclass
@@ -16,25 +17,26 @@ from model_training.importing.lidar_depth import visible_points
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import transform_points
 
-#: Two scans say the same where their disparities differ by less than this, within so many pixels each way.
+#: Two scans agree at a pixel if their disparities differ by less than ``AGREE_PX``, for all points within ``REACH_PX`` along each axis.
 AGREE_PX, REACH_PX = 0.5, 2
-#: Mean size of the horizontal gradient (grey values a pixel) over a patch of this side, from which it counts as textured.
+#: A pixel is textured if the mean absolute horizontal gradient (grey values per pixel) of its patch is at least ``TEXTURED``.
 TEXTURED, PATCH_PX = 1.5, 9
 #: An error larger than this is an outlier, as in KITTI's stereo benchmark (Menze and Geiger, CVPR 2015).
 OUTLIER_PX = 3.0
+#: Distances along a row for the correlation of errors, pixels.
 LAGS_PX = (2, 4, 8, 12, 16, 24, 32, 48, 64)
 
 
 @dataclass(frozen=True, slots=True)
 class DisparityErrors:
-    """Of all points of a recording.
+    """The disparity errors of all points of a recording.
 
     Attributes:
-        error_px: (n) measured less scanned disparity; NaN where nothing was matched.
-        textured: (n) whether the picture has texture there.
-        z_m: (n) depth by the scan, metres.
-        line: (n) of which picture and row it is; the numbers only tell rows apart.
-        column: (n) in the picture.
+        error_px: measured disparity minus disparity of the scan, pixels; NaN where nothing was matched (n,).
+        textured: whether the image has texture at the point (n,).
+        z_m: depth of the point in the scan, metres (n,).
+        line: number of the image and its row. It only tells rows apart (n,).
+        column: column in the image (n,).
     """
 
     error_px: NDArray[np.float64]
@@ -44,24 +46,37 @@ class DisparityErrors:
     column: NDArray[np.int64]
 
     def sizes(self, *, textured: bool) -> NDArray[np.float64]:
-        """Absolute errors of what was matched, textured or not."""
+        """Return the absolute errors of the matched points, pixels (m,).
+
+        Args:
+            textured: select the points with texture, or those without.
+        """
         error = self.error_px[(self.textured == textured) & np.isfinite(self.error_px)]
         sizes: NDArray[np.float64] = np.abs(error)
         return sizes
 
     def unmatched(self, *, textured: bool) -> float:
-        """Share of the points where nothing was matched."""
+        """Return the share of points without a match.
+
+        Args:
+            textured: select the points with texture, or those without.
+        """
         return float(np.isnan(self.error_px[self.textured == textured]).mean())
 
     def outliers(self, *, nearest_m: float, farthest_m: float) -> float:
-        """Share of what was matched in a range of depths that is off by more than ``OUTLIER_PX``."""
+        """Return the share of matched points whose error exceeds ``OUTLIER_PX``; NaN without matched points.
+
+        Args:
+            nearest_m: smallest depth of the points, metres, inclusive.
+            farthest_m: largest depth, metres, exclusive.
+        """
         error = self.error_px[(self.z_m >= nearest_m) & (self.z_m < farthest_m) & np.isfinite(self.error_px)]
         return float((np.abs(error) > OUTLIER_PX).mean()) if len(error) else float("nan")
 
     def correlation_length_px(self) -> float:
-        """Distance along a row at which the errors' correlation falls to 1/e; outliers are clipped.
+        """Return the distance along a row at which the correlation of the errors falls to 1/e, pixels.
 
-        Interpolated between ``LAGS_PX``; the last of them where it does not fall so far.
+        Outliers are clipped. The value is interpolated between ``LAGS_PX``. It is the last of them if the correlation stays above 1/e.
         """
         error = np.clip(self.error_px - np.nanmedian(self.error_px), -OUTLIER_PX, OUTLIER_PX)
         matched = np.isfinite(error)
@@ -83,7 +98,11 @@ class DisparityErrors:
 
     @staticmethod
     def joined(parts: "list[DisparityErrors]") -> "DisparityErrors":
-        """Of several recordings; rows stay apart."""
+        """Join the errors of several images or recordings, and renumber their rows so that no two share a number.
+
+        Args:
+            parts: the errors to join, at least one.
+        """
         first = np.cumsum([0] + [int(part.line.max()) + 1 for part in parts])
         lines = np.concatenate([part.line + start for part, start in zip(parts, first, strict=False)])
         error_px, textured, z_m, column = (
@@ -94,11 +113,11 @@ class DisparityErrors:
 
 
 def disparity_errors(dataset: Dataset, query_set: str) -> DisparityErrors:
-    """Compare each query's depth with the nearest scans ahead of it and behind it.
+    """Compare the depth of each query with the nearest scan ahead of it and the nearest behind it.
 
     Args:
-        dataset: with the baseline of its stereo rig, and a survey that drove the queries' way.
-        query_set: with truth.
+        dataset: a dataset with the baseline of its stereo rig and a survey along the path of the queries.
+        query_set: name of a query set with ground truth.
 
     Raises:
         ValueError: the dataset has no baseline, or no query lies between two scans.
@@ -139,14 +158,18 @@ def disparity_errors(dataset: Dataset, query_set: str) -> DisparityErrors:
 
 
 def gradient_of(rgb: UInt8[NDArray[np.uint8], "H W 3"]) -> Float32[NDArray[np.float32], "H W"]:
-    """Mean size of the horizontal gradient around each pixel, grey values a pixel: what a matcher along rows can hold on to."""
+    """Return the mean absolute horizontal gradient around each pixel, grey values per pixel: the texture that a matcher along rows uses.
+
+    Args:
+        rgb: the image.
+    """
     grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     steps = np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0)) / 8  # Sobel sums eight differences of one pixel
     return np.asarray(cv2.blur(steps, (PATCH_PX, PATCH_PX)), np.float32)
 
 
 def _scans_between(frame: QueryFrame, T_map_lidar: NDArray[np.float64]) -> tuple[int, int] | None:
-    """The nearest scan ahead of the camera and the nearest behind it."""
+    """Return the indices of the nearest scan ahead of the camera and the nearest behind it; None if one is missing."""
     if frame.T_map_camera is None:
         return None
     away = T_map_lidar[:, :3, 3] - frame.T_map_camera[:3, 3]
@@ -160,7 +183,7 @@ def _scans_between(frame: QueryFrame, T_map_lidar: NDArray[np.float64]) -> tuple
 def _disparities(
     points: NDArray[np.float64], camera: PinholeCamera, focal_baseline_px_m: float
 ) -> Float32[NDArray[np.float32], "H W"]:
-    """Of the points that the camera sees, at their pixels; 0 elsewhere."""
+    """Return an image with the disparity of each visible point at its pixel, 0 elsewhere."""
     uv, z_m = visible_points(points, np.eye(4), camera)
     found = np.zeros((camera.height, camera.width), np.float32)
     column, row = np.rint(uv).astype(int).T
@@ -169,7 +192,7 @@ def _disparities(
 
 
 def _agreeing(one: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels of the one near which all that the other has is the same, and it has something."""
+    """Return the pixels of ``one`` near which ``other`` has points, and all of them agree with it."""
     around = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
     most = cv2.dilate(other, around)
     least = cv2.erode(np.where(other > 0, other, np.float32(np.inf)), around)

@@ -1,48 +1,83 @@
-"""Errors of predicted positions (paper, eq. 14-18), with intervals.
+"""Error measures of predicted positions (paper, eq. 14-18), with intervals.
 
-The paper counts a distance in frames or pixels as it suits; here a distance is metres on the ground (x, y).
+The paper measures distances in frames or in pixels. Here a distance is in metres on the ground (x, y).
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+#: An array of positions, angles or errors; the functions give its shape.
 Errors = NDArray[np.float64]
 
 
 def distance_errors(predicted_xy: Errors, true_xy: Errors) -> Errors:
-    """ED (eq. 14): distance between prediction and truth, metres, (n)."""
+    """Compute the ED (eq. 14): distance between prediction and ground truth, metres (n,).
+
+    Args:
+        predicted_xy: predicted positions, metres, map frame (n, 2).
+        true_xy: true positions, metres, map frame (n, 2).
+    """
     distances: Errors = np.linalg.norm(predicted_xy - true_xy, axis=1)
     return distances
 
 
 def error_rate(right: NDArray[np.bool_]) -> float:
-    """ER (eq. 15) of a classification: the share that is not right. A metric position is never exactly right."""
+    """Compute the ER (eq. 15) of a classification: the share of wrong answers.
+
+    It does not apply to metric positions, because these are never exactly right.
+
+    Args:
+        right: whether each answer is right (n,).
+    """
     return float(1.0 - np.mean(right))
 
 
 def mean_error_distance(distances: Errors) -> float:
-    """MED (eq. 16): the mean of the error distances, metres."""
+    """Compute the MED (eq. 16): mean of the error distances, metres.
+
+    Args:
+        distances: error distances, metres (n,).
+    """
     return float(np.mean(distances))
 
 
 def mean_squared_error(distances: Errors) -> float:
-    """MSE (eq. 17, 18): the mean of the squared error distances, m2."""
+    """Compute the MSE (eq. 17, 18): mean of the squared error distances, square metres.
+
+    Args:
+        distances: error distances, metres (n,).
+    """
     return float(np.mean(np.square(distances)))
 
 
 def root_mean_squared_error(distances: Errors) -> float:
-    """Root of the MSE, metres; what ``evo_ape`` calls rmse for the translation part in the plane."""
+    """Compute the root of the MSE, metres. ``evo_ape`` calls it rmse, for the translation part in the plane.
+
+    Args:
+        distances: error distances, metres (n,).
+    """
     return float(np.sqrt(mean_squared_error(distances)))
 
 
 def heading_errors_deg(predicted_rad: Errors, true_rad: Errors) -> Errors:
-    """Size of the difference of headings, degrees, 0 to 180."""
+    """Compute the absolute difference of headings, degrees, 0 to 180 (n,).
+
+    Args:
+        predicted_rad: predicted headings, radians (n,).
+        true_rad: true headings, radians (n,).
+    """
     difference = (predicted_rad - true_rad + np.pi) % (2 * np.pi) - np.pi
     return np.abs(np.rad2deg(difference))
 
 
 def wilson_interval(successes: int, count: int, *, z: float = 1.959964) -> tuple[float, float]:
-    """95 % interval of a share (Wilson, 1927); for no trials it is everything, 0 to 1."""
+    """Compute the 95 % interval of a share (Wilson, 1927); 0 to 1 without trials.
+
+    Args:
+        successes: number of successes.
+        count: number of trials.
+        z: quantile of the standard normal distribution that belongs to the level of the interval.
+    """
     if count == 0:
         return 0.0, 1.0
     share = successes / count

@@ -1,4 +1,4 @@
-"""One map against one dataset: predictions, measures, the split each set belongs to, trajectories."""
+"""Evaluate a map on a dataset: predictions, measures, the split of each query set, trajectories."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,12 +14,18 @@ from service.errors import DatasetError
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Figures as JSON values, and the predictions of each set that they were made from."""
+    """The result of an evaluation.
+
+    Attributes:
+        figures: all figures as JSON values.
+        predictions: the predictions of each query set, by its name.
+    """
 
     figures: dict[str, Any]
     predictions: dict[str, Predictions] = field(default_factory=dict)
@@ -34,12 +40,20 @@ def evaluate(
     workers: int = 2,
     report: Report = lambda *_: None,
 ) -> Evaluation:
-    """Measure a map with query sets; all that have truth where none is named. ``refine=False`` measures retrieval alone.
+    """Measure a map with query sets.
 
-    The figures at the top are over all queries of all sets; ``sets`` has them for each set with its split.
+    The top-level figures are over all queries of all sets. ``sets`` holds the figures of each set with its split.
+
+    Args:
+        bundle: the map.
+        dataset: the dataset with the queries.
+        names: names of the query sets; None takes all sets with ground truth.
+        refine: register the answers. False measures retrieval alone.
+        workers: number of queries that are localized at the same time.
+        report: called after every query.
 
     Raises:
-        DatasetError: there is no query set with truth.
+        DatasetError: there is no query set with ground truth.
     """
     names = names or dataset.query_sets(with_truth=True)
     if not names:
@@ -67,7 +81,12 @@ def evaluate(
 
 
 def city_seen_in_training(dataset: Dataset, trained_on: tuple[str, ...]) -> bool | None:
-    """Whether the encoder saw this city; None where the encoder does not say what it was trained on."""
+    """Return whether the encoder was trained on the dataset's city; None if the encoder does not name its training cities.
+
+    Args:
+        dataset: the dataset.
+        trained_on: names of the training cities, as the encoder gives them.
+    """
     if not trained_on:
         return None
     source = dataset.description.source
@@ -78,10 +97,19 @@ def city_seen_in_training(dataset: Dataset, trained_on: tuple[str, ...]) -> bool
 
 
 def split_of(dataset: Dataset, name: str, city_seen: bool | None) -> str:
-    """``same_drive`` (the paper's way; it leaks), ``other_drive`` (honest), or ``unseen_city`` (and new to the encoder).
+    """Return the split of a query set.
 
-    A recording whose ``source`` does not list the set among its ``other_drives`` is taken for the survey's own drive:
-    that a query and the map are of two moments must be said, not guessed.
+    A set of a real recording is ``same_drive`` unless the ``source`` of the dataset lists it among its ``other_drives``. So an evaluation
+    never claims without evidence that queries and map come from different traversals.
+
+    Args:
+        dataset: the dataset.
+        name: name of the query set.
+        city_seen: whether the encoder was trained on this city; None if unknown.
+
+    Returns:
+        ``same_drive``: queries from the survey traversal, as in the paper; test data leaks into the map. ``other_drive``: queries from
+        another traversal. ``unseen_city``: from another traversal, in a city that the encoder was not trained on.
     """
     if _is_of_the_survey(dataset.description.source, name):
         return "same_drive"
@@ -94,13 +122,17 @@ def _is_of_the_survey(source: dict[str, Any], name: str) -> bool:
     for query in (source.get("plan") or {}).get("queries", []):
         if name in {f"{query.get('name')}_{depth}" for depth in query.get("depths", [])}:
             return bool(query.get("on_track") or query.get("traversal") == 0)
-    return True  # a set that the plan does not have was put there by somebody
+    return True  # the plan does not list the set, so its origin is unknown: assume the worst case
 
 
 def write_trajectory(path: Path, predictions: Predictions) -> None:
-    """Write the accepted poses, T_map_camera, in TUM format, each with the timestamp of its truth.
+    """Write the accepted poses T_map_camera in TUM format, each with the timestamp of its ground truth.
 
-    They are those that ``rms_distance_error_m`` is of; where a map is not calibrated, every answer is accepted.
+    ``rms_distance_error_m`` is computed from the same poses. Without a calibration of the map, every answer is accepted.
+
+    Args:
+        path: file to write.
+        predictions: the answers.
     """
     answered = predictions.localized & np.isfinite(predictions.T_answer[:, 0, 3])
     write_tum(path, predictions.stamp_s[answered], predictions.T_answer[answered])

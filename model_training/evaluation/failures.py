@@ -1,4 +1,4 @@
-"""Which stage lost a query, read off what was kept of its answer."""
+"""Find the stage that lost a query, from the stored part of its answer."""
 
 from enum import StrEnum
 
@@ -11,7 +11,7 @@ from model_training.evaluation.predict import RANKED, Predictions
 
 
 class Stage(StrEnum):
-    """What became of a query, as a reader is told it."""
+    """The outcome of a query, in the words of a report. ``WHY`` explains each."""
 
     RIGHT = "right"
     DOUBTED = "right, but doubted"
@@ -22,6 +22,7 @@ class Stage(StrEnum):
     REFUSED = "refused"
 
 
+#: Explanation of each outcome for the report.
 WHY = {
     Stage.RIGHT: "The answer is within 1 m of the truth and was accepted.",
     Stage.DOUBTED: "The position is within 1 m, but its confidence did not reach the threshold, so it was not accepted.",
@@ -34,13 +35,21 @@ WHY = {
 
 
 def position_errors(predictions: Predictions) -> NDArray[np.float64]:
-    """Distance of every answer, accepted or not, from its truth, metres, (n); infinite where there is none."""
+    """Return the distance of every answer, accepted or not, from its ground truth, metres (n,); infinite without an answer.
+
+    Args:
+        predictions: the answers.
+    """
     errors = distance_errors(predictions.T_answer[:, :2, 3], predictions.T_true[:, :2, 3])
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
 def stages(predictions: Predictions) -> list[Stage]:
-    """What became of each query, in order."""
+    """Return the outcome of each query, in order.
+
+    Args:
+        predictions: the answers.
+    """
     errors, true_xy = position_errors(predictions), predictions.T_true[:, :2, 3]
     among_ten = recall_at(predictions.ranked_xy, true_xy, RANKED)
     registered = np.isfinite(predictions.candidates[:, 0, 0])
@@ -67,9 +76,14 @@ def _stage(error_m: float, accepted: bool, among_ten: bool, registered: bool, ca
 
 
 def worst(predictions: Predictions, count: int) -> list[int]:
-    """Rows of the worst queries, the worst first.
+    """Return the rows of the worst queries, the worst first.
 
-    A wrong answer that was accepted does harm, so these come first; then what is not right, then right answers, each by distance.
+    Wrong accepted answers come first, because they do harm. Then come the other wrong answers, then the right ones. Each group is sorted
+    by distance, the largest first.
+
+    Args:
+        predictions: the answers.
+        count: largest number of rows.
     """
     errors = position_errors(predictions)
     wrong = errors > RIGHT_M

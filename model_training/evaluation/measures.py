@@ -1,7 +1,7 @@
-"""Pass 2: figures from predictions.
+"""Pass 2 of an evaluation: compute figures from predictions.
 
-Shares are over all queries, an unanswered one being wrong. Distances are over answered ones; ``forced`` gives them once
-more for the best hypothesis of every query that has one.
+Shares are over all queries. A query without an accepted answer counts as wrong. Distances are over the accepted answers. The forced
+figures (``forced``) are over the best hypothesis of every query that has one.
 """
 
 from typing import Any
@@ -20,21 +20,34 @@ from model_training.evaluation.error_measures import (
 )
 from model_training.evaluation.predict import Predictions, headings_of
 
+#: Largest distance of a right place, metres on the ground.
 RIGHT_PLACE_M = 5.0
-#: An answer within it is right (what ``confidence`` is the probability of); metres on the ground.
+#: Largest distance of a right answer, metres on the ground. ``confidence`` is the probability of a right answer.
 RIGHT_M = 1.0
 
 
 def recall_at(
     ranked_xy: NDArray[np.float64], true_xy: NDArray[np.float64], k: int, *, within_m: float = RIGHT_PLACE_M
 ) -> NDArray[np.bool_]:
-    """Whether one of the first k distinct places lies within 5 m (or another distance) of the truth, (n)."""
+    """Return for each query whether one of the first k distinct places is within reach of the ground truth (n,).
+
+    Args:
+        ranked_xy: positions of the retrieved places, the best first, NaN where there are fewer, metres, map frame (n, K, 2).
+        true_xy: true positions, metres, map frame (n, 2).
+        k: number of places that count.
+        within_m: largest distance of a right place, metres.
+    """
     distance = np.linalg.norm(ranked_xy[:, :k] - true_xy[:, None], axis=2)
     return np.asarray((np.nan_to_num(distance, nan=np.inf) <= within_m).any(axis=1))
 
 
 def measure(predictions: Predictions, street_names: list[str]) -> dict[str, Any]:
-    """All figures of one query set, as plain JSON values; ``ci95`` holds Wilson intervals of the shares."""
+    """Compute all figures of one query set as JSON values; ``ci95`` holds Wilson intervals of the shares.
+
+    Args:
+        predictions: the answers.
+        street_names: names of the map's streets, in the order of their features.
+    """
     p, count = predictions, len(predictions.T_true)
     true_xy = p.T_true[:, :2, 3]
     has_pose = np.isfinite(p.T_answer[:, 0, 3])
@@ -98,7 +111,7 @@ def _distances(distance: NDArray[np.float64]) -> dict[str, float | None]:
 
 
 def _confusion(p: Predictions, names: list[str]) -> dict[str, Any]:
-    """Counts, a row a true class, a column an answered one; the last column is "no street or no answer"."""
+    """Return the confusion matrix: a row per true street, a column per answered one. The last column means no street or no answer."""
     matrix = np.zeros((len(names), len(names) + 1), int)
     answer = np.where(p.localized, p.street_answer, -1)
     for true, found in zip(p.street_true, answer, strict=True):

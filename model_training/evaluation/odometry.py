@@ -1,4 +1,4 @@
-"""Frames of a dataset as one question: the odometry between them as a robot's wheels would give it."""
+"""Combine frames of a dataset into one sequence query, with simulated odometry between them."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from service.geometry.rigid import Transform, inverse, rotation_z, transform_fro
 from service.imaging.view_grid import ViewGrid
 from service.localization.query import Query
 
-#: Errors of the odometry from frame to frame: a share of the way, and a turn.
+#: Standard deviations of the odometry's error from frame to frame: translation as a share of the travelled distance, and yaw.
 _WAY, _TURN_RAD = 0.01, float(np.deg2rad(0.2))
 
 
@@ -22,15 +22,15 @@ def as_query(
     refine: bool = True,
     exact: bool = False,
 ) -> tuple[tuple[Query, ...], tuple[Transform, ...]]:
-    """The last frame first, and where the others stood against it, by odometry.
+    """Return the queries of a sequence, the last frame first, and the pose of each camera in the last camera's frame (4, 4).
 
     Args:
-        frames: in the order of the drive.
-        rng: of the odometry's errors.
-        grid: of the map that will be asked.
-        ranked: distinct places that the answer shall name.
-        refine: whether to register.
-        exact: the odometry is that of the frames' true poses, without errors of its own.
+        frames: frames in the order of the traversal.
+        rng: random generator for the errors of the odometry.
+        grid: view grid of the map to query.
+        ranked: number of distinct places in the answer.
+        refine: register the answer.
+        exact: take the odometry from the true poses, without errors.
     """
     queries, poses, T_last_this = [], [], np.eye(4)
     for k in range(len(frames) - 1, -1, -1):

@@ -1,4 +1,4 @@
-"""Two runs over the same queries: differences with intervals that know of the pairing."""
+"""Compare two runs over the same queries: differences with intervals for paired data."""
 
 from dataclasses import dataclass
 from math import comb, sqrt
@@ -9,22 +9,24 @@ from scipy.stats import wilcoxon
 
 from model_training.evaluation.error_measures import wilson_interval
 
+#: Number of bootstrap resamples, and their seed.
 _RESAMPLES, _SEED = 4000, 20261122
+#: Number of resamples that are computed at once.
 _BLOCK = 256
 
 
 @dataclass(frozen=True, slots=True)
 class PairedShares:
-    """A share of B less that of A over the same queries.
+    """A share of two runs A and B over the same queries.
 
     Attributes:
         first: share of A.
         second: share of B.
-        only_first: queries that A alone has.
-        only_second: queries that B alone has.
-        interval: 95 % of the difference (Newcombe, Statistics in Medicine 17:2635, 1998, method 10).
-        p: of McNemar's exact test, two-sided: how often chance alone parts so many of the queries so unevenly.
-        count: queries.
+        only_first: number of queries that only A has.
+        only_second: number of queries that only B has.
+        interval: 95 % interval of the difference, B minus A (Newcombe, Statistics in Medicine 17:2635, 1998, method 10).
+        p: two-sided p-value of McNemar's exact test.
+        count: number of queries.
     """
 
     first: float
@@ -37,12 +39,17 @@ class PairedShares:
 
     @property
     def difference(self) -> float:
-        """Of the shares, B less A."""
+        """Difference of the shares, B minus A."""
         return self.second - self.first
 
 
 def paired_shares(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> PairedShares:
-    """Compare two answers, right or not, to each of the same queries (n)."""
+    """Compare a share of two runs over the same queries.
+
+    Args:
+        first: whether run A has each query, for example answers it right (n,).
+        second: the same for run B (n,).
+    """
     count = len(first)
     both, only_first = int((first & second).sum()), int((first & ~second).sum())
     only_second, neither = int((~first & second).sum()), int((~first & ~second).sum())
@@ -53,7 +60,7 @@ def paired_shares(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> Paired
 
 
 def _newcombe(both: int, only_one: int, only_other: int, neither: int) -> tuple[float, float]:
-    """95 % interval of the share of one less that of the other."""
+    """Return the 95 % interval of the difference of two paired proportions, one minus the other (Newcombe 1998, method 10)."""
     n = both + only_one + only_other + neither
     one, other = (both + only_one) / n, (both + only_other) / n
     (low1, high1), (low2, high2) = wilson_interval(both + only_one, n), wilson_interval(both + only_other, n)
@@ -69,7 +76,12 @@ def _spread(a: float, b: float, phi: float) -> float:
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Two-sided exact p that queries which parted did so by a fair coin; 1 where none parted."""
+    """Compute the two-sided p-value of McNemar's exact test; 1 without discordant queries.
+
+    Args:
+        only_first: number of queries that only the first run has.
+        only_second: number of queries that only the second run has.
+    """
     parted = only_first + only_second
     fewer = min(only_first, only_second)
     return float(min(1.0, 2 * sum(comb(parted, k) for k in range(fewer + 1)) / 2**parted))
@@ -77,9 +89,17 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class PairedErrors:
-    """Errors of queries that both runs answered, metres: medians, mean difference (B less A) and its bootstrap interval.
+    """Errors of two runs A and B over the queries that both answered.
 
-    ``p`` is that of Wilcoxon's signed-rank test, two-sided, of no difference; 1 where no query differs.
+    Attributes:
+        first_median_m: median error of A, metres.
+        second_median_m: median error of B, metres.
+        mean_difference_m: mean difference, B minus A, metres.
+        mean_interval_m: its 95 % bootstrap interval, metres.
+        median_difference_m: median difference, B minus A, metres.
+        median_interval_m: its 95 % bootstrap interval, metres.
+        p: two-sided p-value of Wilcoxon's signed-rank test of no difference; 1 if no query differs.
+        count: number of queries that both answered.
     """
 
     first_median_m: float
@@ -93,9 +113,13 @@ class PairedErrors:
 
 
 def paired_errors(first_m: NDArray[np.float64], second_m: NDArray[np.float64]) -> PairedErrors | None:
-    """Compare distances (n), infinite for no answer, over the queries that both have; None where there are none.
+    """Compare the errors of two runs over the queries that both answered; None if there are none.
 
-    Intervals are percentiles of the mean and median difference over resampled queries, from a fixed seed.
+    The intervals are percentiles of the mean and median difference over resampled queries (bootstrap). The seed is fixed.
+
+    Args:
+        first_m: errors of run A, metres; infinite without an answer (n,).
+        second_m: errors of run B for the same queries (n,).
     """
     both = np.isfinite(first_m) & np.isfinite(second_m)
     if not both.any():

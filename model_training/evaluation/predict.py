@@ -1,4 +1,4 @@
-"""Pass 1: what a map answers to every query of a set. New measures then cost no new run."""
+"""Pass 1 of an evaluation: store the answers of a map to every query of a set. New measures then need no new run."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -21,13 +21,15 @@ from service.localization.prior import Prior
 from service.localization.query import Query
 from service.maps.calibration import FEATURES
 
+#: Number of distinct places that are stored per answer.
 RANKED = 10
-#: Of an answer's clusters and of its registered poses so many are kept.
+#: Largest number of clusters and of registered poses that are stored per answer.
 HYPOTHESES, CANDIDATES = 8, 4
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
-#: What a robot believes, from T_map_camera as it is and from chance.
+#: Returns the prior of a robot, from the true T_map_camera (4, 4) and a random generator.
 PriorOf = Callable[[Transform, np.random.Generator], Prior]
-#: The same query by another rig.
+#: Returns the same query as another camera rig would take it.
 SeenBy = Callable[[Query], Query]
 T = TypeVar("T")
 R = TypeVar("R")
@@ -35,15 +37,26 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Predictions:
-    """Truth and answers of one query set, a row a query.
+    """Ground truth and answers of one query set, a row per query.
 
-    ``T_true`` and ``T_answer`` (n, 4, 4) are T_map_camera, NaN where nothing was answered; ``street_true`` and
-    ``street_answer`` (n) are features of the map's streets, -1 for none; ``ranked_xy`` (n, RANKED, 2) are the most similar
-    distinct places, the best first, NaN where there are fewer; ``status`` (n), empty where nothing was answered; ``confidence`` (n),
-    ``evidence`` (n, F) and ``covariance`` (n, 6, 6), NaN where there is none; ``ms`` (n) of decoding and localizing;
-    ``stamp_s`` (n) are the truth's own timestamps, seconds. ``hypotheses`` (n, HYPOTHESES, 4) are x, y, heading (rad) and weight
-    of the clusters that the search found, ``candidates`` (n, CANDIDATES, 4) x, y, heading and support (nats) of the registered
-    poses, the best first; NaN where there are fewer, and in files of releases that did not keep them.
+    Attributes:
+        T_true: true T_map_camera (n, 4, 4).
+        T_answer: T_map_camera of the answer, accepted or not; NaN without an answer (n, 4, 4).
+        street_true: index of the street's feature at the true position, -1 for none (n,).
+        street_answer: index of the answered street's feature, -1 for none (n,).
+        ranked_xy: positions of the most similar distinct places, the best first, metres, map frame; NaN where there are fewer
+            (n, RANKED, 2).
+        ranked_place: indices of these places, -1 where there are fewer (n, RANKED).
+        status: status of the answer; empty without an answer (n,).
+        confidence: confidence of the answer; NaN if there is none (n,).
+        evidence: confidence features in the order of ``FEATURES``; NaN if there are none (n, F).
+        covariance: covariance of the answer; NaN if there is none (n, 6, 6).
+        ms: duration of decoding and localizing, milliseconds (n,).
+        stamp_s: timestamps of the ground truth, seconds (n,).
+        hypotheses: x, y (metres, map frame), heading (radians) and weight of the clusters of the search, NaN where there are fewer
+            (n, HYPOTHESES, 4). Files of early releases lack them; then all are NaN.
+        candidates: x, y (metres, map frame), heading (radians) and support (nats) of the registered poses, the best first, NaN where
+            there are fewer (n, CANDIDATES, 4). Files of early releases lack them; then all are NaN.
     """
 
     T_true: NDArray[np.float64]
@@ -63,27 +76,45 @@ class Predictions:
 
     def __post_init__(self) -> None:
         for name, kept in (("hypotheses", HYPOTHESES), ("candidates", CANDIDATES)):
-            if len(getattr(self, name)) != len(self.T_true):  # not given
+            if len(getattr(self, name)) != len(self.T_true):  # the caller left the default
                 object.__setattr__(self, name, np.full((len(self.T_true), kept, 4), np.nan))
 
     @property
     def localized(self) -> NDArray[np.bool_]:
-        """(n) whether the answer was accepted."""
+        """Whether each answer was accepted (n,)."""
         return np.asarray(self.status == "LOCALIZED")
 
     def of(self, rows: NDArray[np.bool_]) -> "Predictions":
-        """Those of some queries (n)."""
+        """Return the predictions of some queries.
+
+        Args:
+            rows: True for the queries to keep (n,).
+        """
         return Predictions(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
 
     def save(self, path: Path) -> None:
-        """Keep them as NPZ, without pickle."""
+        """Write the predictions to an NPZ file, without pickle.
+
+        Args:
+            path: file to write.
+        """
         part = path.with_suffix(".part.npz")
         np.savez_compressed(part, **{name: getattr(self, name) for name in self.__dataclass_fields__})
         part.rename(path)
 
     @staticmethod
     def load(path: Path) -> "Predictions":
-        """Read what ``save`` wrote."""
+        """Read a file that ``save`` wrote.
+
+        Args:
+            path: file to read.
+
+        Raises:
+            OSError: the file cannot be read.
+            KeyError: a field is missing.
+            BadZipFile: the file is not an NPZ file.
+            ValueError: an array in it is damaged.
+        """
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return Predictions(
                 **{
@@ -99,7 +130,11 @@ _LATER = ("hypotheses", "candidates")
 
 
 def joined(parts: list[Predictions]) -> Predictions:
-    """Several sets as one."""
+    """Join the predictions of several query sets.
+
+    Args:
+        parts: predictions of each set.
+    """
     return Predictions(
         **{name: np.concatenate([getattr(p, name) for p in parts]) for name in Predictions.__dataclass_fields__}
     )
@@ -109,13 +144,21 @@ def predict(
     localizer: Localizer, dataset: Dataset, name: str, *, refine: bool = True, workers: int = 2, frames_each: int = 1,
     prior_of: PriorOf | None = None, seen_by: SeenBy | None = None, report: Report = lambda *_: None,
 ) -> Predictions:  # fmt: skip
-    """Ask every query of a set that has truth; ``refine=False`` asks retrieval alone.
+    """Localize every query of a set with ground truth.
 
-    ``frames_each`` takes so many frames in a row as one question about the last of them, with an odometry that errs;
-    ``prior_of`` says what the robot believes beforehand of a query's pose, with chance of its own; ``seen_by`` changes the rig.
+    Args:
+        localizer: the localizer of the map.
+        dataset: the dataset with the queries.
+        name: name of the query set.
+        refine: register the answers. False answers by retrieval alone.
+        workers: number of queries that are localized at the same time.
+        frames_each: number of successive frames in one sequence query. It asks for the pose of its last frame and has noisy odometry.
+        prior_of: returns the prior of each query; None for no prior.
+        seen_by: changes each query to another camera rig; None keeps the rig.
+        report: called after every query.
 
     Raises:
-        DatasetError: the set has no truth or no frames.
+        DatasetError: the set has no ground truth or no frames.
     """
     frames = list(dataset.queries(name))
     if not frames or frames[0].T_map_camera is None:
@@ -140,7 +183,7 @@ def predict(
 
 
 def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[T], *, ahead: int) -> Iterator[R]:
-    """Results in order, never more than ``ahead`` items in memory."""
+    """Yield the results in the order of the items, with at most ``ahead`` items in memory."""
     rest = iter(items)
     waiting = [pool.submit(work, item) for item in islice(rest, ahead)]
     while waiting:
@@ -219,5 +262,9 @@ def _table(localizer: Localizer, frames: list[QueryFrame], answers: list[tuple[A
 
 
 def headings_of(transforms: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Headings (n), radians, of T_map_camera (n, 4, 4)."""
+    """Return the heading of each camera, radians, map frame (n,).
+
+    Args:
+        transforms: T_map_camera (n, 4, 4).
+    """
     return np.array([heading_of_camera(T) for T in transforms])

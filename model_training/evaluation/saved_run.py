@@ -1,4 +1,4 @@
-"""A run in a folder: its answers, and the map, the data and the settings that they are of."""
+"""Save an evaluation run in a folder: its answers, with the map, the dataset and the settings."""
 
 import json
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from service.errors import DatasetError
 from service.imaging.npy_header import NPY_HEADER_ERRORS
 from service.maps.reader import MapBundle
 
+#: Name of the settings file and of the folder of answers in a run's folder.
 FILE, ANSWERS = "run.json", "answers"
 
 
@@ -25,7 +26,13 @@ class _Frozen(BaseModel):
 
 
 class RunMap(_Frozen):
-    """The map that was asked, and where it lay."""
+    """The map of a run.
+
+    Attributes:
+        name: name of the map.
+        version: version of the map.
+        path: folder of the bundle at the time of the run.
+    """
 
     name: str
     version: str
@@ -33,23 +40,47 @@ class RunMap(_Frozen):
 
 
 class RunData(_Frozen):
-    """The dataset that the queries are of, and where it lay."""
+    """The dataset of the queries.
+
+    Attributes:
+        name: name of the dataset.
+        path: folder of the dataset at the time of the run.
+    """
 
     name: str
     path: str
 
 
 class RunSet(_Frozen):
-    """A query set; ``condition`` is the weather and light of a simulated one."""
+    """A query set.
 
-    name: str = Field(pattern=r"^[^./\\][^/\\]*$")  # a file's name
+    Attributes:
+        name: name of the set.
+        split: the split that it belongs to, as from ``evaluate.split_of``.
+        queries: number of queries.
+        condition: weather and light of a simulated set; None for others.
+    """
+
+    name: str = Field(pattern=r"^[^./\\][^/\\]*$")  # it becomes a file name
     split: str
     queries: int
     condition: str | None = None
 
 
 class RunSettings(_Frozen):
-    """``run.json``: all that two runs must share to be compared, and what may differ between them."""
+    """The content of ``run.json``: the settings of a run.
+
+    Attributes:
+        format: version of the file format.
+        map: the map.
+        dataset: the dataset of the queries.
+        registered: whether the answers were registered, not only retrieved.
+        sets: the query sets.
+        streets: names of the map's streets, in the order of their features.
+        streetfix: version of the package.
+        commit: commit of the source checkout; None outside a checkout.
+        made_at: time of the run.
+    """
 
     format: Literal[1] = 1
     map: RunMap
@@ -64,7 +95,13 @@ class RunSettings(_Frozen):
 
 @dataclass(frozen=True)
 class SavedRun:
-    """A run's settings and its answers by query set."""
+    """A saved run.
+
+    Attributes:
+        folder: folder of the run.
+        settings: its settings.
+        predictions: its answers, by query set.
+    """
 
     folder: Path
     settings: RunSettings
@@ -72,10 +109,13 @@ class SavedRun:
 
     @staticmethod
     def open(folder: Path) -> "SavedRun":
-        """Read what ``save_run`` wrote.
+        """Read a run that ``save_run`` wrote.
+
+        Args:
+            folder: folder of the run.
 
         Raises:
-            DatasetError: the folder is no saved run, or its parts do not fit each other.
+            DatasetError: the folder is not a saved run, or its parts contradict each other.
         """
         path = folder / FILE
         if not path.is_file():
@@ -105,7 +145,14 @@ def _answers(folder: Path, each: RunSet) -> Predictions:
 
 
 def save_run(folder: Path, bundle: MapBundle, dataset: Dataset, evaluation: Evaluation) -> SavedRun:
-    """Write answers, then settings, then figures; ``run.json`` is there only when its answers are."""
+    """Save a run: the answers, then the settings, then the figures. So ``run.json`` exists only if its answers do.
+
+    Args:
+        folder: folder of the run. It is created if it is missing.
+        bundle: the map.
+        dataset: the dataset of the queries.
+        evaluation: the result of the run.
+    """
     (folder / ANSWERS).mkdir(parents=True, exist_ok=True)
     conditions = _conditions(dataset.description.source)
     sets = tuple(
@@ -133,7 +180,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _conditions(source: dict[str, Any]) -> dict[str, str]:
-    """Weather and light of each query set, as the plan of a simulated dataset has them."""
+    """Return the weather and light of each query set, from the plan of a simulated dataset."""
     queries = (source.get("plan") or {}).get("queries", [])
     return {
         f"{query['name']}_{depth}": str(query.get("condition", "clear"))
@@ -143,7 +190,11 @@ def _conditions(source: dict[str, Any]) -> dict[str, str]:
 
 
 def commit_of(file: Path) -> str | None:
-    """The commit that a source file's checkout stands at; None where it lies in no checkout, as in an installed package."""
+    """Return the current commit of a file's Git checkout; None outside a checkout, as in an installed package.
+
+    Args:
+        file: a source file.
+    """
     top = next((folder for folder in file.resolve().parents if (folder / ".git" / "HEAD").is_file()), None)
     if top is None:
         return None

@@ -1,6 +1,7 @@
-"""Which stage of the answer loses a query: every stage is compared with the truth, in the order in which they run.
+"""Find the stage that loses a query: compare each stage of localization with the ground truth, in the order of execution.
 
-``failures`` reads the cause off kept answers. This module asks again and looks inside, so it needs the map and the pictures.
+``failures`` derives the cause from stored answers. This module localizes again and inspects each stage. So it needs the map and the
+images.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,18 +27,19 @@ from service.registration.points import blocks_of, points_from
 from service.registration.register import RegistrationSettings, Start, register, registered_of, score
 from service.registration.surfel_map import SurfelMap
 
-#: A level that is further off than this is wrong: registration starts from it and moves by about so much.
+#: Largest error of a right level. Registration starts from it and corrects about this much.
 TILT_DEG, HEIGHT_M = 3.0, 0.5
-#: Registration can reach the truth from a start that is this near.
+#: Largest error of a start from which registration can reach the true pose.
 START_M, START_DEG = 4.0, 30.0
-#: A candidate with another heading is another answer.
+#: Largest heading error of a right candidate, degrees.
 HEADING_DEG = 10.0
 
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 class Lost(StrEnum):
-    """The first stage that lost a query; ``NOT`` where the answer is right and accepted."""
+    """The first stage that lost a query; ``NOT`` if the answer is right and accepted. ``MEANING`` explains each."""
 
     NOT = "-"
     LEVEL = "level"
@@ -48,6 +50,7 @@ class Lost(StrEnum):
     STATUS = "status"
 
 
+#: Explanation of each stage for the report.
 MEANING = {
     Lost.NOT: "the answer is within 1 m and accepted",
     Lost.LEVEL: f"the estimated level is more than {TILT_DEG:g} degrees or {HEIGHT_M:g} m off",
@@ -61,22 +64,24 @@ MEANING = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QueryStages:
-    """One query against its truth, stage by stage. Distances are metres on the ground; infinite where there is nothing.
+    """The comparison of one query with its ground truth, stage by stage.
+
+    Distances are in metres on the ground. They are infinite if the stage has no result.
 
     Attributes:
-        number: of the query in its set.
-        tilt_deg: angle between the estimated vertical and the normal of the map's ground.
-        height_error_m: estimated camera height above the ground less the true one.
-        rank: of the first place within 5 m among the retrieved ones, from 1; 0 where none was found.
-        start_m: of the nearest start that looks the right way.
-        candidate_m: of the nearest registered pose that looks the right way.
-        from_truth_m: where registration ends that starts at the true pose.
+        number: number of the query in its set.
+        tilt_deg: angle between the estimated vertical and the normal of the map's ground, degrees.
+        height_error_m: estimated minus true height of the camera above the ground, metres.
+        rank: rank of the first retrieved place within 5 m, from 1; 0 if there is none.
+        start_m: distance of the nearest start with about the right heading.
+        candidate_m: distance of the nearest registered pose with about the right heading.
+        from_truth_m: distance between the true pose and the result of a registration that starts there.
         inliers_at_truth: share of inliers at the true pose.
-        inliers_from_truth: share of inliers where registration from the true pose ends.
-        error_m: of the answer, whatever its status.
-        heading_error_deg: of the answer, 0 to 180.
-        status: of the answer; empty where the pictures were refused.
-        confidence: of the answer; NaN where there is none.
+        inliers_from_truth: share of inliers at the result of the registration from the true pose.
+        error_m: distance of the answer from the true position, whatever its status.
+        heading_error_deg: heading error of the answer, 0 to 180 degrees.
+        status: status of the answer; empty if the images were refused.
+        confidence: confidence of the answer; NaN if there is none.
         noise: estimated standard deviation of inverse depth, 1/m.
         lost: the first stage that lost the query.
     """
@@ -98,7 +103,7 @@ class QueryStages:
     lost: Lost = Lost.LEVEL
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; None where there is no finite number."""
+        """Return the fields as JSON values; None for a number that is not finite."""
         return {
             name: None if isinstance(value, float) and not np.isfinite(value) else value
             for name, value in asdict(self).items()
@@ -108,10 +113,16 @@ class QueryStages:
 def stages_of(
     localizer: Localizer, dataset: Dataset, name: str, *, report: Report = lambda *_: None
 ) -> list[QueryStages]:
-    """Ask every query of a set and compare each stage with the truth.
+    """Localize every query of a set and compare each stage with the ground truth.
+
+    Args:
+        localizer: the localizer of the map.
+        dataset: the dataset with the queries.
+        name: name of the query set.
+        report: called after every query.
 
     Raises:
-        DatasetError: the set has no truth, or the map has no cloud to register on.
+        DatasetError: the set has no ground truth, or the map has no cloud for registration.
     """
     if localizer.bundle.cloud is None:
         raise DatasetError(
@@ -157,12 +168,20 @@ def _stages(localizer: Localizer, cloud: SurfelMap, asked: QueryFrame, truth: Tr
 
 
 def lost_by_stage(found: list[QueryStages]) -> dict[Lost, int]:
-    """How many queries each stage lost, in the order of the stages; those that are right come first."""
+    """Count the queries that each stage lost, in the order of the stages. The right and accepted queries come first.
+
+    Args:
+        found: the comparison of each query.
+    """
     return {stage: sum(each.lost == stage for each in found) for stage in Lost}
 
 
 def loses(found: QueryStages) -> Lost:
-    """The first stage that lost a query."""
+    """Return the first stage that lost a query.
+
+    Args:
+        found: the comparison of the query. Its own ``lost`` is ignored.
+    """
     if found.error_m <= RIGHT_M:
         return Lost.NOT if found.status == "LOCALIZED" else Lost.STATUS
     if found.tilt_deg > TILT_DEG or abs(found.height_error_m) > HEIGHT_M:
@@ -175,7 +194,7 @@ def loses(found: QueryStages) -> Lost:
 
 
 def _level_errors(localizer: Localizer, frame: Frame, truth: Transform) -> tuple[float, float]:
-    """Angle (degrees) between the estimated and the map's vertical, and the error of the camera's height (m)."""
+    """Return the angle between the estimated vertical and the map's (degrees), and the error of the camera height (metres)."""
     bundle = localizer.bundle
     nearest = int(np.argmin(np.linalg.norm(bundle.T_map_place[:, :2, 3] - truth[:2, 3], axis=1)))
     place = np.array(bundle.T_map_place[nearest])
@@ -192,7 +211,7 @@ def _candidates(answer: Answer, frame: Frame) -> Iterator[tuple[Rotation, np.nda
 
 
 def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, heading: float, most_deg: float) -> float:
-    """Distance of the nearest level pose whose heading is about right, metres; infinite where there is none."""
+    """Return the distance of the nearest level pose with about the right heading, metres; infinite if there is none."""
     away = [
         float(np.hypot(*(at[:2] - truth[:2, 3])))
         for R, at in poses
@@ -202,7 +221,7 @@ def _nearest(poses: Iterator[tuple[Rotation, np.ndarray]], truth: Transform, hea
 
 
 def _from_truth(localizer: Localizer, cloud: SurfelMap, frame: Frame, truth: Transform) -> tuple[float, float, float]:
-    """How far registration goes that starts at the truth (m), and the share of inliers before and after it."""
+    """Register from the true pose; return the distance that it moves (metres) and the share of inliers before and after."""
     settings = localizer.refining
     rig_px_m = frame.query.focal_baseline_px_m
     if rig_px_m is not None:

@@ -1,7 +1,8 @@
-"""Why a map accepts nearly no answer: what to check, the likeliest cause first.
+"""Explain why a map accepts almost no answer: list the possible causes, the likeliest first.
 
-Two kinds of findings. Some causes can be tried: a query is asked again as if its focal length or its depth unit were another, and what
-then fits the map much better is named. For the others the evidence of the answers is compared with what calibration saw.
+There are two kinds of causes. A wrong focal length or depth unit can be tested: the query is localized again with another value, and a
+value that fits the map much better is reported. For the other causes, the confidence features are compared with those of the
+calibration data.
 """
 
 from collections.abc import Sequence
@@ -19,18 +20,25 @@ from service.localization.query import Query
 from service.localization.reasons import FOCAL_FACTORS, GAIN, reasons_of, support_of
 from service.maps.calibration import FEATURES, Calibration
 
-#: Nearly nothing is answered: a smaller share of the queries than this is accepted.
+#: A map accepts almost no answer if it accepts less than this share of the queries.
 FEW = 0.1
-#: Factors of depth that are tried, and so many queries at most for each factor.
+#: Factors of depth to try.
 DEPTH_FACTORS = (0.001, 0.1, 10.0, 1000.0)
+#: Largest number of queries to try for each factor.
 TRIED = 6
-#: Median depth of a picture of a street, metres. Inside it the unit is right, and no other is tried: tiny depth fits any ground.
+#: Range of the median depth of street images, metres. Within it no other depth unit is tried, because very small depths fit any ground
+#: (decision 0108).
 USUAL_DEPTH_M = (1.5, 30.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One thing to check: ``what`` is wrong or out of range, ``check`` says what to do."""
+    """A possible cause.
+
+    Attributes:
+        what: what is wrong or out of range.
+        check: what to do.
+    """
 
     what: str
     check: str
@@ -40,12 +48,12 @@ class Cause:
 
 
 def causes(localizer: Localizer, frames: Sequence[QueryFrame], answers: Predictions) -> list[Cause]:
-    """What to check, the likeliest first; empty where enough is accepted.
+    """Return the possible causes, the likeliest first; none if enough answers are accepted.
 
     Args:
-        localizer: of the map that was asked.
-        frames: queries of the set; some of them are asked again.
-        answers: to all of them.
+        localizer: the localizer of the map.
+        frames: the queries of a set. Some of them are localized again.
+        answers: the answers to all of them.
     """
     if not len(frames) or answers.localized.mean() >= FEW:
         return []
@@ -59,11 +67,11 @@ def causes(localizer: Localizer, frames: Sequence[QueryFrame], answers: Predicti
 
 
 def out_of_range(calibration: Calibration, evidence: NDArray[np.float64]) -> list[Cause]:
-    """Groups of evidence whose median lies far from what calibration saw, the likeliest cause first.
+    """Return a cause for each group of confidence features whose median is outside the calibration data, the likeliest first.
 
     Args:
-        calibration: the map's.
-        evidence: of the answers (n, F); rows of NaN where there was none.
+        calibration: the calibration of the map.
+        evidence: confidence features of the answers; rows of NaN where there are none (n, F).
     """
     known = evidence[np.isfinite(evidence).all(axis=1)]
     if not len(known):
@@ -79,10 +87,10 @@ def out_of_range(calibration: Calibration, evidence: NDArray[np.float64]) -> lis
 
 
 def _tried(localizer: Localizer, queries: list[Query]) -> list[Cause]:
-    """The one change of focal length or depth unit that makes most queries fit much better, if there is one.
+    """Return the change of focal length or depth unit that fits most queries much better, if there is one.
 
-    It has to raise the support of the median query by ``GAIN``. A wrong focal length looks a little like a wrong unit, so only the change
-    that helps most is named.
+    The median gain of support must exceed ``GAIN``, and more than half of the queries must gain. A wrong focal length and a wrong unit
+    have similar effects. So only the change with the largest gain is reported.
     """
     before = np.array([_support(localizer, query) for query in queries])
     best, gained = None, GAIN
@@ -110,7 +118,7 @@ def _median_depth_m(queries: list[Query]) -> float:
 
 
 def _support(localizer: Localizer, query: Query) -> float:
-    """What speaks for the best pose, nats; 0 where nothing could be registered."""
+    """Return the support of the best pose, nats; 0 without registration."""
     try:
         evidence = localizer.localize(query).evidence
     except NoDepthError:
@@ -121,7 +129,7 @@ def _support(localizer: Localizer, query: Query) -> float:
 
 
 def _changed(query: Query, kind: str, factor: float) -> Query:
-    """A query with another focal length or another unit of depth."""
+    """Return the query with its focal length or its depth multiplied by ``factor``."""
     if kind == "depth":
         return replace(query, depth_m=(query.depth_m * np.float32(factor)).astype(np.float32))
     c = query.camera

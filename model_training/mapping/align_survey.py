@@ -1,9 +1,10 @@
-"""Survey poses brought into agreement: every scan is registered on the map that all of them make, over and over.
+"""Align the scans of a survey: register every scan against the map of all scans, in several rounds.
 
-Poses of a survey are off by centimetres, differently at every visit and every few dozen metres, so the map of them is thicker than its
-walls. Scans themselves are measured better than that. Each round builds a coarse map of all scans where they are said to stand and
-moves each onto it; errors average out over what scans see in common. The drive as a whole stays where it was: what all scans have
-in common no scan can tell, and each is held near its given pose.
+The poses of a survey have errors of centimetres. The errors differ at every visit and every few dozen metres. So a map from the given
+poses has walls that are too thick. A scan itself is more accurate than its pose. Each round builds a coarse map of all scans at their
+current poses and registers each scan against it. The errors average out over surfaces that several scans see.
+
+A common offset of all scans is unobservable. A prior holds each scan near its given pose, so the traversal as a whole stays in place.
 """
 
 from collections.abc import Callable
@@ -18,38 +19,45 @@ from service.geometry.rigid import transform_points
 from service.registration.kernel import STATE, QueryPoints, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 
+#: Number of rounds.
 ROUNDS = 4
-#: Points of a scan that take part, and their ranges: nearer ones are the vehicle, further ones tell more of its angles than of its place.
+#: Largest number of points of a scan, and their smallest and largest range. Nearer points lie on the vehicle. Farther points constrain
+#: the angles of the scan more than its position.
 POINTS, NEAREST_M, REACH_M = 3000, 2.5, 40.0
+#: Edge of a voxel of the coarse map, metres.
 VOXEL_M = 0.4
-#: Noise of a LiDAR's range, and roughness of surfaces, metres.
+#: Noise of a LiDAR range, and roughness of surfaces; standard deviations in metres.
 SIGMA_M, SURFACE_M = 0.02, 0.02
-#: Of the given poses, metres and radians: what they are held with, as if so many points said so.
+#: Prior around the given pose: standard deviations of position and tilt, and its information in units of points.
 POSITION_M, TILT_RAD, HELD_BY = 0.03, float(np.deg2rad(0.05)), 10.0
-#: Points further off the map than this say nothing: the given poses are surveyed ones.
+#: Largest distance between a point and its surfel, metres. The given poses are surveyed, so a larger distance is a wrong match.
 OFF_M = 0.5
-#: Scans of which fewer points lie where another scan has measured too stay where they are.
+#: A scan with fewer points than this on surfaces that another scan has measured keeps its pose.
 FEWEST = 300
 _SOLVER = SolverOptions(
     iterations=6, reach=OFF_M, robust_first=0.1, robust_last=0.05, surface=SURFACE_M, prior_weight=HELD_BY / POINTS, tilt=TILT_RAD,
     height=POSITION_M, position=POSITION_M, free_scale=False,
 )  # fmt: skip
 
-_TOGETHER = 64  # scans whose points are summed up at once
+#: Number of scans whose points go into the voxel map at once.
+_TOGETHER = 64
 
 Poses = Float64[NDArray[np.float64], "N 4 4"]
 Points = Float32[NDArray[np.float32], "n 3"]
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: Report = lambda *_: None) -> Poses:
-    """T_map_lidar of every scan, brought into agreement; those between two kept ones move as the one before.
+    """Compute T_map_lidar of every scan (N, 4, 4) after alignment.
+
+    A scan that does not take part moves like the last scan before it that does.
 
     Args:
-        dataset: with the scans.
-        poses: as the survey gives them.
-        kept: numbers of the scans that take part.
-        report: told after every scan that was read, and every one that was registered.
+        dataset: the dataset with the survey's scans.
+        poses: T_map_lidar of every scan as the survey gives it.
+        kept: indices of the scans that take part, ascending (K,).
+        report: called after every scan that was read and after every scan that was registered.
     """
     steps = len(kept) * (1 + ROUNDS)
     scans = []
@@ -74,7 +82,11 @@ def aligned(dataset: Dataset, poses: Poses, kept: NDArray[np.int64], *, report: 
 
 
 def _thinned(points: Points, number: int) -> Points:
-    """Some of a scan, drawn with its range, since near ones are the most; the same whenever it is read."""
+    """Return at most ``POINTS`` points of a scan, drawn at random.
+
+    Near points are the most frequent. So the probability of a point is proportional to its range. The scan's number is the seed: every
+    run draws the same points.
+    """
     range_m = np.linalg.norm(points, axis=1)
     points, range_m = (each[(range_m > NEAREST_M) & (range_m < REACH_M)] for each in (points, range_m))
     if len(points) > POINTS:
@@ -89,9 +101,10 @@ def _placed(points: Points, T: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _map_of(scans: list[Points], poses: Poses) -> tuple[VoxelMap, NDArray[np.int64]]:
-    """The map that scans make, and the keys of its voxels that more than one of them has points in, sorted.
+    """Build the voxel map of all scans; return it with the sorted keys of the voxels that hold points of more than one scan.
 
-    On surfaces that it alone has seen a scan lies as it is, and rounding of its own would make it wander.
+    Only these voxels take part in registration. On a surface that no other scan has seen, a scan matches itself. There the rounding of
+    the map would make its pose drift.
     """
     voxels = VoxelMap(VOXEL_M, lattice_origin(VOXEL_M, poses[:, :3, 3].mean(axis=0)))
     each_once: list[NDArray[np.int64]] = []
@@ -104,7 +117,7 @@ def _map_of(scans: list[Points], poses: Poses) -> tuple[VoxelMap, NDArray[np.int
 
 
 def _are_of(keys: NDArray[np.int64], some: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which keys are among some that are sorted."""
+    """Return for each key whether the sorted array ``some`` contains it."""
     at = np.minimum(np.searchsorted(some, keys), max(len(some) - 1, 0))
     found: NDArray[np.bool_] = some[at] == keys if len(some) else np.zeros(len(keys), bool)
     return found

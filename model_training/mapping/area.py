@@ -1,4 +1,4 @@
-"""Which part of a map a new drive replaces: what it covered, or a polygon."""
+"""Select the part of a map that a new traversal replaces: the ground that it covered, or a polygon."""
 
 import json
 from collections.abc import Callable
@@ -13,22 +13,26 @@ from scipy.spatial import cKDTree
 
 from service.errors import DatasetError
 
-#: Whether each of some positions (n, 2), metres, map frame, lies inside.
+#: Returns for each of some positions (n, 2), metres, map frame, whether it lies inside the area (n,).
 Area = Callable[[NDArray[np.float64]], NDArray[np.bool_]]
 
+#: Edge of a cell of the ground plan, metres.
 CELL_M = 2.0
-COVERED_M = 25.0  # further away from the drive's places the points are too few to stand for what was there
-_OWN_M = 4.0  # around a place, where the vehicle hides the ground
+#: Largest distance of a covered cell from the places of the traversal, metres. Farther away the points are too sparse.
+COVERED_M = 25.0
+#: Radius around a place that always counts as covered, metres. The vehicle hides the ground there.
+_OWN_M = 4.0
 
 
 def covered_by(points: NDArray[np.float64], places: NDArray[np.float64]) -> Area:
-    """Where a drive measured anything: cells of the ground plan, gaps of a cell or two filled.
+    """Return the area that a traversal covered: the cells of the ground plan with points.
 
-    What stood where now nothing is measured, behind a new wall or inside a block, is not covered and stays in the map.
+    Gaps of one or two cells are filled. Ground without new points is not covered and stays in the map, for example behind a new wall or
+    inside a block.
 
     Args:
-        points: means of the drive's voxels (n, 2 or 3), metres, map frame.
-        places: positions of its places (P, 2 or 3), metres, map frame.
+        points: means of the traversal's voxels, metres, map frame, (n, 2) or (n, 3).
+        places: positions of its places, metres, map frame, (P, 2) or (P, 3).
     """
     track = cKDTree(places[:, :2])
     near = points[track.query(points[:, :2], distance_upper_bound=COVERED_M)[0] < np.inf, :2]
@@ -51,7 +55,10 @@ def covered_by(points: NDArray[np.float64], places: NDArray[np.float64]) -> Area
 
 
 def polygon_of(path: Path) -> Area:
-    """The area of a GeoJSON file: Polygon, MultiPolygon, or a Feature or FeatureCollection of them, in metres of the map frame.
+    """Read an area, rim included, from a GeoJSON file.
+
+    Args:
+        path: Polygon, MultiPolygon, or a Feature or FeatureCollection of them; coordinates in metres, map frame.
 
     Raises:
         DatasetError: the file is missing or holds no valid polygon.

@@ -1,7 +1,7 @@
-"""Dataset + encoder -> map bundle: level by PCA, cut the view fan, encode, gather the cloud, write the bundle.
+"""Build a map bundle from a dataset and an encoder.
 
-What is finished is kept beside the output (``work``), so that a build that was killed goes on where it was and ends with the
-bundle that it would have ended with.
+The build levels each scan by PCA, renders its map views, encodes them, accumulates the cloud and writes the bundle.
+Finished parts stay beside the output (``work``). A build that was killed continues from them and ends with the same bundle.
 """
 
 import os
@@ -46,6 +46,7 @@ __all__ = [
     "BuildSettings", "LevelledScan", "build_map", "describe", "fan", "levelled_scans", "thinned", "tool_versions", "view_ranges",
 ]  # fmt: skip
 
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
@@ -53,23 +54,23 @@ def build_map(
     dataset: Dataset, encoder_file: Path, out: Path, settings: BuildSettings, *, overwrite: bool = False,
     threads: int | None = None, report: Report = lambda *_: None,
 ) -> Manifest:  # fmt: skip
-    """Build a map bundle, or go on with a build of the same that was killed.
+    """Build a map bundle, or continue a killed build with the same inputs; return the manifest.
 
     Args:
-        dataset: with a survey.
-        encoder_file: ONNX; it goes into the bundle.
-        out: folder of the bundle; it appears whole or not at all.
-        settings: spacing, fan, voxel.
-        overwrite: replace a bundle that is there.
-        threads: of the encoder; by default one a core.
-        report: told after every place.
+        dataset: the dataset with the survey.
+        encoder_file: the encoder, ONNX. The bundle gets a copy.
+        out: folder of the bundle. It appears complete or not at all.
+        settings: settings of the map.
+        overwrite: replace an existing bundle.
+        threads: number of threads of the encoder; None uses one per core.
+        report: called after every place, and after every step of the other stages.
 
     Raises:
-        DatasetError: the survey is empty or damaged.
+        DatasetError: the survey is empty or damaged, or ``settings.name`` is not a valid map name.
         EncoderError: the encoder cannot be used.
-        BundleError: ``out`` exists and ``overwrite`` is not given, or another process is building it.
+        BundleError: ``out`` exists and ``overwrite`` is False, or another process is building it.
     """
-    if out.exists() and not overwrite:  # said before the work, not after it
+    if out.exists() and not overwrite:  # refuse before the work, not after it
         raise BundleError(
             f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
         )
@@ -113,12 +114,12 @@ def build_map(
 
 
 def _cloud_around(poses: Transforms, settings: BuildSettings) -> VoxelMap:
-    """An empty cloud in the middle of a survey."""
+    """Return an empty voxel map with its origin in the middle of the survey."""
     return VoxelMap(settings.voxel_m, lattice_origin(settings.voxel_m, poses[:, :3, 3].mean(axis=0)))
 
 
 def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
-    """The map without its cloud and its calibration."""
+    """Return the content of the map without its cloud and its calibration."""
     dataset, settings = drive.dataset, drive.settings
     lidar_height_m = float(np.median(places.height_m))
     T_map_place = places.at_height(lidar_height_m)
@@ -142,7 +143,7 @@ def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
 
 
 def tool_versions() -> dict[str, str]:
-    """What a map is made with."""
+    """Return the version of each package that builds a map, by name."""
     return {name: version(name) for name in ("streetfix", "numpy", "faiss-cpu", "onnxruntime")}
 
 
@@ -150,7 +151,7 @@ def _checked(
     drive: Drive, places: Places, content: BundleContent, cloud: VoxelMap, calibration: Calibration, apart: Set[int], work: Work,
     report: Report,
 ) -> Site | None:  # fmt: skip
-    """What the map without the scans apart says of its own confidence; then they go into the cloud."""
+    """Run the site check on the map without the held-out scans, then add these scans to the cloud; None if none is held out."""
     if not apart:
         return None
     numbers = np.array(sorted(apart))
@@ -169,7 +170,11 @@ def _checked(
 
 
 def describe(manifest: Manifest) -> str:
-    """One line about a bundle, for people."""
+    """Return one line of text about a bundle.
+
+    Args:
+        manifest: manifest of the bundle.
+    """
     counts = manifest.counts
     return (
         f"map {manifest.name}, version {manifest.version}: {counts.places} places, {counts.views} views, "

@@ -1,4 +1,4 @@
-"""The calibration that comes with the stock encoder, or another one."""
+"""Read the calibration file for an encoder."""
 
 from pathlib import Path
 
@@ -7,15 +7,17 @@ from service.maps.calibration import Calibration, read_calibration
 
 
 def calibration_for(path: Path | None, encoder_sha256: str) -> Calibration | None:
-    """The calibration of an encoder's answers, if the file has it; another encoder's similarities mean something else.
+    """Return the calibration for an encoder; None if the file is not for this encoder.
+
+    A calibration holds for one encoder only, because each encoder has its own scale of similarities.
 
     Args:
-        path: of the file; None asks for none.
-        encoder_sha256: of the encoder that will answer.
+        path: the calibration file; None returns None.
+        encoder_sha256: SHA-256 of the encoder that will answer, hexadecimal.
 
     Raises:
-        DatasetError: the file is missing.
-        BundleError: it is no calibration.
+        DatasetError: the file cannot be read.
+        BundleError: the file is not a calibration.
     """
     if path is None:
         return None

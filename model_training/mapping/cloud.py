@@ -1,4 +1,4 @@
-"""The cloud of a map, from the points of its scans to what a bundle holds."""
+"""Compute the cloud of a map: from the points of the scans to the content of a bundle."""
 
 from dataclasses import replace
 
@@ -11,25 +11,41 @@ from service.geometry.rigid import transform_points
 from service.maps.content import BundleContent
 from service.registration.surfel_map import SurfelMap
 
+#: Largest range of a point in the cloud, metres.
 CLOUD_REACH_M = 40.0
 
 
 def near(
     points: NDArray[np.float32], T_map_level: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """What of a levelled scan (n, 4) goes into the cloud: positions, map frame, and intensities."""
+    """Return the points of a levelled scan within ``CLOUD_REACH_M``: positions (m, 3), metres, map frame, and intensities (m,).
+
+    Args:
+        points: x, y, z (metres, level frame of the LiDAR) and intensity (n, 4).
+        T_map_level: pose of the levelled LiDAR (4, 4).
+    """
     reached = points[np.linalg.norm(points[:, :3], axis=1) < CLOUD_REACH_M]
     return transform_points(T_map_level, reached[:, :3].astype(np.float64)), reached[:, 3]
 
 
 def prepared(cloud: VoxelMap, surfels: Surfels | None = None) -> SurfelMap | None:
-    """The cloud as a service reads it; None where nothing makes a surface."""
+    """Prepare the cloud for registration; None if there is no surfel.
+
+    Args:
+        cloud: the voxel map.
+        surfels: surfels of ``cloud``; None computes them.
+    """
     found = cloud.surfels() if surfels is None else surfels
     return SurfelMap.prepare(cloud.origin, *cloud.tiles(found)) if len(found.positions) else None
 
 
 def with_cloud(content: BundleContent, cloud: VoxelMap) -> BundleContent:
-    """The map with this cloud, what it can be merged by, and the picture from above."""
+    """Return the map with a cloud, the voxel sums for merging, and the preview image.
+
+    Args:
+        content: the map. Its own cloud, sums and preview are replaced.
+        cloud: the voxel map of the cloud.
+    """
     surfels = cloud.surfels()
     preview = preview_webp(surfels.positions, surfels.normals, content.T_map_place[:, :3, 3])
     return replace(

@@ -1,4 +1,4 @@
-"""``streetfix map diff``: what is another in one bundle than in another of the same frame."""
+"""``streetfix map diff``: list the differences between two bundles of one frame."""
 
 from typing import Any
 
@@ -11,19 +11,26 @@ from model_training.mapping.stored_map import streets_of_bundle
 from service.geometry.rigid import heading_of_body
 from service.maps.reader import MapBundle
 
+#: Edge of a square in which changed surfels are counted, metres.
 AREA_M = 20.0
+#: Smallest translation and smallest turn of a moved place.
 _MOVED_M, _TURNED_RAD = 0.02, np.deg2rad(0.5)
+#: Fields of the manifest that are compared besides the parameters and the view grid.
 _SAME = ("headings", "spacing_m", "georeference", "licence")
 _PAPER, _KEPT, _APPEARED, _VANISHED = (246, 249, 250), (170, 168, 165), (60, 150, 40), (50, 50, 215)  # BGR
 _NEW_PLACE, _OLD_PLACE = (225, 120, 40), (30, 140, 240)
 
 
 def diff_of(a: MapBundle, b: MapBundle) -> dict[str, Any]:
-    """What changed from ``a`` to ``b``, as JSON can tell it.
+    """Return the changes from ``a`` to ``b`` as JSON values.
 
-    Places are the same where each is the other's nearest and they stand closer than half the spacing; then they ``moved`` if by 2 cm or
-    half a degree or more. A surfel of the cloud ``appeared`` (``vanished``) if the other cloud has none within two voxels;
-    ``areas`` are squares of 20 m, the most changed first.
+    Two places are the same if each is the nearest to the other and their distance is less than half the spacing. Such a place ``moved``
+    if its position changed by 2 cm or its heading by half a degree, or more. A surfel ``appeared`` (``vanished``) if the other cloud
+    has none within two voxels. ``areas`` are squares of 20 m, the most changed first.
+
+    Args:
+        a: the bundle before the change.
+        b: the bundle after it, in the same frame.
     """
     places = _places(a, b)
     appeared, vanished = (
@@ -47,7 +54,7 @@ def _places(a: MapBundle, b: MapBundle) -> dict[str, Any]:
     old, new = a.T_map_place[:, :3, 3], b.T_map_place[:, :3, 3]
     distance, nearest = (np.asarray(found) for found in cKDTree(new).query(old))
     back = np.asarray(cKDTree(old).query(new)[1])
-    # A map of every scan has no spacing; then places a decimetre apart are still the same.
+    # A map of every scan has spacing 0. There, places less than 0.1 m apart count as the same.
     reach = max(0.1, min(a.manifest.spacing_m, b.manifest.spacing_m) / 2)
     same = (back[nearest] == np.arange(len(old))) & (distance < reach)
     pairs = np.c_[np.flatnonzero(same), nearest[same]]
@@ -73,7 +80,7 @@ def _reach_m(a: MapBundle, b: MapBundle) -> float:
 
 
 def _apart(points: NDArray[np.float64], others: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
-    """Those of some points that have none of the others within reach."""
+    """Return the points that are farther than ``reach_m`` from all others."""
     if not len(points) or not len(others):
         return points
     return np.asarray(points[cKDTree(others).query(points, distance_upper_bound=reach_m)[0] == np.inf])
@@ -106,7 +113,7 @@ def _streets(a: MapBundle, b: MapBundle) -> dict[str, list[str]]:
 
 
 def _parameters(a: MapBundle, b: MapBundle) -> dict[str, list[Any]]:
-    """Name -> both values, of those that differ."""
+    """Return both values of each parameter that differs, by its name."""
 
     def told(bundle: MapBundle) -> dict[str, Any]:
         manifest: dict[str, Any] = bundle.manifest.model_dump(mode="json")
@@ -123,15 +130,14 @@ def _parameters(a: MapBundle, b: MapBundle) -> dict[str, list[Any]]:
 
 
 def difference_png(a: MapBundle, b: MapBundle, *, longest_px: int = 1200) -> bytes:
-    """A picture from above.
+    """Draw the changes from above, as a PNG image.
 
-    The cloud is grey where it stayed, green where it appeared, red where it vanished; places are orange where they were removed,
-    blue where they were added.
+    Surfels are grey if they stayed, green if they appeared, red if they vanished. Removed places are orange, added places are blue.
 
     Args:
-        a: before.
-        b: after.
-        longest_px: of the longer side.
+        a: the bundle before the change.
+        b: the bundle after it, in the same frame.
+        longest_px: length of the longer side of the image, pixels.
     """
     old, new, reach = _positions(a), _positions(b), _reach_m(a, b)
     track = [bundle.T_map_place[:, :2, 3] for bundle in (a, b)]

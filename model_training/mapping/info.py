@@ -1,4 +1,4 @@
-"""``streetfix map info``: what a bundle holds."""
+"""``streetfix map info``: describe the content of a bundle."""
 
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,15 @@ from service.maps.reader import MapBundle
 
 
 def info_of(path: Path) -> dict[str, Any]:
-    """What a bundle holds, as JSON can tell it; metres in the map frame, bytes.
+    """Return the content of a bundle as JSON values; lengths in metres, map frame, sizes in bytes.
 
-    Hashes are not compared; that is ``damage_of``.
+    It does not check the hashes of the files. ``damage_of`` does.
+
+    Args:
+        path: folder of the bundle.
 
     Raises:
-        BundleError: it is no bundle, or does not open.
+        BundleError: the folder is not a bundle, or the bundle does not open.
     """
     bundle = MapBundle.open(path, verify=False)
     manifest = bundle.manifest

@@ -1,4 +1,4 @@
-"""Two maps of one frame become one: what must be the same, and how the rest adds up."""
+"""Join two maps of one frame: check what must be equal, and combine the rest."""
 
 import json
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from model_training.mapping.places import streets_of, views_of
 from service.errors import BundleError
 from service.maps.content import BundleContent
 
-#: Parameters that two drives of one map may differ in.
+#: Parameters that may differ between two traversals of one map.
 _OF_A_DRIVE = (
     "lidar_height_m",
     "survey_scans",
@@ -23,15 +23,20 @@ _OF_A_DRIVE = (
     "survey_aligned",
     "expected_lidar_height_m",
 )
-#: Those of them that are said of a map where they hold of all of its drives.
+#: Flags that the joined map keeps only if both maps have them.
 _OF_ALL = ("passes_vote", "traffic_vote", "survey_aligned")
 
 
 def require_same(a: BundleContent, b: BundleContent, *, names: tuple[str, str]) -> None:
-    """Refuse maps that cannot become one.
+    """Refuse two maps that cannot be joined.
+
+    Args:
+        a: a map.
+        b: another map.
+        names: names of both maps for the error message.
 
     Raises:
-        BundleError: another encoder, georeference or parameter; it is named with both values.
+        BundleError: an encoder, georeference, parameter, view grid or its seen rows differ. The message names the field and both values.
     """
     first, second = _comparable(a), _comparable(b)
     for what in sorted(first.keys() | second.keys()):
@@ -59,16 +64,16 @@ def _comparable(content: BundleContent) -> dict[str, Any]:
 
 
 def joined(a: BundleContent, b: BundleContent, *, newer_streets: bool = False) -> BundleContent:
-    """The places of ``a``, then those of ``b`` that stand the spacing or more away from all of ``a``; without a cloud.
+    """Join the places of ``a`` and the places of ``b`` that keep the spacing to all of ``a``; without a cloud.
 
-    The spacing is less a tenth for noisy poses, as it is along a drive. Nominal LiDAR heights are averaged over the places; the
-    ground under each place stays where it was. The calibration's site check is the sum of both, with the lower, more careful
-    correction.
+    The spacing is reduced by a tenth because poses are noisy, as it is along a traversal. The nominal LiDAR height is the average over
+    the places, and the ground under each place stays where it was. The site check of the calibration is the sum of both checks, with
+    the lower, more careful offset.
 
     Args:
-        a: a map; it may have no place left.
-        b: another that ``require_same`` lets pass.
-        newer_streets: where both have a street of the same id, take that of ``b``; else they must be the same.
+        a: a map. It may have no place left.
+        b: another map that ``require_same`` accepts.
+        newer_streets: take the street of ``b`` if both have a street of the same id. Otherwise these streets must be equal.
 
     Raises:
         BundleError: streets or calibrations contradict each other.
@@ -99,7 +104,13 @@ def joined(a: BundleContent, b: BundleContent, *, newer_streets: bool = False) -
 def standing_apart(
     T_map_place: NDArray[np.float64], others: NDArray[np.float64], spacing_m: float
 ) -> NDArray[np.bool_]:
-    """Which places (P, 4, 4) are no closer to any of the others (Q, 4, 4) than the spacing, less a tenth."""
+    """Return for each place (P,) whether it is at least 0.9 times the spacing away from all others.
+
+    Args:
+        T_map_place: poses of the places (P, 4, 4).
+        others: poses of the other places (Q, 4, 4), same frame.
+        spacing_m: distance between places, metres.
+    """
     if not len(others) or not len(T_map_place):
         return np.ones(len(T_map_place), np.bool_)
     distance = cKDTree(others[:, :3, 3]).query(T_map_place[:, :3, 3])[0]
@@ -107,7 +118,12 @@ def standing_apart(
 
 
 def of_places(content: BundleContent, keep: NDArray[np.bool_]) -> BundleContent:
-    """The map with these of its places and their views."""
+    """Return the map with some of its places and their views.
+
+    Args:
+        content: the map.
+        keep: True for the places to keep (P,).
+    """
     views = keep[content.view_place]
     return replace(
         content, T_map_place=content.T_map_place[keep], place_street=content.place_street[keep],
@@ -125,10 +141,15 @@ def _at_height(T_map_place: NDArray[np.float64], up_m: float) -> NDArray[np.floa
 def joined_streets(
     a: Mapping[str, Any] | None, b: Mapping[str, Any] | None, *, newer: bool = False
 ) -> dict[str, Any] | None:
-    """All features of two collections, those of ``a`` first, one of each id.
+    """Join two GeoJSON collections of streets, those of ``a`` first, with one feature per id.
+
+    Args:
+        a: a FeatureCollection; None for no streets.
+        b: another one.
+        newer: take the feature of ``b`` if both have the same id.
 
     Raises:
-        BundleError: a street of both is not the same in both, and ``newer`` does not say that that of ``b`` holds.
+        BundleError: both have different features of the same id, and ``newer`` is False.
     """
     if a is None or b is None:
         only = b if a is None else a
@@ -146,10 +167,14 @@ def joined_streets(
 
 
 def joined_calibration(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
-    """The calibration of both; none where one has none.
+    """Join two calibrations with their site checks; the result is uncalibrated if one of them is.
+
+    Args:
+        a: content of ``calibration.json``.
+        b: content of another one.
 
     Raises:
-        BundleError: they are not the same but for the check of their sites.
+        BundleError: they differ in more than their site checks.
     """
     if not a["calibrated"] or not b["calibrated"]:
         return dict(b if a["calibrated"] else a)

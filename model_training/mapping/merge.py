@@ -1,4 +1,4 @@
-"""``streetfix map merge``: two bundles of one frame and one encoder become one."""
+"""``streetfix map merge``: merge two bundles of one frame and one encoder."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +13,7 @@ from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
@@ -20,23 +21,24 @@ def merge_maps(
     first: Path, second: Path, out: Path, *, name: str | None = None, overwrite: bool = False,
     report: Report = lambda *_: None,
 ) -> Manifest:  # fmt: skip
-    """Merge two bundles.
+    """Merge two bundles into a new one; return its manifest.
 
-    All places of the first stay; of the second, those no closer to them than the spacing. Sums of voxels add up, so the cloud is that
-    of a map built of both surveys at once (of bundles that keep no sums ``stored_map.voxels_of`` says what is
-    approximated). That both lie in the same frame is the caller's word; only their georeferences can be compared.
+    All places of the first bundle stay. A place of the second stays if it keeps the spacing to them. The sums of the voxels add up, so
+    the cloud equals that of a map built from both surveys at once. ``stored_map.voxels_of`` approximates the cloud of a bundle that
+    stores no sums. The caller must ensure that both lie in the same frame. Only their georeferences are compared.
 
     Args:
-        first: a bundle.
-        second: another.
-        out: folder of the new bundle; it appears whole or not at all.
-        name: of the new map; by default that of the first.
-        overwrite: replace a bundle that is there.
-        report: told after every step.
+        first: folder of a bundle.
+        second: folder of another bundle.
+        out: folder of the new bundle. It appears complete or not at all.
+        name: name of the new map; None takes the name of the first.
+        overwrite: replace an existing bundle at ``out``.
+        report: called after every step.
 
     Raises:
         DatasetError: the maps lie too far from each other for one cloud.
-        BundleError: a bundle is damaged, they do not fit together (it says in what), or ``out`` exists.
+        BundleError: a bundle is damaged, the bundles do not fit together (the message names the field), or ``out`` exists and
+            ``overwrite`` is False.
     """
     if out.exists() and not overwrite:
         raise BundleError(

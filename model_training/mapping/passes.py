@@ -1,14 +1,16 @@
-"""What moved between the passes of a survey: voxels that more passes look through than hit.
+"""Find dynamic objects by a visibility vote: voxels that more passes of a survey see through than hit.
 
-Ours, after the visibility tests of map cleaning (for example Kim and Kim, "Remove, then Revert", IROS 2020), with two guards: a pass
-that hits a voxel anywhere has no vote against it, so a thin pole that most rays miss stays; and a ray that ends on the voxel's own
-plane, as rays along the ground and along walls do, has not looked through it.
+The vote is our own variant of the visibility tests of map cleaning (for example Kim and Kim, "Remove, then Revert", IROS 2020). It has
+two safeguards:
 
-Traffic is found in the same way where every scan votes for itself: what drives on before the vehicle is hit once and looked through by
-the scans after it, what stands is hit again.
+- A pass that hits a voxel anywhere has no vote against it. So a thin pole that most rays miss stays.
+- A ray that ends on the voxel's own plane does not see through it. Rays along the ground and along walls are such rays.
 
-Passes count per tile of the ground: a tile that comes into reach again after some way elsewhere is passed again. Who turns round
-within reach is still on the same pass. Votes are bits, one a pass, so that they add up in any order.
+Every scan can also vote on its own (decision 0058). This finds traffic of a single pass: a vehicle ahead is hit once, and later scans
+see through it. Later scans hit a static object again.
+
+Passes are counted per tile of the ground. A tile that comes into reach again after enough travel elsewhere starts a new pass. A turn
+within reach stays in the same pass. Votes are bits, one per pass, so their order does not matter.
 """
 
 from collections.abc import Callable
@@ -25,26 +27,36 @@ from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays, Work
 from service.geometry.rigid import inverse, transform_points
 
+#: Edge of a tile of the ground, metres.
 TILE_M = 10.0
-REACH_M = 30.0  # beyond it a beam is wider than what it should look past
-AWAY_M = 30.0  # of travel out of a tile's reach: then the next visit is another pass
-MOST = 63  # passes that are told apart; later ones count as the last
-CHUNK = 64  # scans
+#: Largest range of a vote, metres. Farther away a beam is wider than the objects that it should see past.
+REACH_M = 30.0
+#: Travel outside the reach of a tile after which the next visit is a new pass, metres.
+AWAY_M = 30.0
+#: Largest number of a pass, counted from 0; later passes share it.
+MOST = 63
+#: Number of scans whose votes are stored as one part.
+CHUNK = 64
 
+#: Edge of a cell of the range image, degrees.
 _CELL_DEG = 0.5
-_ROWS, _COLUMNS = 180, 720  # -45 to 45 degrees, all round
-_NEAREST_M = 2.0  # the vehicle itself
+#: Size of the range image: elevations from -45 to 45 degrees, all azimuths.
+_ROWS, _COLUMNS = 180, 720
+#: Points nearer than this lie on the vehicle, metres.
+_NEAREST_M = 2.0
+#: Number of tiles along an axis that have a number of their own.
 _SPAN = 1 << 24
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Passes:
-    """Which pass over each tile in reach a scan belongs to.
+    """The pass that each scan belongs to, for each tile within its reach.
 
     Attributes:
-        tiles: of each scan (n, K), as ``tile_of`` numbers them, rising.
-        number: of the pass over that tile (n, K), 0 to ``MOST``.
+        tiles: numbers of the tiles within reach of each scan, ascending, as from ``tile_of`` (n, K).
+        number: number of the pass over each of these tiles, 0 to ``MOST`` (n, K).
     """
 
     tiles: NDArray[np.int64]
@@ -52,15 +64,20 @@ class Passes:
 
     @classmethod
     def of(cls, poses: NDArray[np.float64], *, spacing_m: float = 1.0) -> "Passes":
-        """Of the scans' poses (n, 4, 4) in the order of the drive; those of one pass stand about ``spacing_m`` apart."""
+        """Count the passes of a traversal over each tile.
+
+        Args:
+            poses: T_map_lidar of the scans in the order of the traversal (n, 4, 4).
+            spacing_m: usual distance between successive scans, metres. A gap of less than three spacings starts no new pass.
+        """
         half = int(np.ceil(REACH_M / TILE_M)) + 1
         steps = np.arange(-half, half + 1)
         around = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        # A tile's furthest corner from any point of the middle one still counts: who is in reach has its tile here.
+        # Keep a tile if any of its points can be within reach of any point of the middle tile.
         around = around[(np.maximum(np.abs(around) - 1, 0) ** 2).sum(axis=1) * TILE_M**2 <= REACH_M**2]
         tiles = np.sort(_numbered(np.floor(poses[:, None, :2, 3] / TILE_M).astype(np.int64) + around), axis=1)
         flat = tiles.ravel()
-        order = np.argsort(flat, kind="stable")  # by tile, and in the order of the drive
+        order = np.argsort(flat, kind="stable")  # by tile, then in the order of the traversal
         way = np.repeat(travelled_m(poses), tiles.shape[1])[order]
         tile = flat[order]
         first = np.r_[True, tile[1:] != tile[:-1]]
@@ -74,20 +91,33 @@ class Passes:
 
     @classmethod
     def each_scan(cls, poses: NDArray[np.float64]) -> "Passes":
-        """Every scan a pass of its own, by the bits there are: those ``MOST`` + 1 scans apart share one."""
+        """Make every scan a pass of its own; scans that are ``MOST`` + 1 scans apart share a number.
+
+        Args:
+            poses: T_map_lidar of the scans in the order of the traversal (n, 4, 4).
+        """
         tiles = cls.of(poses).tiles
         number = np.arange(len(poses), dtype=np.uint64)[:, None] % np.uint64(MOST + 1)
         return cls(tiles, np.broadcast_to(number, tiles.shape))
 
     def bits(self, scan: int, tiles: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """The bit of a scan's pass over each of some tiles; 0 where it is out of reach."""
+        """Return the bit of the scan's pass over each tile (m,); 0 for a tile out of reach.
+
+        Args:
+            scan: index of the scan.
+            tiles: numbers of the tiles (m,).
+        """
         at = np.minimum(np.searchsorted(self.tiles[scan], tiles), self.tiles.shape[1] - 1)
         bits = np.uint64(1) << self.number[scan][at]
         return np.where(self.tiles[scan][at] == tiles, bits, np.uint64(0))
 
 
 def tile_of(positions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number of the tile that each position (n, 2 or 3), metres, map frame, lies in."""
+    """Return the number of the tile of each position (n,).
+
+    Args:
+        positions: metres, map frame, (n, 2) or (n, 3).
+    """
     return _numbered(np.floor(positions[:, :2] / TILE_M).astype(np.int64))
 
 
@@ -97,15 +127,15 @@ def _numbered(tiles: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """Voxels that are voted about, sorted by tile.
+    """The voxels of a vote, with an index by tile.
 
     Attributes:
-        keys: of the voxels (n), in the order of ``VoxelMap.sums``: rising.
-        positions: of their surfels (n, 3), metres, map frame.
-        normals: of their surfels (n, 3).
-        tile: of each (n).
-        by_tile: numbers of the voxels, tile by tile (n).
-        voxel_m: edge of a voxel.
+        keys: keys of the voxels in the order of ``VoxelMap.sums``, ascending (n,).
+        positions: positions of their surfels, metres, map frame (n, 3).
+        normals: unit normals of their surfels, map frame (n, 3).
+        tile: number of the tile of each voxel (n,).
+        by_tile: indices of the voxels, sorted by tile (n,).
+        voxel_m: edge of a voxel, metres.
     """
 
     keys: NDArray[np.int64]
@@ -117,7 +147,11 @@ class Targets:
 
     @classmethod
     def of(cls, cloud: VoxelMap) -> "Targets":
-        """All voxels that become surfels."""
+        """Select all voxels that have a surfel.
+
+        Args:
+            cloud: the voxel map.
+        """
         surfels = cloud.surfels()
         tile = tile_of(surfels.positions)
         return cls(
@@ -125,7 +159,11 @@ class Targets:
         )
 
     def of_tiles(self, tiles: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Numbers of the voxels in some tiles."""
+        """Return the indices of the voxels in some tiles (m,).
+
+        Args:
+            tiles: numbers of the tiles (K,).
+        """
         first = np.searchsorted(self.tile, tiles, side="left", sorter=self.by_tile)
         last = np.searchsorted(self.tile, tiles, side="right", sorter=self.by_tile)
         ranges = [self.by_tile[a:b] for a, b in zip(first, last, strict=True)]
@@ -136,20 +174,21 @@ def moved(
     cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64], settings: BuildSettings, work: Work, *,
     earlier: NDArray[np.int64] | None = None, each_scan: bool = False, report: Report = lambda *_: None,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Keys of the voxels that more passes look through than hit, two at least; of scans, as many as hit.
+    """Return the keys of the voxels that the vote removes, ascending (m,).
 
-    Reads the scans once more, one at a time.
+    A voxel is removed if more passes see through it than hit it, at least two. With ``each_scan`` it is removed if at least as many
+    scans see through it as hit it. The vote reads the scans again, one at a time.
 
     Args:
-        cloud: of all the scans; it is not changed.
-        dataset: with the scans.
+        cloud: the voxel map of all scans. It is not changed.
+        dataset: the dataset with the scans.
         poses: T_map_lidar of all scans (N, 4, 4).
-        numbers: of the scans that vote, in the order of the drive.
-        settings: the spacing, and whether weather is removed.
-        work: keeps the votes of finished scans.
-        earlier: keys of voxels that were in the map before this survey, which counts as one more pass that hit them.
-        each_scan: every scan votes for itself, which finds traffic, instead of with all of its pass.
-        report: told after every scan.
+        numbers: indices of the scans that vote, in the order of the traversal (n,).
+        settings: settings of the map: the spacing, and whether weather is removed.
+        work: store for the votes of finished chunks.
+        earlier: keys of the voxels that were in the map before this survey (k,). The map counts as one more pass that hit them.
+        each_scan: every scan votes on its own, not with its pass. This finds traffic.
+        report: called after every scan.
     """
     targets = Targets.of(cloud)
     drive = poses[numbers]
@@ -178,7 +217,13 @@ def moved(
 
 @dataclass(frozen=True, eq=False)
 class Ballot:
-    """What is voted about, who has a vote, and how far behind a voxel a ray must end to have looked through it."""
+    """The setup of a vote.
+
+    Attributes:
+        targets: the voxels of the vote.
+        passes: the pass of each scan that votes.
+        behind_m: distance behind a voxel beyond which a ray must end to see through it, metres.
+    """
 
     targets: Targets
     passes: Passes
@@ -210,24 +255,29 @@ def _votes(
 def looked_through(
     targets: Targets, candidates: NDArray[np.int64], points: NDArray[np.float64], T_map_lidar: NDArray[np.float64], *, behind_m: float
 ) -> NDArray[np.int64]:  # fmt: skip
-    """Those of some voxels that a scan looks through.
+    """Return the indices of the voxels that a scan sees through (m,).
 
-    The scan is drawn all round in cells of half a degree, the nearest point in each. A voxel is looked through where a ray goes its
-    way, this one and all in the cells around end far enough behind it, and this one leaves the voxel's plane.
+    The scan becomes a range image with cells of half a degree, the nearest point in each. The scan sees through a voxel under three
+    conditions:
+
+    - The voxel's cell has a ray.
+    - This ray and all rays of the eight cells around end far enough behind the voxel.
+    - The end of this ray lies more than a voxel off the voxel's plane.
 
     Args:
         targets: the voxels.
-        candidates: numbers of those to look at.
-        points: of the scan (n, 3), LiDAR frame.
-        T_map_lidar: where it was taken.
-        behind_m: how far is far enough, and a hundredth of the range more, for what poses and beams are off.
+        candidates: indices of the voxels to test (k,).
+        points: points of the scan, metres, LiDAR frame (n, 3).
+        T_map_lidar: pose of the scan (4, 4).
+        behind_m: smallest distance between the voxel and the end of a ray behind it, metres. One hundredth of the range is added for
+            errors of poses and beams.
     """
-    if not len(points):  # a scan without a single return looks through nothing
+    if not len(points):  # a scan without returns sees through nothing
         return candidates[:0]
     ranges = np.linalg.norm(points, axis=1)
     cells, on_grid = _cells(points, ranges)
     order = np.flatnonzero(on_grid)
-    order = order[np.argsort(-ranges[order], kind="stable")]  # the nearest is written last
+    order = order[np.argsort(-ranges[order], kind="stable")]  # the nearest is written last and stays
     point_at = np.full(_ROWS * _COLUMNS, -1)
     point_at[cells[order]] = order
     nearest = np.where(point_at >= 0, ranges[point_at], np.inf).reshape(_ROWS, _COLUMNS)
@@ -247,7 +297,7 @@ def looked_through(
 
 
 def _cells(points: NDArray[np.float64], ranges: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Cell of each direction, 0 where there is none, and whether there is."""
+    """Return the cell of each point, 0 if it has none, and whether it has one."""
     elevation = np.rad2deg(np.arcsin(np.clip(points[:, 2] / np.maximum(ranges, 1e-9), -1, 1)))
     row = np.floor((elevation + 45.0) / _CELL_DEG).astype(np.int64)
     column = (

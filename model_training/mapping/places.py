@@ -1,4 +1,4 @@
-"""A survey drive as a map takes it: places, their views' descriptors, and the points around them, a chunk of places at a time."""
+"""Compute the places of a survey, the descriptors of their map views and the points around them, in chunks of places."""
 
 from collections.abc import Callable, Set
 from dataclasses import dataclass
@@ -19,19 +19,21 @@ from service.imaging.view_grid import ViewGrid, survey_planes
 from service.localization.encoder import Encoder
 from service.maps.streets import Streets
 
-CHUNK = 64  # places
+#: Number of places whose results are stored as one part.
+CHUNK = 64
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Places of a drive.
+    """The places of a survey.
 
     Attributes:
-        T_map_level: pose of the levelled LiDAR at each (P, 4, 4).
-        height_m: of the LiDAR above the ground (P).
-        heading_rad: of the views, map frame (P, headings).
-        descriptors: of the views (P * headings, D).
+        T_map_level: pose of the levelled LiDAR at each place (P, 4, 4).
+        height_m: height of the LiDAR above the ground, metres (P,).
+        heading_rad: heading of each map view, radians, map frame (P, headings).
+        descriptors: descriptors of the map views, place by place (P * headings, D).
     """
 
     T_map_level: NDArray[np.float64]
@@ -40,7 +42,11 @@ class Places:
     descriptors: NDArray[np.float32]
 
     def at_height(self, lidar_height_m: float) -> NDArray[np.float64]:
-        """Poses (P, 4, 4) moved up or down so that the ground under each lies that far below it."""
+        """Return the poses (P, 4, 4), moved vertically to one height above the ground.
+
+        Args:
+            lidar_height_m: height of every pose above its ground, metres.
+        """
         T = self.T_map_level.copy()
         T[:, 2, 3] += lidar_height_m - self.height_m
         return T
@@ -48,16 +54,16 @@ class Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A survey drive and how a map looks at it.
+    """A survey traversal and the settings by which a map is built from it.
 
     Attributes:
-        dataset: with the scans.
+        dataset: the dataset with the scans.
         poses: T_map_lidar of all scans (n, 4, 4).
-        kept: numbers of the scans that become places.
-        settings: of the map.
-        encoder: of the views.
-        grid: of the views.
-        rows_seen: rows of the grid that the map has.
+        kept: indices of the scans that become places (P,).
+        settings: settings of the map.
+        encoder: encoder of the map views.
+        grid: grid of the map views.
+        rows_seen: True for the rows of the grid that the map uses (rows,).
     """
 
     dataset: Dataset
@@ -71,13 +77,13 @@ class Drive:
     def places(
         self, cloud: VoxelMap, work: Work, *, apart: Set[int] = frozenset(), report: Report = lambda *_: None
     ) -> Places:
-        """Look at every kept scan.
+        """Process every kept scan: level it, render and encode its map views, and add its points to the cloud.
 
         Args:
-            cloud: gets the points: chunk by chunk in their order, whether a chunk is looked at now or was kept.
-            work: keeps the finished chunks.
-            apart: places whose points stay out of the cloud.
-            report: told after every place.
+            cloud: the voxel map that the points go into. Chunks are added in order, whether they are computed now or were stored.
+            work: store for finished chunks.
+            apart: indices of the places whose points stay out of the cloud.
+            report: called after every place.
         """
         chunks: list[Arrays] = []
         for first in range(0, len(self.kept), CHUNK):
@@ -111,12 +117,22 @@ class Drive:
 
 
 def views_of(places: int, headings: int) -> NDArray[np.int32]:
-    """Place of each view, a fan after the other."""
+    """Return the index of the place of each view (V,), fan by fan.
+
+    Args:
+        places: number of places.
+        headings: number of views per place.
+    """
     return np.repeat(np.arange(places, dtype=np.int32), headings)
 
 
 def streets_of(streets: dict[str, Any] | None, T_map_place: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Number of the street's feature under each place, -1 for none."""
+    """Return the index of the street's feature at each place (P,), -1 for none.
+
+    Args:
+        streets: GeoJSON FeatureCollection; None for a map without streets.
+        T_map_place: poses of the places (P, 4, 4).
+    """
     if streets is None:
         return np.full(len(T_map_place), -1, np.int32)
     polygons = Streets.from_geojson(streets)

@@ -1,4 +1,4 @@
-"""The map from above, for people."""
+"""Draw a map from above."""
 
 import cv2
 import numpy as np
@@ -10,13 +10,15 @@ _PAPER = np.array([250, 249, 246], np.float32)
 def preview_webp(
     positions: NDArray[np.float64], normals: NDArray[np.float32], track: NDArray[np.float64], *, longest_px: int = 1200
 ) -> bytes:
-    """A WebP picture: walls dark, by how much stands upright in a pixel; ground light; the survey's track in colour.
+    """Draw a WebP image of a map: walls dark, ground light, the track of the survey in colour.
+
+    A pixel is the darker, the more vertical surfels it has.
 
     Args:
-        positions: surfels (n, 3), metres.
-        normals: of the surfels (n, 3).
-        track: places (P, 3), metres.
-        longest_px: of the longer side.
+        positions: positions of the surfels, metres, map frame (n, 3).
+        normals: unit normals of the surfels, map frame (n, 3).
+        track: positions of the places, metres, map frame (P, 3).
+        longest_px: length of the longer side of the image, pixels.
     """
     everything = np.concatenate([positions[:, :2], track[:, :2]])
     low, high = everything.min(axis=0) - 5, everything.max(axis=0) + 5

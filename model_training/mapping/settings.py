@@ -1,4 +1,4 @@
-"""How a map is built."""
+"""Settings of a map build."""
 
 import math
 from dataclasses import dataclass
@@ -11,10 +11,23 @@ from service.maps.manifest import Manifest
 
 @dataclass(frozen=True, slots=True)
 class BuildSettings:
-    """How a map is built; all of it is in the manifest.
+    """Settings of a map build. The bundle records them.
+
+    Attributes:
+        name: name of the map in requests.
+        spacing_m: travelled distance between places, metres.
+        headings: number of map views per place.
+        voxel_m: edge of a voxel of the cloud, metres.
+        expected_lidar_height_m: expected height of the LiDAR above the ground, metres. The search for the ground starts there.
+        remove_weather: remove the returns of rain and snow from the scans.
+        passes_vote: remove voxels that more passes of the survey see through than hit.
+        traffic_vote: remove voxels that at least as many scans see through as hit.
+        align_survey: align the scans of the survey before the build.
+        licence: text of the licence. May be empty.
+        calibration: calibration file; None builds a map without calibration.
 
     Raises:
-        DatasetError: a number makes no sense, naming the field.
+        DatasetError: a number is too small or not finite. The message names the field.
     """
 
     name: str
@@ -30,7 +43,7 @@ class BuildSettings:
     calibration: Path | None = CALIBRATION
 
     def __post_init__(self) -> None:
-        """Refuse what would end in an empty fan or a cloud without voxels."""
+        """Refuse values that would give an empty fan or a cloud without voxels."""
         lowest = {"spacing_m": 0.0, "headings": 1, "voxel_m": 0.01, "expected_lidar_height_m": 0.1}
         for field, least in lowest.items():
             value = getattr(self, field)
@@ -39,7 +52,12 @@ class BuildSettings:
 
     @classmethod
     def of_map(cls, manifest: Manifest, *, passes_vote: bool = False) -> "BuildSettings":
-        """What a map was built with, for more of the same."""
+        """Return the settings that a map was built with, without a calibration.
+
+        Args:
+            manifest: manifest of the map.
+            passes_vote: whether the next build uses the visibility vote of passes. It is not taken from the manifest.
+        """
         parameters = manifest.parameters
         return cls(
             name=manifest.name, spacing_m=manifest.spacing_m, headings=manifest.headings, voxel_m=parameters["voxel_m"],

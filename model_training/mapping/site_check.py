@@ -1,8 +1,8 @@
-"""Does calibrated confidence hold on this site? Asked with depth drawn from the survey's own scans, each held out of the map.
+"""Check the calibrated confidence on a site with queries that are rendered from held-out scans of the survey.
 
-A scan that neither the index nor the cloud has seen is drawn as a camera would see it - range and grey from the beams, with a
-stereo camera's noise added - and the map without it is asked. All of these queries are in the map, so they can show that
-confidence is too high here, never that it is too low: the correction only ever lowers it.
+Neither the index nor the cloud of the map contains a held-out scan. The check renders the scan as a camera would see it: depth and grey
+values come from the beams, and noise of a stereo camera is added. Then it queries the map. All these queries lie in the map. So they can
+show that the confidence is too high, but not that it is too low. The correction only lowers the confidence (decision 0030).
 """
 
 import tempfile
@@ -23,24 +23,30 @@ from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 
+#: Largest and smallest number of held-out scans. With fewer than ``FEWEST`` there is no check.
 MOST, FEWEST = 60, 20
-#: One place in so many is held out, at most ``MOST``.
+#: One place in this many is held out, at most ``MOST``.
 _EACH = 25
+#: Camera of the rendered queries.
 _CAMERA = PinholeCamera(320, 240, 160.0, 160.0, 159.5, 119.5)
-_NOISE_PX, _FOCAL_BASELINE = (0.1, 0.5), 80.0  # of the precise and the stereo preset, by turns
+#: Noise of disparity of the presets precise and stereo, pixels; the queries alternate between them. Focal length times baseline, px m.
+_NOISE_PX, _FOCAL_BASELINE = (0.1, 0.5), 80.0
+#: Largest error of a right answer, metres on the ground.
 _RIGHT_M = 1.0
-_PRIOR_OFFSET = 1.0  # standard deviation of the log odds' offset, before anything is asked
+#: Standard deviation of the prior of the offset, in log odds (decision 0030).
+_PRIOR_OFFSET = 1.0
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class HeldScan:
-    """A scan that was kept out of the map.
+    """A scan that was held out of the map.
 
     Attributes:
-        place: its number among the places.
-        points: level frame of the LiDAR, with intensity (n, 4).
-        T_map_level: pose of the levelled LiDAR.
+        place: index of its place.
+        points: x, y, z (metres, level frame of the LiDAR) and intensity (n, 4).
+        T_map_level: pose of the levelled LiDAR (4, 4).
     """
 
     place: int
@@ -49,7 +55,11 @@ class HeldScan:
 
 
 def held_out(places: int) -> set[int]:
-    """Numbers of the places that are kept out, evenly spread; none where there are too few for a figure."""
+    """Return the indices of the held-out places, evenly spread; none if there are too few places for a check.
+
+    Args:
+        places: number of places.
+    """
     count = min(MOST, places // _EACH)
     if count < FEWEST:
         return set()
@@ -59,14 +69,19 @@ def held_out(places: int) -> set[int]:
 def site_of(
     content: BundleContent, held: list[HeldScan], calibration: Calibration, report: Report = lambda *_: None
 ) -> Site:
-    """Ask the map without the held scans where they were taken, and compare with the truth.
+    """Localize the held-out scans in the map without them, and fit the offset of the confidence.
+
+    The queries do not use the brightness of the map. Their own brightness comes from the survey and agrees better than that of any
+    camera.
 
     Args:
-        content: of the whole map, its cloud without the held scans. Its brightness is not asked: the queries' is the survey's own,
-            which agrees with it as no camera's does.
-        held: the scans.
-        calibration: to be checked.
-        report: told after every query.
+        content: the whole map. Its cloud must not contain the held-out scans.
+        held: the held-out scans.
+        calibration: the calibration to check.
+        report: called after every query.
+
+    Returns:
+        The offset, the number of queries and of right answers, and the expected calibration error with the offset.
     """
     confidence, right = [], []
     with tempfile.TemporaryDirectory(prefix="streetfix-site-") as folder:
@@ -86,7 +101,7 @@ def site_of(
 
 
 def _offset(odds: NDArray[np.float64], right: NDArray[np.bool_]) -> float:
-    """The most probable offset of the log odds, under a prior that it is small (Newton's method)."""
+    """Return the most probable offset of the log odds under a Gaussian prior around 0 (Newton's method)."""
     offset = 0.0
     for _ in range(50):
         p = probability(odds + offset)
@@ -109,7 +124,7 @@ def _without(content: BundleContent, places: set[int]) -> BundleContent:
 
 
 def _drawn(scan: HeldScan, grid: ViewGrid, number: int) -> tuple[Query, NDArray[np.float64]]:
-    """A query as a camera in the LiDAR's place would take it, and its pose."""
+    """Render the query of a camera at the LiDAR's position; return it with its T_map_camera."""
     rng = np.random.default_rng([2718, number])
     R_level_camera = rotation_z(rng.uniform(-np.pi, np.pi)) @ R_BODY_OPTICAL
     panorama = panorama_from_points(scan.points, grid)
@@ -120,9 +135,8 @@ def _drawn(scan: HeldScan, grid: ViewGrid, number: int) -> tuple[Query, NDArray[
     column = np.rint((azimuth + np.pi) / (2 * np.pi) * grid.around).astype(int) % grid.around
     inside = (row >= 0) & (row < grid.rows)
     cell = np.where(inside, row, 0), column
-    noise = (
-        _NOISE_PX[number % 2] / _FOCAL_BASELINE * np.sqrt(0.5)
-    )  # half of it from beam to beam, half from pixel to pixel
+    # Noise of the inverse depth. Half of its variance differs from beam to beam, half from pixel to pixel.
+    noise = _NOISE_PX[number % 2] / _FOCAL_BASELINE * np.sqrt(0.5)
     of_beam, of_pixel = rng.normal(0, noise, panorama[0].shape), rng.normal(0, noise, rays.shape[:2])
     z = np.where(inside, panorama[0][cell], 0) / np.linalg.norm(rays, axis=-1)
     inverse = np.where(z > 0, 1 / np.where(z > 0, z, 1) + of_beam[cell] + of_pixel, 0)

@@ -1,4 +1,4 @@
-"""A map that lies on the disk, as what it was written from: so that another can be made of it."""
+"""Read a stored bundle back into the content that it was written from, to build another map from it."""
 
 import json
 from typing import Any
@@ -16,7 +16,11 @@ from service.maps.reader import MapBundle
 
 
 def content_of(bundle: MapBundle) -> BundleContent:
-    """All of a map but its cloud (``voxels_of``) and the picture of it."""
+    """Return the content of a bundle without its cloud and its preview image; ``voxels_of`` returns the cloud.
+
+    Args:
+        bundle: the bundle.
+    """
     manifest = bundle.manifest
     return BundleContent(
         name=manifest.name, grid=bundle.grid, headings=manifest.headings, spacing_m=manifest.spacing_m, rows_seen=bundle.rows_seen,
@@ -29,7 +33,11 @@ def content_of(bundle: MapBundle) -> BundleContent:
 
 
 def streets_of_bundle(bundle: MapBundle) -> dict[str, Any] | None:
-    """The GeoJSON of a map's streets, None where it has none."""
+    """Return the GeoJSON of the streets; None for a map without streets.
+
+    Args:
+        bundle: the bundle.
+    """
     if bundle.streets is None:
         return None
     document: dict[str, Any] = json.loads((bundle.path / streets.FILE).read_bytes())
@@ -37,10 +45,13 @@ def streets_of_bundle(bundle: MapBundle) -> dict[str, Any] | None:
 
 
 def voxel_edge_m(bundle: MapBundle) -> float:
-    """Edge of the cloud's voxels, metres.
+    """Return the edge of the cloud's voxels, metres.
+
+    Args:
+        bundle: the bundle.
 
     Raises:
-        BundleError: the manifest does not say.
+        BundleError: the manifest has no ``voxel_m`` above 0.
     """
     edge = bundle.manifest.parameters.get("voxel_m", 0.0)
     if not edge > 0:
@@ -49,20 +60,30 @@ def voxel_edge_m(bundle: MapBundle) -> float:
 
 
 def empty_voxels_of(bundle: MapBundle) -> VoxelMap:
-    """Voxels of a map's edge around its middle, with nothing in them."""
+    """Return an empty voxel map with the voxel edge of a bundle and its origin in the middle of the places.
+
+    Args:
+        bundle: the bundle.
+
+    Raises:
+        BundleError: the manifest has no ``voxel_m`` above 0.
+    """
     edge = voxel_edge_m(bundle)
     return VoxelMap(edge, lattice_origin(edge, bundle.T_map_place[:, :3, 3].mean(axis=0)))
 
 
 def voxels_of(bundle: MapBundle) -> VoxelMap:
-    """The voxels of a map, ready to take more points.
+    """Return the voxels of a bundle, ready for more points.
 
-    Bundles that keep sums of their voxels' points give them as they were. Older ones have surfels alone: each then counts as its
-    points spread evenly over a disc as wide as the voxel, as thick as the surfel, at its mean; voxels with too few points for a
-    surfel are lost.
+    A bundle that stores the sums of its voxels returns them unchanged. An older bundle has only surfels, so its voxels are approximated.
+    The points of a surfel then spread evenly around its mean, as wide as the voxel and as thick as the surfel. Voxels with too few
+    points for a surfel are lost.
+
+    Args:
+        bundle: the bundle.
 
     Raises:
-        BundleError: the sums are not ours.
+        BundleError: the file of the sums is damaged or has another format, or the manifest has no ``voxel_m``.
     """
     voxels = empty_voxels_of(bundle)
     edge = voxels.voxel_m
@@ -82,10 +103,13 @@ def voxels_of(bundle: MapBundle) -> VoxelMap:
 
 
 def read_statistics(bundle: MapBundle) -> NDArray[Any]:
-    """Sums of the voxels' points, of dtype ``VOXEL``.
+    """Read the sums of the voxels' points: (n,) of ``VOXEL`` or ``VOXEL_WITHOUT_BRIGHTNESS``.
+
+    Args:
+        bundle: a bundle that stores sums.
 
     Raises:
-        BundleError: the file is not that.
+        BundleError: the file cannot be read, has another type, or holds an empty voxel or a sum that is not finite.
     """
     path = bundle.path / parts.STATISTICS_FILE
     try:

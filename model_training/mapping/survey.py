@@ -1,4 +1,4 @@
-"""A survey's scans as a map takes them: those that stand far enough apart, levelled, looked at all round."""
+"""Prepare the scans of a survey for a map: select them by distance, level them and render their views."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,12 +15,20 @@ from service.imaging.pca import Level, level_scan, principal_heading
 from service.imaging.view_grid import LidarView, ViewGrid, panorama_from_points, view_from_panorama
 from service.imaging.weather import remove_weather_noise
 
-SEEN_SHARE = 0.02  # a row of the grid is the survey's if at least this share of its cells is measured
+#: The survey covers a row of the view grid if more than this share of the row's cells is measured.
+SEEN_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class LevelledScan:
-    """One kept scan: its number, level points with intensity (n, 4), level, and the principal heading that its fan starts at (rad)."""
+    """A levelled scan.
+
+    Attributes:
+        number: index of the scan in the survey.
+        points: x, y, z (metres, level frame of the LiDAR) and intensity (n, 4).
+        level: level of the scan.
+        start_rad: principal heading, at which the fan of views starts, radians, level frame.
+    """
 
     number: int
     points: NDArray[np.float32]
@@ -28,17 +36,31 @@ class LevelledScan:
     start_rad: float
 
     def T_map_level(self, T_map_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pose of the levelled LiDAR, from that of the LiDAR."""
+        """Return the pose of the levelled LiDAR (4, 4).
+
+        Args:
+            T_map_lidar: pose of the LiDAR (4, 4).
+        """
         return T_map_lidar @ transform_from(self.level.R_level_sensor.T, np.zeros(3))
 
 
 def fan(headings: int) -> NDArray[np.float64]:
-    """Turns of a place's views against its principal heading, radians."""
+    """Return the heading of each view relative to the principal heading of its place, radians (headings,).
+
+    Args:
+        headings: number of views.
+    """
     return 2 * np.pi * np.arange(headings) / headings
 
 
 def fan_views(scan: LevelledScan, turns: NDArray[np.float64], grid: ViewGrid) -> Iterator[LidarView]:
-    """What a scan shows in each direction of the fan."""
+    """Yield the view of a scan in each direction of a fan.
+
+    Args:
+        scan: the levelled scan.
+        turns: headings relative to the principal heading, radians (headings,).
+        grid: the view grid.
+    """
     panorama = panorama_from_points(scan.points, grid)
     for turn in turns:
         yield view_from_panorama(panorama, scan.start_rad + float(turn), grid)
@@ -47,7 +69,14 @@ def fan_views(scan: LevelledScan, turns: NDArray[np.float64], grid: ViewGrid) ->
 def view_ranges(
     dataset: Dataset, settings: BuildSettings, grid: ViewGrid, rows_seen: NDArray[np.bool_]
 ) -> Iterator[NDArray[np.float32]]:
-    """Range views (headings, rows, columns) of every place of the map that these settings build, in its order."""
+    """Yield the range views (headings, rows, columns), metres, of every place of the map, in the order of the places.
+
+    Args:
+        dataset: the dataset with the survey.
+        settings: settings of the map.
+        grid: the view grid.
+        rows_seen: True for the rows of the grid that the map uses (rows,). The other rows become 0.
+    """
     kept = thinned(dataset.survey_poses(), settings.spacing_m)
     turns = fan(settings.headings)
     for scan in levelled_scans(dataset, kept, settings):
@@ -55,7 +84,11 @@ def view_ranges(
 
 
 def kept_scans(dataset: Dataset, settings: BuildSettings) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """T_map_lidar of every scan (n, 4, 4), and the numbers of those that become places.
+    """Return T_map_lidar of every scan (n, 4, 4) and the indices of the scans that become places (P,).
+
+    Args:
+        dataset: the dataset with the survey.
+        settings: settings of the map.
 
     Raises:
         DatasetError: the survey is empty.
@@ -69,16 +102,28 @@ def kept_scans(dataset: Dataset, settings: BuildSettings) -> tuple[NDArray[np.fl
 
 
 def require_poses_within(cloud: VoxelMap, poses: NDArray[np.float64], dataset: Dataset) -> None:
-    """Refuse a survey that leaves the reach of a cloud; said before the work, not in its middle.
+    """Refuse a survey that exceeds the reach of a cloud, before the build starts.
+
+    Args:
+        cloud: the voxel map that the scans would go into.
+        poses: T_map_lidar of every scan (n, 4, 4).
+        dataset: the dataset, for the error message.
 
     Raises:
-        DatasetError: names the file, the line's scan and how far off it is.
+        DatasetError: a pose is too far away. The message names the file, the scan and its distance.
     """
     cloud.require_within(poses[:, :3, 3], lambda number: f"{dataset.folder}/survey/poses.txt: scan {number}")
 
 
 def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:
-    """Numbers of the poses that stand ``spacing_m`` of travel, less a tenth for noisy poses, after the last one kept."""
+    """Return the indices of poses that keep the spacing to the last kept one (P,), along the travelled path.
+
+    Poses are noisy, so 0.9 times the spacing is enough.
+
+    Args:
+        poses: T_map_lidar in the order of the traversal (n, 4, 4).
+        spacing_m: travelled distance between kept poses, metres.
+    """
     travelled = travelled_m(poses)
     kept, last = [0], 0.0
     for k in range(1, len(poses)):
@@ -89,12 +134,22 @@ def thinned(poses: NDArray[np.float64], spacing_m: float) -> NDArray[np.int64]:
 
 
 def travelled_m(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Way from the first pose to each of (n, 4, 4), metres."""
+    """Return the travelled distance from the first pose to each pose, metres (n,).
+
+    Args:
+        poses: poses in the order of the traversal (n, 4, 4).
+    """
     return np.asarray(np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
 
 
 def levelled_scans(dataset: Dataset, numbers: NDArray[np.int64], settings: BuildSettings) -> Iterator[LevelledScan]:
-    """Scans one at a time, levelled by PCA, each with its principal heading."""
+    """Yield scans one at a time, levelled by PCA, each with its principal heading.
+
+    Args:
+        dataset: the dataset with the survey.
+        numbers: indices of the scans (n,).
+        settings: settings of the map: the expected LiDAR height, and whether weather is removed.
+    """
     for number in numbers:
         points = clear_scan(dataset, int(number), settings)
         level = level_scan(points[:, :3], expected_height_m=settings.expected_lidar_height_m)
@@ -103,7 +158,13 @@ def levelled_scans(dataset: Dataset, numbers: NDArray[np.int64], settings: Build
 
 
 def clear_scan(dataset: Dataset, number: int, settings: BuildSettings) -> NDArray[np.float32]:
-    """Scan ``number`` (n, 4), LiDAR frame, without rain and snow where the settings say so."""
+    """Return a scan: x, y, z (metres, LiDAR frame) and intensity (n, 4), without rain and snow if the settings say so.
+
+    Args:
+        dataset: the dataset with the survey.
+        number: index of the scan.
+        settings: settings of the map: whether weather is removed.
+    """
     points = dataset.scan(number)
     return points[remove_weather_noise(points[:, :3])] if settings.remove_weather else points
 
@@ -111,10 +172,19 @@ def clear_scan(dataset: Dataset, number: int, settings: BuildSettings) -> NDArra
 def rows_seen_by(
     dataset: Dataset, kept: NDArray[np.int64], grid: ViewGrid, settings: BuildSettings, *, sample: int = 100
 ) -> NDArray[np.bool_]:
-    """Rows that the survey's sensor covers, from a sample of its scans; what it never sees is cut from queries too.
+    """Return which rows of the view grid the survey's LiDAR covers (rows,), from a sample of its scans.
+
+    The other rows are also removed from query views.
+
+    Args:
+        dataset: the dataset with the survey.
+        kept: indices of the scans that become places (P,).
+        grid: the view grid.
+        settings: settings of the map.
+        sample: approximate number of scans in the sample.
 
     Raises:
-        DatasetError: it sees none.
+        DatasetError: the LiDAR covers no row.
     """
     chosen = kept[:: max(1, len(kept) // sample)]
     measured = np.zeros(grid.rows)

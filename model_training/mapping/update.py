@@ -1,4 +1,4 @@
-"""``streetfix map update``: a new survey drive goes into a map, beside what is there or in its place."""
+"""``streetfix map update``: add a new survey to a map, or replace part of the map with it."""
 
 import os
 from collections.abc import Callable
@@ -27,6 +27,7 @@ from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
@@ -34,27 +35,28 @@ def update_map(
     old: Path, dataset: Dataset, out: Path, *, replace_covered: bool = False, replace_area: Path | None = None,
     passes_vote: bool = False, overwrite: bool = False, threads: int | None = None, report: Report = lambda *_: None,
 ) -> Manifest:  # fmt: skip
-    """Add a survey drive to a map, with the encoder and the settings that the map was built with.
+    """Add a survey to a map, with the encoder and the settings that the map was built with; return the new manifest.
 
-    Without replacing, the new drive's places that stand the spacing away from the old ones come in, and its points add to the cloud.
-    With it, old places, and voxels by their mean, go wherever the new drive covered the ground (or inside the polygon) before the new
-    ones come in. Old views elsewhere that look at the replaced block still show it as it was. A killed update goes on where it was.
+    Without replacement, new places are added that keep the spacing to the old ones, and the new points are added to the cloud.
+    With replacement, the old places and voxels are first removed where the new survey covered the ground, or inside the polygon. The
+    mean of a voxel decides. Old views elsewhere still show the replaced part as it was. A killed update continues where it stopped.
 
     Args:
-        old: the bundle; it stays as it is.
-        dataset: with the survey drive, its poses in the frame of the map.
-        out: folder of the new bundle; it appears whole or not at all.
-        replace_covered: replace what the drive covered.
-        replace_area: GeoJSON of a polygon, metres in the map frame; replace what lies in it.
-        passes_vote: drop voxels that more passes of the new drive look through than hit; the map counts as one pass that hit its own.
-        overwrite: replace a bundle at ``out``.
-        threads: of the encoder; by default one a core.
-        report: told after every place.
+        old: folder of the bundle. It is not changed.
+        dataset: the dataset with the survey. Its poses must be in the map frame.
+        out: folder of the new bundle. It appears complete or not at all.
+        replace_covered: replace the part that the survey covered.
+        replace_area: GeoJSON file of a polygon, metres, map frame; replace the part inside it. None replaces no polygon.
+        passes_vote: remove voxels that more passes of the survey see through than hit. The map counts as one pass that hit its voxels.
+        overwrite: replace an existing bundle at ``out``.
+        threads: number of threads of the encoder; None uses one per core.
+        report: called after every place, and after every step of the other stages.
 
     Raises:
-        BundleError: the bundle is damaged, ``out`` exists, streets contradict each other, or another process is at work on ``out``.
-        DatasetError: the survey is empty or damaged, lies in another frame, its LiDAR does not see what the map's does, or the polygon
-            holds none of its places.
+        BundleError: the bundle is damaged, ``out`` exists and ``overwrite`` is False, streets contradict each other, or another process
+            works on ``out``.
+        DatasetError: the survey is empty, damaged, in another frame, or too far away. Its LiDAR misses too many rows that the map's
+            LiDAR sees. The polygon file is not valid. None of the new places lies in the area to replace.
     """
     if out.exists() and not overwrite:
         raise BundleError(
@@ -63,7 +65,7 @@ def update_map(
     bundle = MapBundle.open(old)
     _require_frame(dataset, bundle)
     area = None if replace_area is None else polygon_of(replace_area)
-    # What would be refused at the end is refused before the work.
+    # Refuse contradicting streets before the work, not at its end.
     joined_streets(streets_of_bundle(bundle), dataset.streets(), newer=replace_covered or area is not None)
     settings = BuildSettings.of_map(bundle.manifest, passes_vote=passes_vote)
     threads = threads or os.cpu_count() or 1
@@ -122,7 +124,10 @@ def _require_frame(dataset: Dataset, bundle: MapBundle) -> None:
 
 
 def _require_rows(rows_seen: np.ndarray, bundle: MapBundle, dataset: Dataset) -> None:
-    """A row at the rim may be seen by chance or not; more of them, and the views would be of another sensor's."""
+    """Refuse a survey whose LiDAR misses more than a tenth of the rows that the map uses.
+
+    A few rows at the rim are covered by chance or not. With more missing rows, the views would look like those of another sensor.
+    """
     missing = int((bundle.rows_seen & ~rows_seen).sum())
     if missing > 0.1 * bundle.rows_seen.sum():
         raise DatasetError(
@@ -134,7 +139,7 @@ def _require_rows(rows_seen: np.ndarray, bundle: MapBundle, dataset: Dataset) ->
 def _without(
     content: BundleContent, cloud: VoxelMap, area: Area, places: Places, polygon: Path | None
 ) -> BundleContent:
-    """The map without its places in the area; its voxels there go from the cloud."""
+    """Return the map without its places in the area, and remove its voxels there from ``cloud``."""
     if not area(places.T_map_level[:, :2, 3]).any():
         raise DatasetError(
             f"{polygon}: none of the new drive's places lies in the polygon, so nothing would fill it; give one around where it drove, "
@@ -145,7 +150,7 @@ def _without(
 
 
 def _content(drive: Drive, places: Places, old: BundleContent) -> BundleContent:
-    """The new drive as a map of its own, with what the map gives it."""
+    """Return the new traversal as a map of its own, with the encoder and the settings of the old map."""
     lidar_height_m = float(np.median(places.height_m))
     T_map_place = places.at_height(lidar_height_m)
     voted = {"passes_vote": 1.0} if drive.settings.passes_vote else {}

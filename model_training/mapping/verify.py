@@ -1,4 +1,4 @@
-"""``streetfix map verify``: every defect of a bundle, not only the first."""
+"""``streetfix map verify``: list all defects of a bundle, not only the first."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,18 +14,22 @@ from service.maps.manifest import FileEntry, read_manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import sha256_of
 
+#: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
-_LENGTH_OFF = 1e-3  # of a unit vector
-_OUTSIDE_M = 1.0  # that a place may stand outside its street: who joins maps may shift a rim
+#: Largest error of the length of a unit vector.
+_LENGTH_OFF = 1e-3
+#: Largest distance of a place from its street, metres. Joining maps may move the rim of a street.
+_OUTSIDE_M = 1.0
+#: Number of descriptors that are read at once.
 _CHUNK = 16_384
 
 
 def damage_of(path: Path, *, report: Report = lambda *_: None) -> list[str]:
-    """A line for each defect, with the file it is in; none where the bundle is whole.
+    """Return one line per defect, with its file; no line for an undamaged bundle.
 
     Args:
-        path: the bundle's folder.
-        report: told after every file.
+        path: folder of the bundle.
+        report: called after every file.
     """
     try:
         manifest = read_manifest(path)
@@ -37,7 +41,7 @@ def damage_of(path: Path, *, report: Report = lambda *_: None) -> list[str]:
             found.append(f"{path / name}: {wrong}")
         report("files", number, len(manifest.files))
     if found:
-        return found  # what is inside damaged files says nothing further
+        return found  # the content of damaged files would only give follow-up errors
     try:
         bundle = MapBundle.open(path)
         if parts.STATISTICS_FILE in manifest.files:
@@ -58,7 +62,7 @@ def _damage_of_file(folder: Path, name: str, entry: FileEntry) -> str:
 
 
 def _contradictions(bundle: MapBundle) -> Iterator[str]:
-    """What opens, but cannot be meant."""
+    """Yield the defects of a bundle that opens: values that cannot be right."""
     off = 0
     for first in range(0, len(bundle.views), _CHUNK):
         vectors = bundle.view_index.vectors(np.arange(first, min(first + _CHUNK, len(bundle.views))))

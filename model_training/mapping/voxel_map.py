@@ -1,7 +1,7 @@
-"""The map cloud for registration: voxels with mean, normal and thickness, from sums that add up scan by scan.
+"""Accumulate scans in voxels and compute the surfels of the map cloud.
 
-Each voxel keeps the moments of its points (count, sum, sum of products), so a drive of any length streams through. The
-normal of a voxel is the axis of least variance of the moments of it and, for less, of its 26 neighbours.
+Each voxel stores the moments of its points: count, sum, sum of products. So the memory depends on the number of voxels, not of points.
+The normal of a voxel is the axis of least variance of its moments and those of its 26 neighbours. The neighbours have less weight.
 """
 
 from collections.abc import Callable
@@ -16,29 +16,38 @@ from service.errors import DatasetError
 from service.registration.kernel import SURFEL
 from service.registration.surfel_map import TILE_M
 
-_SPAN = 1 << 20  # cells along an axis: a key is 3 x 20 bits
-#: Cells from the origin that have keys of their own, and whose neighbours have: beyond, two voxels would share a key.
+#: Number of cells along an axis. A key has 3 x 20 bits.
+_SPAN = 1 << 20
+#: Largest distance of a cell from the origin, in cells, up to which it and its neighbours have unique keys.
 _FARTHEST = _SPAN // 2 - 2
+#: Columns of the second moments.
 _SECOND = slice(4, 10)
-#: Count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre; brightness, and how many points have one.
+#: Number of columns: count, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre; sum of brightness, number of points that have one.
 _MOMENTS, _BRIGHT = 12, slice(10, 12)
-#: What a neighbour's points count for in a normal, by the number of axes it is away along: all alike, balconies and recesses of a facade
-#: melt into one slope. Watch cities; fewer still (0.1, 0.02, 0.005) follow the survey's own noise.
+#: Weight of a neighbour's points in a normal, by the number of axes along which it is displaced. Equal weights smooth the balconies and
+#: recesses of a facade into one slope. Smaller weights (0.1, 0.02, 0.005) follow the noise of the survey (decision 0098).
 _NEIGHBOUR = (1.0, 0.3, 0.1, 0.03)
-_WAITING = 1 << 20  # rows of sums that wait to be merged, at least
+#: Smallest number of waiting rows of sums that starts a merge.
+_WAITING = 1 << 20
 
-#: What a bundle keeps of a voxel, so that maps can be merged: its cell (voxels of all maps of one edge lie on one lattice through
-#: the map frame's zero), how many points it has, and their sums and sums of products about its centre (m, m2).
-#: Last the sum of their brightnesses and the number of points that have one; older maps lack these two.
+#: A voxel as a bundle stores it, for merging maps. ``cell``: its cell; all maps of one edge share one lattice through the zero of the map
+#: frame. ``points``: number of points. ``sums``: their sums (m) and sums of products (m2) about the voxel's centre.
 VOXEL_WITHOUT_BRIGHTNESS = np.dtype([("cell", "<i4", (3,)), ("points", "<u4"), ("sums", "<f4", (9,))])
+#: The same with the sum of brightness and the number of points that have one. Older maps lack these two.
 VOXEL = np.dtype([*VOXEL_WITHOUT_BRIGHTNESS.descr, ("brightness", "<f4"), ("bright_points", "<u4")])
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Surface elements: ``positions`` and unit ``normals`` (n, 3), ``thickness_m`` and ``points`` in the voxel, its ``keys`` (n).
+    """Surface elements, one per voxel with enough points.
 
-    ``brightness`` (n) is the mean intensity of the voxel's returns as the sensor gives it, NaN where none was told.
+    Attributes:
+        positions: mean of the voxel's points, metres, map frame (n, 3).
+        normals: unit normals, map frame (n, 3).
+        thickness_m: standard deviation across the surface, metres (n,).
+        points: number of points in the voxel (n,).
+        keys: key of the voxel (n,).
+        brightness: mean intensity of the voxel's returns as the sensor gives it, NaN where unknown (n,).
     """
 
     positions: NDArray[np.float64]
@@ -50,15 +59,15 @@ class Surfels:
 
 
 class VoxelMap:
-    """Accumulates scans; ``tiles`` gives the surfels.
+    """Moments of points in voxels; ``surfels`` computes the surfels.
 
-    It reaches as far as its keys do (``reach_m``): 157 km from its origin along each axis with voxels of 0.3 m. What adds points beyond
-    that raises ``DatasetError``.
+    The number of keys limits the reach (``reach_m``): 157 km from the origin along each axis with voxels of 0.3 m. A method that adds
+    points beyond it raises ``DatasetError``.
 
     Args:
-        voxel_m: edge of a voxel.
-        origin: a point near the map's middle, metres; coordinates stay small around it. ``lattice_origin`` gives one at which the
-            voxels are those of other maps.
+        voxel_m: edge of a voxel, metres.
+        origin: corner of a cell near the middle of the map, metres, map frame (3,). Coordinates stay small around it. With an origin
+            from ``lattice_origin``, all maps of one edge share their voxels.
     """
 
     def __init__(self, voxel_m: float, origin: NDArray[np.float64]) -> None:
@@ -69,14 +78,18 @@ class VoxelMap:
 
     @property
     def reach_m(self) -> float:
-        """How far from the origin points may lie along each axis."""
+        """Largest distance of a point from the origin along each axis, metres."""
         return _FARTHEST * self.voxel_m
 
     def require_within(self, positions: NDArray[np.float64], what: Callable[[int], str]) -> None:
-        """Refuse positions (n, 3), metres, map frame, that lie beyond the map's reach; ``what`` says what one of them is.
+        """Refuse positions beyond the reach of the map.
+
+        Args:
+            positions: metres, map frame (n, 3).
+            what: returns a name for the position of an index, for the error message.
 
         Raises:
-            DatasetError: names the farthest of them.
+            DatasetError: a position is too far away or not finite. The message names the farthest one.
         """
         away = np.abs(positions - self.origin).max(axis=1, initial=0.0)
         away[~np.isfinite(away)] = np.inf
@@ -89,7 +102,15 @@ class VoxelMap:
             )  # fmt: skip
 
     def add(self, points_map: NDArray[np.float64], intensity: NDArray[np.floating[Any]] | None = None) -> None:
-        """Add points (n, 3), metres, map frame, with the intensity of their returns (n), if it is known."""
+        """Add points.
+
+        Args:
+            points_map: metres, map frame (n, 3).
+            intensity: intensity of their returns (n,); None if unknown.
+
+        Raises:
+            DatasetError: a point lies beyond the reach of the map.
+        """
         cell = self._cells(points_map)
         local = (points_map - self.origin) - (cell + 0.5) * self.voxel_m
         moments = _moments_of(local)
@@ -98,33 +119,50 @@ class VoxelMap:
         self.add_sums(*_summed(_keys_of_cells(cell), moments))
 
     def add_sums(self, keys: NDArray[np.int64], moments: NDArray[np.float64]) -> None:
-        """Add what ``sums`` of a map of the same voxels and the same origin gave."""
+        """Add the ``sums`` of another map with the same voxel edge and the same origin.
+
+        Args:
+            keys: keys of the voxels (n,).
+            moments: moments of the voxels (n, 12).
+        """
         self._waiting.append((keys, moments))
-        # By the amount of what waits, so that a map of any size is copied seldom, and whoever adds the same gets the same.
+        # The limit grows with the map, so even a large map is seldom copied. It depends on the added rows only, so the same calls give
+        # the same rounding.
         if sum(len(k) for k, _ in self._waiting) >= max(_WAITING, len(self._keys) // 4):
             self._merge()
 
     def sums(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Keys of all voxels, sorted, and their moments."""
+        """Return the keys of all voxels, ascending (n,), and their moments about the voxel's centre (n, 12)."""
         self._merge()
         return self._keys, self._moments
 
     def keys_of(self, points_map: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Key of the voxel that each point (n, 3), metres, map frame, lies in."""
+        """Return the key of the voxel of each point (n,).
+
+        Args:
+            points_map: metres, map frame (n, 3).
+
+        Raises:
+            DatasetError: a point lies beyond the reach of the map.
+        """
         return _keys_of_cells(self._cells(points_map))
 
     def keep(self, wanted: NDArray[np.bool_]) -> None:
-        """Forget the other voxels; one flag for each, in the order of ``sums``."""
+        """Keep some voxels and remove the others.
+
+        Args:
+            wanted: True for the voxels to keep, in the order of ``sums`` (n,).
+        """
         self._merge()
         self._keys, self._moments = self._keys[wanted], self._moments[wanted]
 
     def means(self) -> NDArray[np.float64]:
-        """Mean of each voxel's points (n, 3), metres, map frame, in the order of ``sums``."""
+        """Return the mean of each voxel's points (n, 3), metres, map frame, in the order of ``sums``."""
         keys, moments = self.sums()
         return self.origin + (_cells_of_keys(keys) + 0.5) * self.voxel_m + moments[:, 1:4] / moments[:, :1]
 
     def statistics(self) -> NDArray[Any]:
-        """All voxels as a bundle keeps them (``VOXEL``); the origin must be of the lattice."""
+        """Return all voxels in the format of a bundle: (n,) of ``VOXEL``. The origin must come from ``lattice_origin``."""
         keys, moments = self.sums()
         found = np.zeros(len(keys), VOXEL)
         found["cell"] = _cells_of_keys(keys) + self._lattice()
@@ -133,7 +171,16 @@ class VoxelMap:
         return found
 
     def add_statistics(self, statistics: NDArray[Any]) -> None:
-        """Add what ``statistics`` of a map of the same voxels gave; single precision loses less than a micrometre of a mean."""
+        """Add the ``statistics`` of another map with the same voxel edge.
+
+        Single precision changes a mean by less than a micrometre.
+
+        Args:
+            statistics: (n,) of ``VOXEL`` or ``VOXEL_WITHOUT_BRIGHTNESS``.
+
+        Raises:
+            DatasetError: a voxel lies beyond the reach of this map.
+        """
         cell = statistics["cell"].astype(np.int64) - self._lattice()
         self.require_within(self.origin + cell * self.voxel_m, lambda _: "a voxel of the added map")
         keys = _keys_of_cells(cell)
@@ -144,9 +191,15 @@ class VoxelMap:
         self.add_sums(*_summed(keys, moments))
 
     def add_moments(self, means: NDArray[np.float64], points: NDArray[Any], covariances: NDArray[np.float64]) -> None:
-        """Add groups of points of which only the mean (n, 3; m, map frame), number (n) and covariance (n, 3, 3; m2) are known.
+        """Add groups of points by their moments. A group goes into the voxel of its mean.
 
-        A group goes into the voxel that its mean lies in.
+        Args:
+            means: mean of each group, metres, map frame (n, 3).
+            points: number of points of each group (n,).
+            covariances: covariance of each group, square metres (n, 3, 3).
+
+        Raises:
+            DatasetError: a mean lies beyond the reach of the map.
         """
         cell = self._cells(means)
         moments = _moments_of((means - self.origin) - (cell + 0.5) * self.voxel_m)
@@ -155,12 +208,12 @@ class VoxelMap:
 
     def _cells(self, points_map: NDArray[np.float64]) -> NDArray[np.int64]:
         cell = np.floor((points_map - self.origin) / self.voxel_m)
-        if not (np.abs(cell) <= _FARTHEST).all():  # a number that is not finite neither
+        if not (np.abs(cell) <= _FARTHEST).all():  # written so that NaN is refused too
             self.require_within(points_map, lambda number: f"a point at {np.round(points_map[number]).tolist()} m")
         return cell.astype(np.int64)
 
     def _lattice(self) -> NDArray[np.int64]:
-        """Cell of the lattice that the origin is the corner of."""
+        """Return the lattice cell whose corner is the origin."""
         return np.rint(self.origin / self.voxel_m).astype(np.int64)
 
     def _merge(self) -> None:
@@ -172,7 +225,11 @@ class VoxelMap:
         self._waiting = []
 
     def surfels(self, *, fewest: int = 5) -> "Surfels":
-        """One for each voxel that has ``fewest`` points in it and around it, enough for a normal."""
+        """Compute one surfel for each voxel with enough points for a normal.
+
+        Args:
+            fewest: smallest number of points in the voxel and its 26 neighbours together.
+        """
         self._merge()
         keys, own = self._keys, self._moments
         total, around = np.zeros_like(own), np.zeros(len(own))
@@ -197,9 +254,16 @@ class VoxelMap:
         )
 
     def tiles(self, found: "Surfels") -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float32]]:
-        """Surfels relative to ``origin``, sorted by tile; tiles (n, 4): centre x, y (m, same frame), first surfel, count; brightness.
+        """Sort surfels by tile, in the format of ``SurfelMap.prepare``.
 
-        float32 holds a tenth of a millimetre as far as 1 km from the origin, and 1 mm as far as 16 km.
+        The positions are float32. Their resolution is 0.1 mm up to 1 km from the origin, and 1 mm up to 16 km.
+
+        Args:
+            found: the surfels.
+
+        Returns:
+            Surfels (n,) of ``SURFEL`` with positions relative to ``origin``; tiles (T, 4): centre x, y (metres, same frame), first surfel
+            and number of surfels; brightness of each surfel (n,).
         """
         positions = found.positions - self.origin
         tile = np.floor(positions[:, :2] / TILE_M).astype(np.int64)
@@ -213,7 +277,12 @@ class VoxelMap:
 
 
 def lattice_origin(voxel_m: float, near: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The corner of the common lattice of voxels that is nearest to a point (3,), metres, map frame."""
+    """Return the corner (3,) of the common voxel lattice that is nearest to a point, metres, map frame.
+
+    Args:
+        voxel_m: edge of a voxel, metres.
+        near: the point, metres, map frame (3,).
+    """
     return np.asarray(np.round(near / voxel_m) * voxel_m)
 
 
@@ -233,7 +302,7 @@ def _moments_of(local: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _summed(keys: NDArray[np.int64], moments: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows of equal key added up; keys sorted."""
+    """Add up the rows of equal key; the keys become ascending."""
     order = np.argsort(keys, kind="stable")
     keys, moments = keys[order], moments[order]
     first = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]]) if len(keys) else np.zeros(0, np.int64)
@@ -241,7 +310,7 @@ def _summed(keys: NDArray[np.int64], moments: NDArray[np.float64]) -> tuple[NDAr
 
 
 def _shifted(moments: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same moments about a corner that lies ``shift`` (3,) away: every point moves by it."""
+    """Return the moments after every point has moved by ``shift`` (3,)."""
     n, s = moments[:, :1], moments[:, 1:4]
     a, b, c = shift
     moved = moments.copy()

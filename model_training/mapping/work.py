@@ -1,8 +1,8 @@
-"""The finished parts of a build, kept beside its output until it is whole: a killed build goes on where it was.
+"""Store the finished parts of a build beside its output until the output is complete, so a killed build can continue.
 
-Beside ``maps/town`` they lie in ``maps/.town.building``; a service that mounts ``maps`` looks at no name with a dot. Each part is a
-file that is there whole or not at all, and its name carries a hash of all that it was made of: what was made of other scans,
-another encoder, with other settings or by other code is never taken.
+The parts of ``maps/town`` lie in ``maps/.town.building``. A service that mounts ``maps`` ignores names that start with a dot. A part is a
+file that exists complete or not at all. Its name contains a hash of all inputs. So a build never uses a part from other scans, another
+encoder, other settings or other code.
 """
 
 import fcntl
@@ -29,10 +29,11 @@ from model_training.datasets.files import reading
 from model_training.mapping.settings import BuildSettings
 from service.errors import BundleError
 
+#: Arrays of a part, by name.
 Arrays = dict[str, NDArray[Any]]
 #: Settings that no part depends on.
 _NOT_IN_PARTS = ("name", "licence", "calibration", "passes_vote")
-#: Code that parts are made by.
+#: Folders of the code that computes parts.
 _CODE = (
     (model_training, ("mapping", "datasets")),
     (service, ("imaging", "geometry", "registration", "localization", "maps")),
@@ -40,18 +41,26 @@ _CODE = (
 
 
 class Work:
-    """Finished parts of one build.
+    """The store for the finished parts of one build.
 
     Args:
-        folder: where they lie.
-        key: hash of what they are made of.
+        folder: folder of the parts.
+        key: hash of all inputs of the build.
     """
 
     def __init__(self, folder: Path, key: str) -> None:
         self.folder, self.key = folder, key
 
     def part(self, name: str, make: Callable[[], Arrays]) -> Arrays:
-        """The part of that name: as it was kept, or made now and kept."""
+        """Return a part from the store; if it is missing or damaged, compute and store it.
+
+        Args:
+            name: name of the part.
+            make: computes the part.
+
+        Raises:
+            BundleError: the part cannot be written.
+        """
         path = self.folder / f"{name}-{self.key}.npz"
         kept = _read(path)
         if kept is None:
@@ -62,11 +71,13 @@ class Work:
 
 @contextmanager
 def work_beside(out: Path, key: str) -> Iterator[Work]:
-    """Give the work folder of an output; it goes when the work is done, and stays when it is not.
+    """Provide the store of an output as a context, locked against other processes.
+
+    The folder is removed at the end of the context. After an exception it stays if it holds a finished part.
 
     Args:
-        out: the bundle's folder.
-        key: hash of what it is made of; parts of another key are removed.
+        out: folder of the bundle.
+        key: hash of all inputs of the build. Parts of another key are removed.
 
     Raises:
         BundleError: another process works on the same output, or the folder cannot be written.
@@ -82,36 +93,45 @@ def work_beside(out: Path, key: str) -> Iterator[Work]:
         for path in folder.iterdir():
             if path.name != _LOCK and not path.name.endswith(f"-{key}.npz"):
                 path.unlink()
-        for partial in out.parent.glob(
-            f".{out.name}.*.partial"
-        ):  # of a writer that was killed; nobody else holds the lock
+        # A killed writer left these folders. No other process uses them, because this one holds the lock.
+        for partial in out.parent.glob(f".{out.name}.*.partial"):
             shutil.rmtree(partial)
         try:
             yield Work(folder, key)
         except BaseException:
-            if [path.name for path in folder.iterdir()] == [_LOCK]:  # nothing was finished, nothing is kept
+            if [path.name for path in folder.iterdir()] == [_LOCK]:  # no part is finished
                 shutil.rmtree(folder)
             raise
         shutil.rmtree(folder)
 
 
 def work_folder(out: Path) -> Path:
-    """Where the parts of a build lie."""
+    """Return the folder of the parts of a build.
+
+    Args:
+        out: folder of the bundle.
+    """
     return out.parent / f".{out.name}.building"
 
 
 def key_of(
     dataset: Dataset, encoder_sha256: str, settings: BuildSettings, *, threads: int, held_out: int = 0, **more: str
 ) -> str:
-    """Hash of all that the parts of a build are made of.
+    """Return a hash of all inputs that the parts of a build depend on, the code included.
+
+    The code counts byte by byte: every ``.py`` and ``.so`` file in the folders of ``_CODE``. So a new comment gives a new hash too. The
+    versions of NumPy, ONNX Runtime and Faiss count as well.
 
     Args:
-        dataset: its description, poses, and its scans' names, sizes and times of change.
-        encoder_sha256: of the encoder.
-        settings: those that parts depend on.
-        threads: of the encoder: sums of another order round otherwise.
-        held_out: how many places the site check holds out.
-        more: what else there is.
+        dataset: the dataset. Its type, description and poses count, and the names, sizes and modification times of its scans.
+        encoder_sha256: SHA-256 of the encoder, hexadecimal.
+        settings: settings of the map. Only those count that parts depend on.
+        threads: number of threads of the encoder. It changes the order of sums, so it changes their rounding.
+        held_out: number of places that the site check holds out.
+        more: further inputs, by name.
+
+    Raises:
+        DatasetError: the folder of the scans cannot be read.
     """
     folder = dataset.folder / "survey" / "scans"
     with reading(folder):
@@ -142,7 +162,10 @@ _LOCK = "lock"
 
 
 def _locked(folder: Path, out: Path) -> IO[str]:
-    """Take the lock: the system gives it back however its holder ends, so what a killed build left is simply taken over."""
+    """Take the lock of a work folder.
+
+    The operating system releases the lock however its holder ends. So a new build can take over the folder of a killed one.
+    """
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / _LOCK
@@ -161,7 +184,7 @@ def _locked(folder: Path, out: Path) -> IO[str]:
             lock.write(str(os.getpid()))
             lock.flush()
             return lock
-        lock.close()  # its holder has just finished and removed the folder
+        lock.close()  # the previous holder has just removed the folder, so the lock is on a deleted file
 
 
 def _read(path: Path) -> Arrays | None:
@@ -171,14 +194,14 @@ def _read(path: Path) -> Arrays | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
-        return None  # a machine that lost power: the part is made again, which is all that could be done about it
+        return None  # damaged, for example by a power failure: compute the part again
 
 
 def _write(path: Path, arrays: Arrays) -> None:
     part = path.with_suffix(".part")
     try:
         with part.open("wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]  # numpy's stub takes ``allow_pickle`` for one of the arrays
+            np.savez(file, **arrays)  # type: ignore[arg-type]  # numpy's stub confuses ``allow_pickle`` with an array
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)

@@ -1,4 +1,4 @@
-"""Between the contract and the core's types, the same for every face; no arithmetic but degrees."""
+"""Convert between the contract and the types of the core, for REST and gRPC. The only arithmetic is degrees to radians."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -35,10 +35,14 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def parsed(document: bytes, model: type[M]) -> M:
-    """A part's JSON as a message of the contract.
+    """Parse JSON to a model of the contract.
+
+    Args:
+        document: JSON, encoded.
+        model: class of the model.
 
     Raises:
-        RequestError: it is no JSON, or a field makes no sense.
+        RequestError: the document is not JSON, or a field is invalid.
     """
     try:
         return model.model_validate_json(document)
@@ -47,10 +51,14 @@ def parsed(document: bytes, model: type[M]) -> M:
 
 
 def checked(content: dict[str, Any], model: type[M]) -> M:
-    """What another face was sent, as a message of the contract.
+    """Validate a dictionary as a model of the contract.
+
+    Args:
+        content: fields by name.
+        model: class of the model.
 
     Raises:
-        RequestError: a field makes no sense.
+        RequestError: a field is invalid.
     """
     try:
         return model.model_validate(content)
@@ -59,12 +67,20 @@ def checked(content: dict[str, Any], model: type[M]) -> M:
 
 
 def invalid(error: ValidationError) -> RequestError:
-    """One error of ours from pydantic's: the first field is named, the next ones are in the message."""
+    """Convert an error of pydantic. The error names the first field; its message also names the next ones.
+
+    Args:
+        error: of pydantic.
+    """
     return request_error_from(error.errors(include_url=False, include_input=False, include_context=False))
 
 
 def request_error_from(errors: Sequence[Any]) -> RequestError:
-    """The same from its list."""
+    """Convert a list of pydantic's errors, as ``invalid`` does.
+
+    Args:
+        errors: as pydantic lists them; at least one.
+    """
     told = [
         f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg'].removeprefix('Value error, ')}"
         for each in errors[:5]
@@ -74,16 +90,16 @@ def request_error_from(errors: Sequence[Any]) -> RequestError:
 
 
 def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> EncodedQuery:
-    """The core's query.
+    """Build the query of the core.
 
     Args:
         request: checked against the contract.
-        rgb: encoded picture.
-        depth: encoded picture.
+        rgb: encoded RGB image.
+        depth: encoded depth image.
 
     Raises:
-        RequestError: a field makes no sense beside the others.
-        NotYetSupportedError: a field that this release cannot use.
+        RequestError: a field contradicts other fields.
+        NotYetSupportedError: this release cannot use a field.
     """
     _require_supported(request.camera)
     return EncodedQuery(
@@ -111,15 +127,15 @@ def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> 
 def sequence_from(
     request: schema.SequenceRequest, pictures: Sequence[tuple[bytes, bytes]]
 ) -> tuple[tuple[EncodedQuery, ...], tuple[NDArray[np.float64], ...]]:
-    """The core's queries, the reference first, and where each camera stood against the reference.
+    """Build the queries of the core, the reference first, and ``T_reference_camera`` of each camera.
 
     Args:
         request: checked against the contract.
-        pictures: rgb and depth of each frame, encoded.
+        pictures: RGB and depth image of each frame, encoded.
 
     Raises:
-        RequestError: a field makes no sense beside the others.
-        NotYetSupportedError: a field that this release cannot use.
+        RequestError: a field contradicts other fields.
+        NotYetSupportedError: this release cannot use a field.
     """
     queries, transforms = [], []
     for number, (frame, (rgb, depth)) in enumerate(zip(request.frames, pictures, strict=True)):
@@ -142,7 +158,11 @@ def sequence_from(
 
 @contextmanager
 def fields_under(where: str) -> Iterator[None]:
-    """Errors name their field as one of this message's."""
+    """Prefix the field of an error with the path of the enclosing message.
+
+    Args:
+        where: dotted path of the enclosing message.
+    """
     try:
         yield
     except StreetfixError as error:
@@ -152,7 +172,11 @@ def fields_under(where: str) -> Iterator[None]:
 
 
 def answer_from(located: Located) -> schema.LocalizeAnswer:
-    """The answer as the contract says it: without a pose, a geopose and a street unless it is LOCALIZED."""
+    """Convert an answer to the contract. Only a LOCALIZED answer gets a pose, a geopose and a street.
+
+    Args:
+        located: answer of the core, with its map.
+    """
     answer, bundle = located.answer, located.bundle
     times, spread = answer.timings, answer.spread
     localized = answer.status == "LOCALIZED"
@@ -182,7 +206,12 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
 
 
 def geopose_of(T_map_body: NDArray[np.float64], bundle: MapBundle) -> schema.GeoPose | None:
-    """Where on the Earth a body of the map stands, and how; None where the map is not georeferenced."""
+    """Convert a pose in the map frame to a GeoPose; None if the map is not georeferenced.
+
+    Args:
+        T_map_body: pose of the vehicle or of the camera.
+        bundle: the map.
+    """
     earth = bundle.earth
     if earth is None:
         return None
@@ -195,7 +224,11 @@ def geopose_of(T_map_body: NDArray[np.float64], bundle: MapBundle) -> schema.Geo
 
 
 def last_answer_from(answer: LastAnswer) -> schema.LastAnswer:
-    """A kept answer as the contract says it."""
+    """Convert a kept answer to the contract.
+
+    Args:
+        answer: as kept.
+    """
     return schema.LastAnswer(
         number=answer.number,
         at=answer.at.isoformat(timespec="milliseconds"),
@@ -211,16 +244,20 @@ def last_answer_from(answer: LastAnswer) -> schema.LastAnswer:
 
 
 def vector_from(position_m: NDArray[np.float64]) -> schema.Vector:
-    """A position as the contract says it."""
+    """Convert a position to the contract.
+
+    Args:
+        position_m: position, metres.
+    """
     return _vector(position_m)
 
 
 def map_entry_from(bundle: MapBundle, versions: Sequence[Localizer]) -> schema.MapEntry:
-    """A mounted map as the contract says it.
+    """Convert a mounted map to the contract.
 
     Args:
-        bundle: the version that serves.
-        versions: all that are open, the newest first.
+        bundle: the serving version.
+        versions: all open versions, the newest first.
     """
     manifest = bundle.manifest
     return schema.MapEntry(
@@ -247,10 +284,13 @@ def _require_supported(camera: schema.Camera) -> None:
 
 
 def require_camera(camera: PinholeCamera) -> None:
-    """Hold intrinsics that came by no request against the contract's bounds.
+    """Check intrinsics that did not come by a request against the limits of the contract.
+
+    Args:
+        camera: the intrinsics.
 
     Raises:
-        RequestError: a number makes no sense.
+        RequestError: a number is out of its limits.
     """
     numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     with fields_under("camera"):
@@ -318,7 +358,7 @@ def _direction(vector: schema.Direction, field: str) -> NDArray[np.float64]:
 
 
 def _down(gravity: schema.Direction) -> NDArray[np.float64]:
-    """Gravity's direction; along the optical axis it leaves no heading to localize."""
+    """Return the direction of gravity. If it lies along the optical axis, there is no heading to localize."""
     down = _direction(gravity, "gravity")
     if abs(down[2]) > np.cos(np.deg2rad(20.0)):
         raise RequestError(
@@ -329,14 +369,18 @@ def _down(gravity: schema.Direction) -> NDArray[np.float64]:
 
 
 def transform_of(transform: schema.RigidTransform, name: str) -> NDArray[np.float64]:
-    """The matrix.
+    """Return a rigid transform as a 4x4 matrix, translation in metres.
+
+    Args:
+        transform: of the contract.
+        name: path of its field, for the error.
 
     Raises:
-        RequestError: its quaternion is no rotation.
+        RequestError: the quaternion is not a rotation.
     """
     q, p = transform.orientation, transform.position
     quaternion = np.array([q.x, q.y, q.z, q.w])
-    length = math.hypot(*quaternion)  # no square of 1e200 on the way
+    length = math.hypot(*quaternion)  # hypot does not overflow for components of 1e200
     if not 1e-6 < length < 1e9:
         field = f"{name}.orientation"
         raise RequestError(f"{field}: a quaternion of length {length:g} is no rotation; send a unit one", field=field)
@@ -395,6 +439,6 @@ def _vector(position: NDArray[np.float64]) -> schema.Vector:
 
 
 def _degrees(angle_rad: float) -> float:
-    """In (-180, 180]."""
+    """Convert radians to degrees in (-180, 180]."""
     found = 180.0 - (180.0 - math.degrees(angle_rad)) % 360.0
     return found if found > -180.0 else 180.0

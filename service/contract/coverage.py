@@ -1,4 +1,4 @@
-"""Where maps can answer, as GeoJSON."""
+"""Coverage of the maps as GeoJSON."""
 
 import json
 from collections.abc import Sequence
@@ -10,23 +10,26 @@ from numpy.typing import NDArray
 
 from service.maps.reader import MapBundle
 
-#: Edge of a cell, and how far from a place a robot may stand: retrieval finds it 2 m aside of a survey's lane, and a little more.
+#: Edge of a cell, and largest distance of a robot from a place. Retrieval finds a robot 2 m and slightly more beside a survey's lane.
 CELL_M, REACH_M = 5.0, 7.5
 _MOST_MADE = 64
 _made: dict[tuple[str, str], bytes] = {}
 
 
 def coverage_geojson(bundles: Sequence[MapBundle]) -> bytes:
-    """A FeatureCollection with a MultiPolygon of each map: its places and what lies near them.
+    """Return a FeatureCollection with one MultiPolygon per map: the cells near its places.
 
-    Longitude and latitude where the map is georeferenced, as RFC 7946 has it, else metres of the map frame, which the property
-    ``frame`` says.
+    Coordinates are longitude and latitude (RFC 7946) if the map is georeferenced, else metres of the map frame. The property
+    ``frame`` names the frame.
+
+    Args:
+        bundles: the maps.
     """
     return b'{"type": "FeatureCollection", "features": [' + b", ".join(_feature(bundle) for bundle in bundles) + b"]}"
 
 
 def _feature(bundle: MapBundle) -> bytes:
-    """Made once for each version of a map: of a large one it takes seconds."""
+    """Return the feature of a map, computed once per version. A large map takes seconds."""
     name = (str(bundle.path), bundle.manifest.version)
     if name not in _made:
         while len(_made) >= _MOST_MADE:
@@ -48,7 +51,13 @@ def _made_feature(bundle: MapBundle) -> dict[str, Any]:
 
 
 def covered(places_m: Float64[NDArray[np.float64], "P 2"]) -> list[tuple[float, float, float, float]]:
-    """Rectangles (x0, y0, x1, y1) of cells whose centre lies within reach of a place, runs of cells along x as one."""
+    """Return rectangles (x0, y0, x1, y1), metres, that cover the cells with their centre within ``REACH_M`` of a place.
+
+    A run of adjacent cells along x is one rectangle.
+
+    Args:
+        places_m: positions of the places, map frame, metres.
+    """
     steps = np.arange(-np.ceil(REACH_M / CELL_M), np.ceil(REACH_M / CELL_M) + 1)
     around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     cells = np.floor(places_m / CELL_M)[:, None] + around
@@ -69,7 +78,7 @@ def covered(places_m: Float64[NDArray[np.float64], "P 2"]) -> list[tuple[float, 
 
 
 def _ring(rectangle: tuple[float, float, float, float], bundle: MapBundle) -> list[list[float]]:
-    """Counter-clockwise and closed."""
+    """Return the closed ring of a rectangle, counter-clockwise."""
     x0, y0, x1, y1 = rectangle
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
     earth = bundle.earth

@@ -1,11 +1,12 @@
-"""The OSCP GeoPose Protocol, version 2: its messages, of which clients leave out or send as null what they please.
+"""Messages of the OSCP GeoPose Protocol, version 2. Clients may omit any field or send null for it.
 
-Facts after github.com/OpenArCloud/oscp-geopose-protocol (README, November 2026). What it leaves open is settled here:
+Source: github.com/OpenArCloud/oscp-geopose-protocol (README, November 2026). This module settles what the protocol leaves open:
 
-- Intrinsics are COLMAP's, so the corner of the first pixel is (0, 0); ours puts its centre there.
-- A DEPTH image of integers holds millimetres; of floats metres. ``minMaxDepth`` ends what counts as measured.
-- An accuracy of 0, or of more than ``_MOST_STD_M``, is not known: the clients' own structures begin with 0 and with the largest float.
-- The accelerometer is W3C's: x right, y up, z towards the viewer, and at rest it points up; the camera looks the other way.
+- Intrinsics follow COLMAP: the corner of the first pixel is (0, 0). In our contract, its centre is (0, 0).
+- A DEPTH image of integers holds millimetres, one of floats holds metres. Depth beyond the
+  maximum of ``minMaxDepth`` counts as not measured.
+- An accuracy of 0, or above ``_MOST_STD_M``, means unknown. The clients' structures start with 0 and with the largest float.
+- The accelerometer follows W3C: x right, y up, z towards the viewer. At rest it points up. The camera looks the other way.
 """
 
 import base64
@@ -23,22 +24,22 @@ from service.errors import DecodeError, NotYetSupportedError, RequestError
 from service.geometry.rigid import rotation_from_quaternion_xyzw
 from service.runtime.engine import EncodedQuery
 
-#: How many numbers a camera model has: focal lengths, principal point, distortion.
+#: Number of focal lengths and of distortion coefficients per camera model. The principal point has two numbers in each model.
 _MODELS = {
     "SIMPLE_PINHOLE": (1, 0), "PINHOLE": (2, 0), "SIMPLE_RADIAL": (1, 1), "RADIAL": (1, 2), "OPENCV": (2, 4), "FULL_OPENCV": (2, 8),
 }  # fmt: skip
 _COLOUR = ("RGBA32", "RGB", "JPG", "GRAY8")
 _MOST_READINGS = 64
-_SAME_VIEW = 0.01  # of the picture's size
-#: Of a prior pose whose accuracy was not told, or told too well: its sender has moved since.
+_SAME_VIEW = 0.01  # of the image size
+#: Standard deviations of a prior pose with an unknown or too small accuracy. Its sender has moved since.
 _LEAST_STD_M, _MOST_STD_M, _HEADING_STD_DEG = 5.0, 1e5, 30.0
 
-#: Bounds of what clients send. What our own contract bounds more narrowly is refused there, by its name there.
+#: Limits of the numbers that clients send. Our own contract has narrower limits for some. It refuses them under its own field names.
 _Pixels = Annotated[float, Field(ge=-schema.MOST_COMPONENT, le=schema.MOST_COMPONENT)]
 _Side = Annotated[float, Field(ge=0, le=schema.MOST_SIDE)]
 _Metres = Annotated[float, Field(ge=0, le=1e5)]
 _Component = Annotated[float, Field(ge=-schema.MOST_COMPONENT, le=schema.MOST_COMPONENT)]
-#: -1 is iOS' word for not known, the largest float that of the clients' own structures.
+#: iOS sends -1 for unknown. The clients' own structures start with the largest float.
 _Deviation = Annotated[float, Field(ge=-1, le=sys.float_info.max)]
 _Latitude = Annotated[float, Field(ge=-90, le=90)]
 _Longitude = Annotated[float, Field(ge=-180, le=180)]
@@ -49,7 +50,7 @@ class _Lenient(BaseModel):
 
 
 class CameraParams(_Lenient):
-    """Intrinsics."""
+    """Intrinsics of a camera, as in COLMAP, and its depth range."""
 
     model: str | None = None
     modelParams: list[_Pixels] | None = Field(None, max_length=32)
@@ -57,27 +58,27 @@ class CameraParams(_Lenient):
 
 
 class ImageOrientation(_Lenient):
-    """How the picture lies in its bytes."""
+    """Orientation of the stored image."""
 
     mirrored: bool | None = None
-    rotation: float | None = Field(None, ge=-360, le=360, description="degrees")
+    rotation: float | None = Field(None, ge=-360, le=360, description="rotation, degrees")
 
 
 class CameraReading(_Lenient):
-    """A picture."""
+    """An image."""
 
     sensorId: str | None = None
     imageFormat: str | None = Field(
-        None, description="RGBA32, JPG or GRAY8 for colour, whatever the file's own format; DEPTH for depth"
+        None, description="RGBA32, JPG or GRAY8 for colour, whatever the format of the file. DEPTH for depth"
     )
     size: list[_Side] | None = Field(None, max_length=2, description="width, height")
-    imageBytes: str | None = Field(None, description="base64 of an encoded picture, with or without a data: prefix")
+    imageBytes: str | None = Field(None, description="base64 of an encoded image, with or without a data: prefix")
     imageOrientation: ImageOrientation | None = None
     params: CameraParams | None = None
 
 
 class GeolocationReading(_Lenient):
-    """What a satellite receiver says."""
+    """Reading of a satellite receiver."""
 
     latitude: _Latitude | None = None
     longitude: _Longitude | None = None
@@ -85,7 +86,7 @@ class GeolocationReading(_Lenient):
 
 
 class AccelerometerReading(_Lenient):
-    """Specific force."""
+    """Reading of an accelerometer: specific force."""
 
     x: _Component | None = None
     y: _Component | None = None
@@ -93,7 +94,7 @@ class AccelerometerReading(_Lenient):
 
 
 class SensorReadings(_Lenient):
-    """All that a client has read; other kinds are passed over."""
+    """Sensor readings of a client. The service ignores other kinds of readings."""
 
     cameraReadings: list[CameraReading] | None = Field(None, max_length=_MOST_READINGS)
     geolocationReadings: list[GeolocationReading] | None = Field(None, max_length=_MOST_READINGS)
@@ -101,47 +102,77 @@ class SensorReadings(_Lenient):
 
 
 class Accuracy(_Lenient):
-    """Standard deviations: position m, mean of the components; orientation degrees, mean of the three angles."""
+    """Standard deviations. Position: mean of the components, metres. Orientation: mean of the three angles, degrees."""
 
     position: float | None = None
     orientation: float | None = None
 
 
 class EarlierAccuracy(_Lenient):
-    """Of an earlier answer, as ``Accuracy``."""
+    """Accuracy of an earlier answer, with the units of `Accuracy`."""
 
     position: _Deviation | None = None
     orientation: _Deviation | None = None
 
 
 class EarlierPosition(_Lenient):
-    """Of an earlier answer, on the WGS-84 ellipsoid."""
+    """Position of an earlier answer, on the WGS-84 ellipsoid."""
 
-    lat: _Latitude = Field(description="degrees")
-    lon: _Longitude = Field(description="degrees")
-    h: float = Field(ge=-1e5, le=1e5, description="metres above the ellipsoid")
+    lat: _Latitude = Field(description="latitude, degrees")
+    lon: _Longitude = Field(description="longitude, degrees")
+    h: float = Field(ge=-1e5, le=1e5, description="height above the ellipsoid, metres")
 
 
 class EarlierGeoPose(_Lenient):
-    """An earlier answer's pose."""
+    """Pose of an earlier answer."""
 
     position: EarlierPosition
     quaternion: schema.Quaternion
 
 
 class PriorPose(_Lenient):
-    """An earlier answer."""
+    """An earlier answer, as a prior pose."""
 
     accuracy: EarlierAccuracy | None = None
     geopose: EarlierGeoPose | None = None
 
 
 class GeoPoseRequest(_Lenient):
-    """A request."""
+    """Request of the OSCP GeoPose Protocol."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "4f0c8f4c0d5e4c0f9b4a3a1d4b7f9e21",
+                    "timestamp": 1763452800000,
+                    "type": "geopose",
+                    "sensorReadings": {
+                        "cameraReadings": [
+                            {
+                                "sensorId": "camera",
+                                "imageFormat": "RGBA32",
+                                "size": [640, 480],
+                                "imageBytes": "/9j/4AAQSkZJRg==",
+                                "params": {"model": "PINHOLE", "modelParams": [320, 320, 320, 240]},
+                            },
+                            {
+                                "sensorId": "depth",
+                                "imageFormat": "DEPTH",
+                                "size": [640, 480],
+                                "imageBytes": "iVBORw0KGgo=",
+                            },
+                        ],
+                        "geolocationReadings": [{"latitude": 49.0, "longitude": 8.4, "accuracy": 10.0}],
+                    },
+                }
+            ]
+        }
+    )
 
     id: str | None = Field(None, max_length=256)
     timestamp: float | None = Field(
-        None, ge=0, le=1e19, description="Unix ms; finer units pass, since nothing reads it"
+        None, ge=0, le=1e19, description="Unix time, ms. Finer units pass, because the service does not read the field"
     )
     type: str | None = None
     sensorReadings: SensorReadings | None = None
@@ -149,21 +180,28 @@ class GeoPoseRequest(_Lenient):
 
 
 class GeoPoseAnswer(BaseModel):
-    """An answer; the quaternion leads from east, north, up to the camera's axes: x right, y down, z forward."""
+    """Answer of the OSCP GeoPose Protocol.
+
+    The quaternion leads from east, north, up to the camera's axes: x right, y down, z forward.
+    """
 
     id: str
-    timestamp: int = Field(description="Unix ms")
+    timestamp: int = Field(description="Unix time, ms")
     type: Literal["geopose"] = "geopose"
     accuracy: Accuracy
     geopose: schema.GeoPose
 
 
 def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
-    """The core's query.
+    """Build the query of the core.
+
+    Args:
+        request: of the protocol.
+        map_name: map to use; None takes the only mounted map.
 
     Raises:
-        RequestError: a reading is missing or makes no sense; RGB alone lacks its DEPTH.
-        NotYetSupportedError: a distorted, mirrored or turned picture.
+        RequestError: a reading is missing or invalid. A colour image without its DEPTH image is also an error.
+        NotYetSupportedError: an image is distorted, mirrored or rotated.
     """
     readings = request.sensorReadings or SensorReadings()
     where = "sensorReadings.cameraReadings"
@@ -188,7 +226,11 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
 
 
 def accuracy_of(covariance: list[float] | None) -> Accuracy:
-    """Means of the standard deviations; nothing where they are not known."""
+    """Return the means of the standard deviations; both are None if the covariance is unknown.
+
+    Args:
+        covariance: 6x6, row by row, translation (m), then rotation (rad).
+    """
     if covariance is None:
         return Accuracy()
     sigma = np.sqrt(np.diag(np.array(covariance).reshape(6, 6)))
@@ -210,7 +252,7 @@ def _reading(readings: SensorReadings, formats: tuple[str, ...], missing: str) -
 
 
 def _camera(reading: CameraReading) -> dict[str, Any]:
-    """The contract's camera from COLMAP's numbers."""
+    """Convert COLMAP's parameters to the camera of the contract."""
     where = "sensorReadings.cameraReadings.params"
     params = reading.params or CameraParams()
     model, numbers = (params.model or "").upper(), params.modelParams or []
@@ -234,7 +276,7 @@ def _camera(reading: CameraReading) -> dict[str, Any]:
 
 
 def _require_same_view(colour: CameraReading, depth: CameraReading) -> None:
-    """Depth is read by the colour camera's intrinsics, so it must be aligned with it; another camera's is refused, not misread."""
+    """Refuse depth of another camera. The service reads depth with the colour camera's intrinsics, so depth must be aligned with it."""
     if depth.params is None or not depth.params.modelParams:
         return
     one, other = _camera(colour), _camera(depth)
@@ -262,7 +304,7 @@ def _bytes(reading: CameraReading, field: str) -> bytes:
 
 
 def _gravity(readings: SensorReadings) -> dict[str, float] | None:
-    """Down in the camera's axes."""
+    """Return the direction of gravity (down) in the camera frame."""
     for each in reversed(readings.accelerometerReadings or []):
         if each.x is not None and each.y is not None and each.z is not None and (each.x, each.y, each.z) != (0, 0, 0):
             return {"x": -each.x, "y": each.y, "z": each.z}
@@ -270,7 +312,7 @@ def _gravity(readings: SensorReadings) -> dict[str, float] | None:
 
 
 def _prior(request: GeoPoseRequest, readings: SensorReadings) -> dict[str, Any] | None:
-    """Of the latest earlier pose, else of the satellite receiver."""
+    """Return the prior of the latest earlier pose, else of the satellite receiver."""
     for pose in reversed(request.priorPoses or []):
         if pose.geopose is not None:
             at, q = pose.geopose.position, pose.geopose.quaternion

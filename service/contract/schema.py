@@ -1,19 +1,20 @@
-"""The contract as REST says it in JSON and gRPC in messages: requests and answers. Degrees here, radians inside."""
+"""The public contract: requests and answers, for REST as JSON and for gRPC as messages. Angles are in degrees; the core uses radians."""
 
 import math
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, field_validator, model_validator
+from pydantic.config import JsonDict
 
 from service.errors import NotLocalizedError, RequestError
 from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS
 
-#: Of a focal length, in widths or heights of the picture: 175 and 0.6 degrees of view. What is less or more was given in another unit
+#: Limits of a focal length, in widths or heights of the image: 175 and 0.6 degrees of view. A value outside was given in another unit
 #: than pixels.
 LEAST_FOCAL, MOST_FOCAL = 0.02, 100.0
-#: Sides of a picture, pixels, and how many times longer than the other one of them may be: memory goes with the longer one.
+#: Limits of the sides of an image, pixels, and of their ratio. The longer side determines the memory.
 LEAST_SIDE, MOST_SIDE, MOST_ASPECT = 2, 32768, 16
-#: Components of a vector whose length does not matter: an accelerometer may count in m/s2, in thousandths of g or in its own steps.
+#: Limit of the components of a vector whose length does not matter. An accelerometer may use m/s2, thousandths of g or its own steps.
 MOST_COMPONENT = 1e6
 
 
@@ -22,7 +23,7 @@ class _Strict(BaseModel):
 
 
 class Vector(_Strict):
-    """Three numbers."""
+    """Vector with three components."""
 
     x: float
     y: float
@@ -30,7 +31,7 @@ class Vector(_Strict):
 
 
 class Direction(_Strict):
-    """Three numbers of which only the direction counts."""
+    """Vector with three components. Only its direction counts."""
 
     x: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
     y: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
@@ -38,7 +39,7 @@ class Direction(_Strict):
 
 
 class Quaternion(_Strict):
-    """A rotation; of any length but zero when sent, of length 1 when answered."""
+    """Rotation. A request may send any length but zero. An answer has length 1."""
 
     x: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
     y: float = Field(ge=-MOST_COMPONENT, le=MOST_COMPONENT)
@@ -47,7 +48,7 @@ class Quaternion(_Strict):
 
 
 class Position(_Strict):
-    """Metres; between parts of a robot, or places that it passed."""
+    """Position, metres, between parts of a robot or between places that it passed."""
 
     x: float = Field(ge=-1e5, le=1e5)
     y: float = Field(ge=-1e5, le=1e5)
@@ -55,36 +56,37 @@ class Position(_Strict):
 
 
 class RigidTransform(_Strict):
-    """Takes coordinates of the second frame of its name to the first."""
+    """Rigid transform. `T_a_b` maps points from frame b to frame a."""
 
     position: Position
     orientation: Quaternion
 
 
 class Camera(_Strict):
-    """Intrinsics of the rectified colour picture, pixels; the centre of the first pixel is (0, 0)."""
+    """Intrinsics of the rectified RGB image, pixels. The centre of the first pixel is (0, 0)."""
 
     model: Literal["PINHOLE"] = Field(
-        "PINHOLE", description="what the pictures are after rectification; any other model is refused, not misread"
+        "PINHOLE", description="projection of the rectified images. The service refuses any other model"
     )
     width: int = Field(ge=LEAST_SIDE, le=MOST_SIDE)
     height: int = Field(
-        ge=LEAST_SIDE, le=MOST_SIDE, description=f"neither side is longer than {MOST_ASPECT} times the other"
+        ge=LEAST_SIDE, le=MOST_SIDE, description=f"neither side may be longer than {MOST_ASPECT} times the other"
     )
     fx: float = Field(
         ge=LEAST_FOCAL * LEAST_SIDE, le=MOST_FOCAL * MOST_SIDE,
-        description=f"pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} of the width",
+        description=f"focal length, pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} times the width",
     )  # fmt: skip
     fy: float = Field(
         ge=LEAST_FOCAL * LEAST_SIDE, le=MOST_FOCAL * MOST_SIDE,
-        description=f"pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} of the height",
+        description=f"focal length, pixels, {LEAST_FOCAL} to {MOST_FOCAL:g} times the height",
     )  # fmt: skip
     cx: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
     cy: float = Field(ge=-2 * MOST_SIDE, le=2 * MOST_SIDE)
     distortion: list[Annotated[float, Field(ge=-1e3, le=1e3)]] = Field(
         default_factory=list,
         max_length=14,
-        description="of the pictures as sent: empty or zero; others are refused, not misread: rectify first",
+        description="distortion coefficients of the images as sent: empty or zero. The service refuses other values: "
+        "rectify the images first",
     )
 
     @field_validator("model", mode="before")
@@ -117,71 +119,91 @@ class Camera(_Strict):
 
 
 class Depth(_Strict):
-    """How the depth picture is to be read."""
+    """Format of the depth image."""
 
     scale_m: float | None = Field(
         None,
         ge=1e-6,
         le=1e4,
-        description="metres for each stored unit (disparity: pixels); default 0.001 for integers, 1 for floats",
+        description="metres per stored unit (disparity: pixels per stored unit). Default: 0.001 for integers, 1 for floats",
     )
     kind: Literal["z", "range", "disparity"] = Field(
-        "z", description="along the optical axis, along the ray, or disparity"
+        "z", description="z: depth along the optical axis. range: depth along the ray. disparity: stereo disparity"
     )
     encoding: Literal["auto", "carla", "compressed_depth"] = Field(
         "auto",
-        description="carla: depth in the 24 bits of a colour PNG; compressed_depth: data of a ROS compressedDepth message, PNG or RVL",
+        description="auto: the first bytes of the file tell. carla: depth in the 24 bits of a colour PNG. "
+        "compressed_depth: data of a ROS compressedDepth message, PNG or RVL",
     )
-    max_range_m: float | None = Field(None, ge=0.01, le=1e5, description="what lies beyond is no measurement")
+    max_range_m: float | None = Field(
+        None, ge=0.01, le=1e5, description="depth beyond this range counts as not measured"
+    )
     baseline_m: float | None = Field(
-        None, ge=1e-3, le=100, description="of the stereo rig; needed for disparity; the rig's disparity offset is then estimated too"
-    )  # fmt: skip
+        None,
+        ge=1e-3,
+        le=100,
+        description="baseline of the stereo rig. Disparity needs it. "
+        "With a baseline, the service also estimates the rig's disparity offset",
+    )
 
 
 class PriorPosition(_Strict):
-    """Where the camera is believed to be, in the map frame, metres."""
+    """Prior of the camera position in the map frame, metres."""
 
     x: float = Field(ge=-1e7, le=1e7)
     y: float = Field(ge=-1e7, le=1e7)
-    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each coordinate")
+    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each coordinate, metres")
 
 
 class PriorWgs84(_Strict):
-    """Where the camera is believed to be on the Earth; only where the map is georeferenced."""
+    """Prior of the camera position on the Earth. The map must be georeferenced."""
 
     latitude_deg: float = Field(ge=-90, le=90)
     longitude_deg: float = Field(ge=-180, le=180)
-    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each horizontal coordinate")
+    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each horizontal coordinate, metres")
 
 
 class Prior(_Strict):
-    """What is known of the camera's pose beforehand. It narrows the search; the pictures may still contradict it."""
+    """Prior of the camera pose. The prior narrows the search. The images may still contradict the prior."""
 
     position: PriorPosition | None = None
     wgs84: PriorWgs84 | None = None
     heading_deg: float | None = Field(
-        None, ge=-360, le=360, description="of the optical axis, counter-clockwise from map x"
+        None, ge=-360, le=360, description="heading of the optical axis, counter-clockwise from map x"
     )
-    heading_std_deg: float = Field(20.0, ge=1e-3, le=360)
+    heading_std_deg: float = Field(20.0, ge=1e-3, le=360, description="standard deviation of the heading")
 
 
 class Options(_Strict):
-    """What to answer."""
+    """Options of the localization and of its answer."""
 
-    neighbours: int = Field(5, ge=1, le=MOST_NEIGHBOURS, description="k: distinct places that vote and are answered")
+    neighbours: int = Field(
+        5, ge=1, le=MOST_NEIGHBOURS, description="k: number of distinct places that vote and that the answer lists"
+    )
     refine: bool = Field(
         True,
-        description="register the depth picture on the map's cloud; false: the pose of retrieval alone, covariance and confidence null",
+        description="true: the service registers the depth image on the map cloud. "
+        "false: the answer is the pose of retrieval only, and covariance and confidence are null",
     )
     false_accept_rate: float | None = Field(
         None, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
-        description="share of the queries taken outside the map that one can live with being LOCALIZED; less than the map's calibration "
-        "measured is refused; default: the service's setting",
+        description="tolerated share of out-of-map queries with status LOCALIZED. The service refuses a share below the least "
+        "that the map's calibration measured. Default: the service's setting",
     )  # fmt: skip
 
 
+#: Examples. A camera that looks along the vehicle's x axis, 1.6 m above its origin; and its pose after 0.8 m of straight travel.
+_CAMERA: JsonDict = {"model": "PINHOLE", "width": 640, "height": 480, "fx": 320, "fy": 320, "cx": 319.5, "cy": 239.5}
+_DEPTH: JsonDict = {"scale_m": 0.001, "kind": "z", "max_range_m": 80}
+_FORWARD_CAMERA: JsonDict = {
+    "position": {"x": 0.5, "y": 0.0, "z": 1.6},
+    "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5},
+}
+_AHEAD: JsonDict = {"position": {"x": 0.0, "y": 0.0, "z": 0.8}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+
+
 class LocalizeRequest(_Strict):
-    """The JSON part of a request."""
+    """JSON part of a request."""
 
     model_config = ConfigDict(
         title="LocalizeRequest",
@@ -189,16 +211,8 @@ class LocalizeRequest(_Strict):
             "examples": [
                 {
                     "map": "paper-city",
-                    "camera": {
-                        "model": "PINHOLE",
-                        "width": 640,
-                        "height": 480,
-                        "fx": 320,
-                        "fy": 320,
-                        "cx": 319.5,
-                        "cy": 239.5,
-                    },
-                    "depth": {"scale_m": 0.001, "kind": "z", "max_range_m": 80},
+                    "camera": _CAMERA,
+                    "depth": _DEPTH,
                     "gravity": {"x": 0.01, "y": 0.999, "z": 0.02},
                     "prior": {"position": {"x": 12.0, "y": -40.0, "std_m": 20.0}, "heading_deg": 90.0},
                     "options": {"neighbours": 5},
@@ -207,14 +221,16 @@ class LocalizeRequest(_Strict):
         },
     )
 
-    map: str | None = Field(None, max_length=64, description="optional where one map is mounted")
+    map: str | None = Field(None, max_length=64, description="name of the map. Optional if only one map is mounted")
     camera: Camera
     depth: Depth = Depth()
-    gravity: Direction | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
-    T_vehicle_camera: RigidTransform | None = Field(
-        None, description="where the camera sits: the vehicle's pose is answered too"
+    gravity: Direction | None = Field(
+        None, description="direction of gravity (down) in the camera frame, from an IMU. Any length but zero"
     )
-    prior: Prior | None = Field(None, description="a position, a heading, or both")
+    T_vehicle_camera: RigidTransform | None = Field(
+        None, description="pose of the camera on the vehicle. If sent, the answer also has the vehicle pose"
+    )
+    prior: Prior | None = Field(None, description="prior of the camera pose: a position, a heading, or both")
     options: Options = Options()
 
 
@@ -222,72 +238,119 @@ MOST_FRAMES = 16
 
 
 class BatchRequest(_Strict):
-    """The JSON part of a batch: request k goes with the parts rgbK and depthK."""
+    """JSON part of a batch. Request k belongs to the parts rgbK and depthK."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "requests": [
+                        {"map": "paper-city", "camera": _CAMERA, "depth": _DEPTH},
+                        {"map": "paper-city", "camera": _CAMERA, "depth": _DEPTH, "options": {"refine": False}},
+                    ]
+                }
+            ]
+        }
+    )
 
     requests: list[LocalizeRequest] = Field(min_length=1, max_length=MOST_FRAMES)
 
 
 class SequenceFrame(_Strict):
-    """A pair of pictures of a sequence: frame k goes with the parts rgbK and depthK."""
+    """Image pair of a sequence. Frame k belongs to the parts rgbK and depthK."""
 
     camera: Camera
     depth: Depth = Depth()
-    gravity: Direction | None = Field(None, description="down in the camera frame, any length but zero, from an IMU")
+    gravity: Direction | None = Field(
+        None, description="direction of gravity (down) in the camera frame, from an IMU. Any length but zero"
+    )
     T_reference_camera: RigidTransform | None = Field(
-        None, description="where this camera stood against the first frame's; null in the first frame"
+        None, description="pose of this camera in the frame of the first frame's camera. Null in the first frame"
     )
 
 
 class SequenceRequest(_Strict):
-    """The JSON part of a sequence: frames of a drive, or the cameras of a rig at one instant; the first one's pose is answered."""
+    """JSON part of a sequence: frames of a traversal, or the cameras of a rig at one instant.
 
-    map: str | None = Field(None, max_length=64, description="optional where one map is mounted")
+    The answer is the pose of the first frame.
+    """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "map": "paper-city",
+                    "frames": [
+                        {"camera": _CAMERA, "depth": _DEPTH},
+                        {"camera": _CAMERA, "depth": _DEPTH, "T_reference_camera": _AHEAD},
+                    ],
+                    "T_vehicle_camera": _FORWARD_CAMERA,
+                }
+            ]
+        }
+    )
+
+    map: str | None = Field(None, max_length=64, description="name of the map. Optional if only one map is mounted")
     frames: list[SequenceFrame] = Field(min_length=1, max_length=MOST_FRAMES)
-    T_vehicle_camera: RigidTransform | None = Field(None, description="where the first frame's camera sits")
-    prior: Prior | None = Field(None, description="of the first frame's camera")
+    T_vehicle_camera: RigidTransform | None = Field(
+        None,
+        description="pose of the first frame's camera on the vehicle. If sent, the answer also has the vehicle pose",
+    )
+    prior: Prior | None = Field(None, description="prior of the pose of the first frame's camera")
     options: Options = Options()
 
 
 class Street(BaseModel):
-    """The street under the registered position; without registration that of the heaviest cluster of similar places."""
+    """A street, or a section of a street, under the registered position.
+
+    Without registration, it is the street of the heaviest cluster of similar places.
+    """
 
     id: str
     name: str = Field(examples=["End of street 4"])
     street: str = Field(examples=["4"])
     section: Literal["beginning", "end"] | None
-    class_index: int = Field(description="0 to 15 in the paper's city")
-    vote: float = Field(description="this street's share of the nearest places' similarity-weighted votes, 0 to 1")
+    class_index: int = Field(description="number of the class, 0 to 15 in the paper's city")
+    vote: float = Field(
+        description="this street's share of the similarity-weighted votes of the nearest places, 0 to 1"
+    )
 
 
 HeadingDeg = Annotated[
     float,
-    Field(gt=-180, le=180, description="of the optical axis (or of the vehicle's x), counter-clockwise from map x"),
+    Field(
+        gt=-180,
+        le=180,
+        description="heading of the optical axis (or of the vehicle's x axis), counter-clockwise from map x",
+    ),
 ]
 
 
 class Pose(BaseModel):
-    """In the map frame: metres; the camera frame is x right, y down, z forward."""
+    """Pose in the map frame, metres. The camera frame is x right, y down, z forward."""
 
     position: Vector
     orientation: Quaternion
     heading_deg: HeadingDeg
     covariance: list[float] | None = Field(
-        description="6x6, row by row, translation first, map axes, about this frame's origin; null: not known without registration"
+        description="6x6, row by row, translation (m) first, then rotation (rad), in map axes, about the origin of this frame. "
+        "Null if unknown, as without registration"
     )
 
 
 class GeoPosition(BaseModel):
-    """On the WGS-84 ellipsoid, as OGC GeoPose spells it."""
+    """Position on the WGS-84 ellipsoid, with the field names of OGC GeoPose."""
 
-    lat: float = Field(description="degrees")
-    lon: float = Field(description="degrees")
-    h: float = Field(description="metres above the ellipsoid")
+    lat: float = Field(description="latitude, degrees")
+    lon: float = Field(description="longitude, degrees")
+    h: float = Field(description="height above the ellipsoid, metres")
 
 
 class GeoPose(BaseModel):
-    """OGC GeoPose 1.0, Basic-Quaternion: from east, north, up at the position to the axes of what is posed.
+    """OGC GeoPose 1.0, Basic-Quaternion. The quaternion leads from east, north, up at the position to the axes of the body.
 
-    That is the vehicle (x forward, y left, z up) where T_vehicle_camera was sent, else the camera (x right, y down, z forward).
+    The body is the vehicle (x forward, y left, z up) if the request has T_vehicle_camera.
+    Otherwise, the body is the camera (x right, y down, z forward).
     """
 
     position: GeoPosition
@@ -299,66 +362,75 @@ class Neighbour(BaseModel):
 
     place: int
     distance: float = Field(description="Euclidean distance of the descriptors, 0 to 2")
-    similarity: float = Field(description="cosine of the descriptors")
-    street: str | None = Field(description="id of the street it lies in")
+    similarity: float = Field(description="cosine similarity of the descriptors")
+    street: str | None = Field(description="id of the street of this place")
     position: Vector
     heading_deg: HeadingDeg
 
 
 class HypothesisOfPose(BaseModel):
-    """A place where the pictures may have been taken."""
+    """A pose that the camera may have had."""
 
     confirmed: bool = Field(
-        description="true for the first hypothesis of a LOCALIZED answer alone: it is the answer's pose. false: do not use it as a pose"
+        description="true only for the first hypothesis of a LOCALIZED answer, the answer's pose. "
+        "false: do not use this hypothesis as a pose"
     )
     pose: Pose = Field(
-        description="T_map_camera; its covariance holds only if this hypothesis is right, and is null for the others of a LOCALIZED answer"
+        description="T_map_camera. Its covariance holds only if this hypothesis is right. "
+        "The covariance is null for the other hypotheses of a LOCALIZED answer"
     )
     share: float = Field(
-        description="of the support of all hypotheses, 0 to 1; LOCALIZED needs more than a half for the first"
+        description="share of the support of all hypotheses, 0 to 1. LOCALIZED needs more than a half for the first hypothesis"
     )
-    inliers: float = Field(description="share of the depth's weight that lies on the map, 0 to 1")
-    similarity: float = Field(description="of the pictures to the places around, cosine")
+    inliers: float = Field(description="share of the depth weight that lies on the map, 0 to 1")
+    similarity: float = Field(description="cosine similarity of the query to the places around the pose")
 
 
 class Spread(BaseModel):
-    """Where the camera may be, over all hypotheses and the rest of the map. It is not a pose: its mean is usually between the hypotheses.
+    """Where the camera may be, over all hypotheses and the rest of the map.
 
-    Each hypothesis counts with the probability that it is right, the whole map with the rest. The covariance is that of the mixture
-    (law of total covariance): hypotheses that are metres apart give metres, and a single hypothesis that is probably wrong gives the
-    size of the map. Of an OUT_OF_MAP answer the camera may be outside the map as well, which no covariance can say.
+    The spread is not a pose. Its mean usually lies between the hypotheses.
+
+    Each hypothesis is weighted with the probability that it is right. The whole map has the rest of the probability.
+    The covariance is the covariance of this mixture (law of total covariance).
+    Hypotheses that are metres apart give metres. A single hypothesis that is probably wrong gives the size of the map.
+    For an OUT_OF_MAP answer, the camera may also be outside the map. No covariance can express that.
     """
 
-    mean: Vector = Field(description="metres, map frame; not a position of the camera")
-    covariance: list[float] = Field(description="3x3, row by row, of the position, map axes, m^2")
+    mean: Vector = Field(description="mean position, map frame, metres. The mean is not a camera position")
+    covariance: list[float] = Field(description="covariance of the position, 3x3, row by row, in map axes, m^2")
     heading_std_deg: float = Field(
-        description="circular standard deviation of the heading; 103.9 where nothing is known of it"
+        description="circular standard deviation of the heading. 103.9 if the heading is unknown"
     )
     hypotheses_weight: float = Field(description="probability that one of the hypotheses is right, 0 to 1")
 
 
 class Reason(BaseModel):
-    """What may be wrong with the question or the map. It is read off the evidence, so it is a place to look, not a finding."""
+    """What may be wrong with the query or the map.
+
+    The service derives the reason from the confidence features. A reason is a place to look, not a finding.
+    """
 
     check: str = Field(
-        description="intrinsics, depth unit, field of view or depth range, baseline, traffic in the map, calibration; depth: too few "
-        "pixels have one"
+        description="what to check: intrinsics, depth unit, field of view or depth range, baseline, traffic in the map, "
+        "calibration or depth. depth: too few pixels have a depth"
     )
     evidence: dict[str, FiniteFloat] = Field(
-        description="evidence out of the range that calibration saw: name, and distance from calibration's mean in standard deviations"
+        description="confidence features outside the range of the calibration data: "
+        "name, and distance from the mean of the calibration data in standard deviations"
     )
     remedy: str = Field(description="what to do")
 
 
 class MapVersion(BaseModel):
-    """Which map answered."""
+    """A map and its version, for example the map that answered."""
 
     name: str
     version: str = Field(description="hash of the map's content")
 
 
 class TimingsMs(BaseModel):
-    """Milliseconds of each stage; register is 0 where nothing was registered."""
+    """Duration of each stage, milliseconds. register is 0 without registration."""
 
     decode: float
     fuse: float
@@ -369,50 +441,52 @@ class TimingsMs(BaseModel):
 
 
 class LocalizeAnswer(BaseModel):
-    """Where the pictures were taken. Only a LOCALIZED answer has a pose, a vehicle's pose, a geopose and a street.
+    """Answer to a query. Only a LOCALIZED answer has a pose, a vehicle pose, a geopose and a street.
 
-    An answer that is not LOCALIZED says in `hypotheses` and `spread` where the camera may be. None of that is confirmed.
+    In any other answer, `hypotheses` and `spread` say where the camera may be. None of that is confirmed.
     """
 
     status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"] = Field(
-        description="LOCALIZED: act on it; AMBIGUOUS: in the map, but not sure where; OUT_OF_MAP: the map does not show what "
-        "the pictures do. Always LOCALIZED where confidence is null"
+        description="LOCALIZED: act on the pose. AMBIGUOUS: the camera is in the map, but its pose is uncertain. "
+        "OUT_OF_MAP: the map does not show what the images show. The status is always LOCALIZED if confidence is null"
     )
     confidence: float | None = Field(
-        description="probability that the position of the first hypothesis is within 1 m; null: not calibrated, or nothing was to be "
-        "registered"
+        description="probability that the position of the first hypothesis is within 1 m. "
+        "Null if the map has no cloud or no calibration, or if options.refine is false"
     )
     street: Street | None = Field(
-        description="null unless LOCALIZED, and where the map has no streets or the position lies in none"
+        description="null unless LOCALIZED. Also null if the map has no streets, or if the position lies in none"
     )
-    pose: Pose | None = Field(description="T_map_camera; null unless LOCALIZED")
+    pose: Pose | None = Field(description="T_map_camera. Null unless LOCALIZED")
     vehicle_pose: Pose | None = Field(
-        description="T_map_vehicle, where T_vehicle_camera was sent; null unless LOCALIZED"
+        description="T_map_vehicle, if the request has T_vehicle_camera. Null unless LOCALIZED"
     )
     geopose: GeoPose | None = Field(
-        description="the vehicle's where T_vehicle_camera was sent, else the camera's; null unless LOCALIZED, and where the map is not "
-        "georeferenced"
+        description="pose of the vehicle if the request has T_vehicle_camera, else of the camera. "
+        "Null unless LOCALIZED. Also null if the map is not georeferenced"
     )
     hypotheses: list[HypothesisOfPose] = Field(
-        description="distinct poses that were registered, the best supported first; unconfirmed unless LOCALIZED; empty without "
-        "registration"
+        description="distinct registered poses, the best supported first. Unconfirmed unless LOCALIZED. "
+        "Empty without registration"
     )
-    spread: Spread | None = Field(description="where the camera may be; null for a LOCALIZED answer")
+    spread: Spread | None = Field(description="where the camera may be. Null for a LOCALIZED answer")
     reasons: list[Reason] = Field(
         default_factory=list,  # an earlier service sends none
-        description="why it may not be LOCALIZED, the likeliest first; empty for a LOCALIZED answer. Empty in another answer: all "
-        "evidence lies in the range that calibration saw, so the place may be outside the map, or look like another",
+        description="why the answer may not be LOCALIZED, the likeliest reason first. Empty for a LOCALIZED answer. "
+        "Empty in any other answer: all confidence features lie in the range of the calibration data. "
+        "The place may then be outside the map, or be a perceptual alias",
     )
     neighbours: list[Neighbour] = Field(
-        description="k distinct places: those nearest to the registered poses first, the best supported pose's before all, then the most "
-        "similar ones; by similarity alone without registration"
+        description="k distinct places. The places nearest to the registered poses come first, "
+        "with those of the best supported pose before all others. The most similar places follow. "
+        "Without registration, only similarity orders them"
     )
     map: MapVersion
     timings_ms: TimingsMs
 
     @model_validator(mode="after")
     def _no_pose_unless_localized(self) -> Self:
-        """No answer of another kind can be made or read, whatever made it."""
+        """Refuse an inconsistent answer, whether it is created or parsed."""
         localized = self.status == "LOCALIZED"
         if localized != (self.pose is not None) or localized != (self.spread is None):
             raise ValueError("a LOCALIZED answer has a pose and no spread, every other one a spread and no pose")
@@ -425,7 +499,7 @@ class LocalizeAnswer(BaseModel):
         return self
 
     def require_pose(self) -> Pose:
-        """The camera's pose.
+        """Return the camera pose, ``T_map_camera``.
 
         Raises:
             NotLocalizedError: the answer is not LOCALIZED; the error carries the answer.
@@ -435,11 +509,11 @@ class LocalizeAnswer(BaseModel):
         return self.pose
 
     def require_vehicle_pose(self) -> Pose:
-        """The vehicle's pose.
+        """Return the vehicle pose, ``T_map_vehicle``.
 
         Raises:
             NotLocalizedError: the answer is not LOCALIZED; the error carries the answer.
-            RequestError: T_vehicle_camera was not sent.
+            RequestError: the request did not have T_vehicle_camera.
         """
         if self.status != "LOCALIZED":
             raise self._not_localized()
@@ -460,8 +534,8 @@ class MapEntry(BaseModel):
     """A mounted map."""
 
     name: str
-    version: str
-    made_at: str
+    version: str = Field(description="hash of the map's content")
+    made_at: str = Field(description="time of the build, RFC 3339")
     places: int
     views: int
     streets: int
@@ -469,13 +543,15 @@ class MapEntry(BaseModel):
     encoder_sha256: str
     georeferenced: bool
     licence: str
-    versions: list[str] = Field(description="open ones, the newest first; a request may name one as name@version")
+    versions: list[str] = Field(description="open versions, the newest first. A request may name one as name@version")
 
 
 class ServeVersion(_Strict):
-    """Which version of a map is to serve."""
+    """The version of a map that shall serve."""
 
-    version: str = Field(max_length=64)
+    model_config = ConfigDict(json_schema_extra={"examples": [{"version": "3f9c2a7be01d4586"}]})
+
+    version: str = Field(max_length=64, description="hash of the map's content; one of the map's open versions")
 
 
 class MapList(BaseModel):
@@ -485,61 +561,63 @@ class MapList(BaseModel):
 
 
 class Version(BaseModel):
-    """What runs here."""
+    """The running service: its version, resources and maps."""
 
     version: str
     api: Literal["v1"] = "v1"
-    threads: int = Field(description="requests worked on at once")
-    cores: int = Field(description="that this process may use, by affinity and by its container's quota")
+    threads: int = Field(description="number of requests that the service works on at once")
+    cores: int = Field(
+        description="number of cores that this process may use, by its affinity and the quota of its container"
+    )
     pools: dict[str, int] = Field(
-        description="threads of each native pool: whole requests run side by side, so one each"
+        description="threads of each native pool. Whole requests run in parallel, so each pool has one thread"
     )
     maps: list[MapVersion]
 
 
 class Health(BaseModel):
-    """Whether the service lives, or is ready."""
+    """Liveness or readiness of the service."""
 
     status: Literal["ok"] = "ok"
 
 
 class RefusedBundle(BaseModel):
-    """A bundle in a maps folder that is not mounted."""
+    """A map bundle in a maps folder that is not mounted."""
 
-    bundle: str = Field(description="the folder's name")
+    bundle: str = Field(description="name of the folder")
     reason: str
 
 
 class Readiness(BaseModel):
-    """The service is ready; what it could not mount all the same."""
+    """The service is ready. `refused` lists the map bundles that it could not mount."""
 
     status: Literal["ok"] = "ok"
     refused: list[RefusedBundle] = Field(
-        description="bundles that are not mounted, as this process found them; at most 20, the log has all"
+        description="map bundles that are not mounted, as this process found them. At most 20; the log lists all"
     )
 
 
 class Truth(_Strict):
-    """Where a pair of pictures was really taken: for people who compare."""
+    """Ground truth of an image pair, for people who compare an answer with it."""
 
-    position: Position = Field(description="of the camera, map frame")
+    position: Position = Field(description="position of the camera, map frame")
     heading_deg: float | None = Field(
-        None, ge=-360, le=360, description="of the optical axis, counter-clockwise from map x"
+        None, ge=-360, le=360, description="heading of the optical axis, counter-clockwise from map x"
     )
 
 
 class SamplePair(BaseModel):
-    """A pair of pictures that lies beside the maps, to try the service with."""
+    """A sample image pair, stored beside the maps, to try the service with."""
 
     name: str
-    rgb: str = Field(description="address of the picture, relative to this list's")
-    depth: str = Field(description="address of the picture, relative to this list's")
+    rgb: str = Field(description="address of the image, relative to the address of this list")
+    depth: str = Field(description="address of the image, relative to the address of this list")
     request: LocalizeRequest
-    truth: Truth | None
+    truth: Truth | None = Field(description="ground truth, if known")
 
 
 class SampleList(BaseModel):
-    """All sample pairs."""
+    """All sample image pairs."""
 
     samples: list[SamplePair]
 
@@ -548,48 +626,52 @@ Base64 = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
 
 
 class QueryPointCloud(BaseModel):
-    """The query's points where the best guess puts them: the answer's pose if it is LOCALIZED, else it is not confirmed."""
+    """Points of the query, placed by the best guess of the pose.
 
-    origin: Vector = Field(description="map frame; the points count from it")
+    The best guess is the answer's pose if the answer is LOCALIZED. Otherwise, the best guess is not confirmed.
+    """
+
+    origin: Vector = Field(description="map frame. The points are relative to this origin")
     count: int
     data: Base64 = Field(
-        description="of each point x, y, z as little-endian float32 (metres), then red, green, blue and an unused byte"
+        description="for each point x, y, z as little-endian float32 (metres), then red, green, blue and an unused byte"
     )
 
 
 class Explanation(BaseModel):
-    """An answer and what the machine saw on the way to it, as PNG."""
+    """An answer and its intermediate results as PNG images."""
 
     answer: LocalizeAnswer
     depth: Base64 = Field(
-        description="the query's depth, its estimated scale error taken out; Turbo colours, near red, far (40 m) blue"
+        description="depth image of the query without its estimated scale error. Turbo colours: near is red, far (40 m) is blue"
     )
-    fused: Base64 = Field(description="the query on the view grid: range in the place of intensity, colour kept")
+    fused: Base64 = Field(description="query view on the view grid, with colour, and with range in place of intensity")
     view: Base64 | None = Field(
-        description="the map from the most similar place, on the view grid; null without a cloud"
+        description="map view from the most similar place, on the view grid. Null if the map has no cloud"
     )
     map_depth: Base64 | None = Field(
-        description="the map as this camera would see it from the best guess, coloured as `depth`; null without a cloud"
+        description="depth image of the map, rendered for this camera at the best guess, coloured as `depth`. "
+        "Null if the map has no cloud"
     )
     points: QueryPointCloud
 
 
 class LastAnswer(BaseModel):
-    """An answer that the service gave; nothing of its pictures."""
+    """Figures of an answer that the service gave. They hold no image data."""
 
-    number: int = Field(description="counted since the process started")
-    at: str = Field(description="when, UTC")
+    number: int = Field(description="number of the answer since the process started")
+    at: str = Field(description="time of the answer, UTC")
     map: MapVersion
     status: Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
     confidence: float | None
-    street: str | None = Field(description="name of the street; null unless LOCALIZED")
-    position: Vector | None = Field(description="null unless LOCALIZED")
-    heading_deg: HeadingDeg | None = Field(description="null unless LOCALIZED")
-    frames: int = Field(description="picture pairs that it rests on")
+    street: str | None = Field(description="name of the street. Null unless LOCALIZED")
+    position: Vector | None = Field(description="position of the camera, map frame, metres. Null unless LOCALIZED")
+    heading_deg: HeadingDeg | None = Field(description="heading of the camera. Null unless LOCALIZED")
+    frames: int = Field(description="number of image pairs that the answer uses")
     total_ms: float
 
 
 class LastAnswers(BaseModel):
-    """The last answers of the process that was asked, the newest first."""
+    """The last answers of the process that took the request, the newest first."""
 
     answers: list[LastAnswer]

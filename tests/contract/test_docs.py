@@ -64,6 +64,19 @@ def test_every_relative_link_leads_to_a_file_and_a_heading(page: Path) -> None:
             assert anchor in anchors_of(file), f"{page.name}: {target}"
 
 
+def test_the_files_that_the_architecture_names_exist() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    named_files = re.findall(r"`([a-z0-9_/]+\.py)`", text)
+    assert len(named_files) > 40
+    folders = [ROOT / "service", ROOT / "service" / "localization", ROOT / "model_training"]
+    assert [name for name in named_files if not any((folder / name).is_file() for folder in folders)] == []
+    of_service, of_training = (
+        {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}
+        for package in ("service", "model_training")
+    )
+    assert of_service | of_training <= set(re.findall(r"`(\w+)`", text))
+
+
 @pytest.mark.parametrize("block", [each for each in BLOCKS if each.kind in ("json", "yaml") and each.runs], ids=named)
 def test_documents_parse(block: Block) -> None:
     assert json.loads(block.text) if block.kind == "json" else yaml.safe_load(block.text)

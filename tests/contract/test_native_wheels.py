@@ -99,9 +99,17 @@ def test_the_wheel_is_for_this_platform_and_any_python_3(by_zig: Path) -> None:
 def test_the_wheel_holds_no_source_of_c_and_nothing_of_the_working_tree(by_zig: Path) -> None:
     held = {path.relative_to(by_zig).as_posix() for path in by_zig.rglob("*") if path.is_file()}
     assert not [name for name in held if name.endswith((".c", ".h", ".ts")) or "__pycache__" in name]
-    assert {name.partition("/")[0] for name in held if ".dist-info" not in name} == {"streetfix", "service", "model_training"}
+    assert {name.partition("/")[0] for name in held if ".dist-info" not in name} == {
+        "streetfix",
+        "service",
+        "model_training",
+    }
     tracked = subprocess.run(
-        ["git", "ls-files", "streetfix/*.py", "service/*.py", "model_training/*.py"], cwd=ROOT, capture_output=True, text=True, check=True
+        ["git", "ls-files", "streetfix/*.py", "service/*.py", "model_training/*.py"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
     ).stdout.split()
     assert {name for name in held if name.endswith(".py")} >= set(tracked)
 

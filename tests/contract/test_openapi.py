@@ -5,11 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import BaseModel
 
-from service.contract.schema import LocalizeRequest
+from service.contract.oscp import GeoPoseRequest
+from service.contract.schema import BatchRequest, LocalizeRequest, SequenceRequest, ServeVersion
 from service.http.openapi import main, openapi_text
 
 COMMITTED = Path(__file__).parents[2] / "openapi" / "openapi.json"
+#: Models of all request bodies, by the names of their schemas.
+REQUESTS: dict[str, type[BaseModel]] = {
+    model.__name__: model for model in (LocalizeRequest, SequenceRequest, BatchRequest, ServeVersion, GeoPoseRequest)
+}
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +66,21 @@ def test_every_error_is_a_problem(document: dict[str, Any]) -> None:
                     assert schema == {"$ref": "#/components/schemas/Problem"}
 
 
-def test_the_example_of_a_request_is_a_valid_one(document: dict[str, Any]) -> None:
-    for example in document["components"]["schemas"]["LocalizeRequest"]["examples"]:
-        LocalizeRequest.model_validate(example)
+def test_every_request_body_has_a_model(document: dict[str, Any]) -> None:
+    named = set()
+    for path in document["paths"].values():
+        for operation in path.values():
+            for content in operation.get("requestBody", {}).get("content", {}).values():
+                body = content["schema"].get("properties", {}).get("request", content["schema"])
+                named.add(body["$ref"].rpartition("/")[2])
+    assert named == set(REQUESTS)
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_every_example_of_a_request_is_valid(document: dict[str, Any], name: str) -> None:
+    examples = document["components"]["schemas"][name]["examples"]
+    assert examples
+    for example in examples:
+        # Models that ignore unknown fields would also accept a misspelt one.
+        assert set(example) <= set(REQUESTS[name].model_fields)
+        REQUESTS[name].model_validate(example)

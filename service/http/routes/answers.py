@@ -1,4 +1,4 @@
-"""The last answers, for operators who watch."""
+"""Route for the last answers, for monitoring by operators."""
 
 from typing import Annotated
 
@@ -14,7 +14,11 @@ from service.runtime.last_answers import MOST
 
 
 def router_for(engine: Engine) -> APIRouter:
-    """The route, bound to an engine."""
+    """Create the route.
+
+    Args:
+        engine: holds the last answers.
+    """
     router = APIRouter(tags=["console"])
 
     @router.get(
@@ -24,9 +28,12 @@ def router_for(engine: Engine) -> APIRouter:
         responses=problems(401, 403, 422),
     )
     async def list_answers(
-        request: Request, most: Annotated[int, Query(ge=1, le=MOST, description="of them")] = 50
+        request: Request, most: Annotated[int, Query(ge=1, le=MOST, description="number of answers at most")] = 50
     ) -> schema.LastAnswers:
-        """Figures alone, nothing of a picture. They say where robots are: for an operator's key, or a service on loopback without keys."""
+        """List figures of the last answers, without image data.
+
+        The figures say where robots are. So the route needs an operator's key, or a service on loopback without keys.
+        """
         require_operator(request, engine.settings)
         return schema.LastAnswers(answers=[last_answer_from(each) for each in engine.last_answers.newest(most)])
 

@@ -1,4 +1,4 @@
-"""The browser console's page; what it shows it asks for like any client."""
+"""The page of the browser console. It requests its data like any other client."""
 
 from fastapi import APIRouter
 from starlette.exceptions import HTTPException
@@ -11,14 +11,16 @@ _YEAR_S = 31_536_000
 
 
 def router_for() -> APIRouter:
-    """The routes; the page is the same for every service."""
+    """Create the routes. The page is the same for every service."""
     router = APIRouter(tags=["console"], include_in_schema=False)
     files = built_files()
 
     # Redirects are relative, so that a proxy may put the service below a path of its own.
     @router.get("/", operation_id="getRoot")
     async def get_root() -> Response:
-        return RedirectResponse("console/", status_code=307, headers=HEADERS)  # temporary: the console may be switched off
+        return RedirectResponse(
+            "console/", status_code=307, headers=HEADERS
+        )  # temporary: the console may be switched off
 
     @router.get("/console", operation_id="getConsole")
     async def get_console() -> Response:

@@ -1,4 +1,4 @@
-"""What draws a map: its cloud and its survey track, as compact binary."""
+"""Routes for drawing a map: its cloud and its survey track, in a compact binary format."""
 
 from typing import Annotated, Any
 
@@ -13,16 +13,17 @@ _BYTES = "application/octet-stream"
 _BINARY = {_BYTES: {"schema": {"type": "string", "format": "binary"}}}
 _CLOUD: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "`SFC1`, count (uint32), origin and step (3 float64 each; metres, map frame), then for each point x, y, z in steps "
-        "from the origin and how upright its surface is (0 ground, 65535 wall), as uint16. Little-endian; any beginning is thinner.",
+        "description": "`SFC1`, count (uint32), origin and step (3 float64 each; metres, map frame). Then for each point, as uint16: "
+        "x, y, z in steps from the origin, and how upright its surface is (0 ground, 65535 wall). All numbers are little-endian. "
+        "The first N points form a thinner cloud, for any N.",
         "content": _BINARY,
     },
     **problems(404, 422, 503, 504),
 }
 _PLACES: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "`SFP1`, count (uint32), origin (3 float64; metres, map frame), then for each place x, y, z from the origin and "
-        "heading (float32; metres, radians) and the number of its street (int32, -1 for none). Little-endian.",
+        "description": "`SFP1`, count (uint32), origin (3 float64; metres, map frame). Then for each place: x, y, z from the origin and "
+        "heading (float32; metres, radians), and the number of its street (int32, -1 for none). All numbers are little-endian.",
         "content": _BINARY,
     },
     **problems(404, 422, 503),
@@ -30,21 +31,30 @@ _PLACES: dict[int | str, dict[str, Any]] = {
 
 
 def router_for(asking: Asking) -> APIRouter:
-    """The routes, bound to an engine."""
+    """Create the routes.
+
+    Args:
+        asking: runs the work; holds the engine.
+    """
     router = APIRouter(tags=["console"])
     registry, clouds = asking.engine.registry, Clouds()
 
     @router.get(
         "/v1/maps/{map}/cloud",
         operation_id="getCloud",
-        summary="The cloud of a map, thinned",
+        summary="Get the thinned cloud of a map",
         response_class=Response,
         responses=_CLOUD,
     )
     async def get_cloud(
         map: str,  # noqa: A002  # the contract's name
         points: Annotated[
-            int, Query(ge=1, le=LEVELS[-1], description="at most, rounded down to one of a few levels")
+            int,
+            Query(
+                ge=1,
+                le=LEVELS[-1],
+                description="number of points at most. The service rounds it down to one of a few levels",
+            ),
         ] = 500_000,
     ) -> Response:
         bundle = registry.get(map).bundle
@@ -53,7 +63,7 @@ def router_for(asking: Asking) -> APIRouter:
     @router.get(
         "/v1/maps/{map}/places",
         operation_id="getPlaces",
-        summary="The survey track of a map",
+        summary="Get the survey track of a map",
         response_class=Response,
         responses=_PLACES,
     )

@@ -1,4 +1,4 @@
-"""POST /v1/explain: an answer, and what the machine saw on the way to it."""
+"""POST /v1/explain: an answer with its intermediate results as images."""
 
 from fastapi import APIRouter
 from starlette.requests import Request
@@ -15,20 +15,27 @@ from service.http.routes.localize import LOCALIZE_BODY, problems
 
 
 def router_for(asking: Asking) -> APIRouter:
-    """The route, bound to an engine."""
+    """Create the route.
+
+    Args:
+        asking: reads the bodies; holds the engine.
+    """
     router = APIRouter(tags=["console"])
     engine = asking.engine
 
     @router.post(
         "/v1/explain",
         operation_id="explain",
-        summary="Localize one pair of pictures, and show what the machine saw",
+        summary="Localize one image pair, with the intermediate results as images",
         response_model=schema.Explanation,
         responses=problems(404, 413, 415, 422, 503, 504),
         openapi_extra={"requestBody": LOCALIZE_BODY},
     )
     async def post_explain(request: Request) -> Response:
-        """The answer that `/v1/localize` gives, with pictures for people. It costs more: robots ask there."""
+        """Return the answer of `/v1/localize`, with images for people.
+
+        This route costs more than `/v1/localize`. Robots use `/v1/localize`.
+        """
 
         async def answer(body: Body) -> Response:
             content_type = request.headers.get("content-type", "")

@@ -1,4 +1,4 @@
-"""What an orchestrator asks."""
+"""Routes for orchestrators: liveness, readiness, metrics and version."""
 
 from fastapi import APIRouter
 from starlette.responses import Response
@@ -13,21 +13,29 @@ from service.runtime.threads import pools, usable_cores
 
 
 def router_for(engine: Engine, version: str) -> APIRouter:
-    """The routes, bound to an engine."""
+    """Create the routes.
+
+    Args:
+        engine: its state is reported.
+        version: of the installed package.
+    """
     router = APIRouter(tags=["operation"])
 
-    @router.get("/livez", operation_id="getLiveness", summary="Whether the process lives")
+    @router.get("/livez", operation_id="getLiveness", summary="Tell whether the process lives")
     async def livez() -> schema.Health:
         return schema.Health()
 
     @router.get(
-        "/readyz", operation_id="getReadiness", summary="Whether a map is open to answer from", responses=problems(503)
+        "/readyz",
+        operation_id="getReadiness",
+        summary="Tell whether the service has a map to answer from",
+        responses=problems(503),
     )
     async def readyz() -> schema.Readiness:
-        """200 as soon as one map is mounted.
+        """Return 200 as soon as one map is mounted.
 
-        Bundles that are damaged do not change that; they are in `refused`. 503 without a map, as with a maps folder that is still
-        empty, and while the service is leaving.
+        Damaged map bundles do not change the status; `refused` lists them. The status is 503 without a map, for example while the
+        maps folder is empty. The status is also 503 while the service shuts down.
         """
         refused = engine.registry.refused[:MOST_REFUSED]
         if engine.is_draining:
@@ -42,16 +50,21 @@ def router_for(engine: Engine, version: str) -> APIRouter:
     @router.get(
         "/metrics",
         operation_id="getMetrics",
-        summary="What Prometheus scrapes",
+        summary="Get the metrics for Prometheus",
         response_class=Response,
         responses={
-            200: {"content": {"text/plain": {"schema": {"type": "string"}}}, "description": "Prometheus' text format."}
+            200: {
+                "content": {"text/plain": {"schema": {"type": "string"}}},
+                "description": "The text format of Prometheus.",
+            }
         },
     )
     def get_metrics() -> Response:
         return Response(engine.metrics.text(), headers={"content-type": CONTENT_TYPE})
 
-    @router.get("/v1/version", operation_id="getVersion", summary="What runs here")
+    @router.get(
+        "/v1/version", operation_id="getVersion", summary="Get the version, the resources and the maps of the service"
+    )
     async def get_version() -> schema.Version:
         maps = [localizer.bundle.manifest for localizer in engine.registry]
         return schema.Version(

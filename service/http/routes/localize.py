@@ -1,4 +1,4 @@
-"""POST /v1/localize, alone, as a sequence, and as a batch."""
+"""POST /v1/localize for one image pair, a sequence and a batch."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -35,8 +35,8 @@ LOCALIZE_BODY: dict[str, Any] = {
                     "depth": {
                         "type": "string",
                         "format": "binary",
-                        "description": "16-bit PNG, TIFF, NPY or raw16 (SFD1: zstd or lz4, the cheapest); "
-                        "CARLA's 24-bit PNG with depth.encoding = carla, ROS' compressedDepth with compressed_depth",
+                        "description": "16-bit PNG, TIFF, NPY or raw16 (SFD1: zstd or lz4, the cheapest). With depth.encoding: "
+                        "CARLA's 24-bit PNG (carla), or ROS' compressedDepth (compressed_depth)",
                     },
                     "request": {"$ref": "#/components/schemas/LocalizeRequest"},
                 },
@@ -52,7 +52,7 @@ LOCALIZE_BODY: dict[str, Any] = {
 
 
 def _numbered(document: str) -> dict[str, Any]:
-    """Body of several pairs: rgb0, depth0, rgb1, depth1 and so on, beside the JSON."""
+    """OpenAPI body of several image pairs: rgb0, depth0, rgb1, depth1 and so on, and the JSON."""
     pictures: dict[str, Any] = {}
     for kind, formats in (("rgb", "as rgb of /v1/localize"), ("depth", "as depth of /v1/localize")):
         for number in range(schema.MOST_FRAMES):
@@ -69,57 +69,69 @@ def _numbered(document: str) -> dict[str, Any]:
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The documented problems of a route."""
+    """Build the OpenAPI responses for the problems of a route.
+
+    Args:
+        statuses: HTTP status codes of the problems.
+    """
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {status: {"description": HTTPStatus(status).phrase, "content": content} for status in statuses}
 
 
 def router_for(asking: Asking) -> APIRouter:
-    """The routes, bound to an engine."""
+    """Create the routes.
+
+    Args:
+        asking: reads the bodies; holds the engine.
+    """
     router = APIRouter(tags=["localization"])
     engine = asking.engine
 
     @router.post(
         "/v1/localize",
         operation_id="localize",
-        summary="Localize one pair of pictures",
+        summary="Localize one image pair",
         response_model=schema.LocalizeAnswer,
         responses=problems(404, 413, 415, 422, 503, 504),
         openapi_extra={"requestBody": LOCALIZE_BODY},
     )
     async def localize(request: Request) -> Response:
-        """Street, pose with covariance, and confidence of one RGB and one depth picture.
+        """Return street, pose with covariance, and confidence for one RGB image and one depth image.
 
-        The most similar places of the map are looked up, the depth picture is registered on the map's cloud from each of them, and
-        the best supported pose is answered; with `options.refine` false it is the mean of the best hypothesis' places.
+        The service looks up the most similar places of the map. It registers the depth image on the map cloud from each of them.
+        The answer is the best supported pose. With `options.refine` false, the answer is the mean of the best hypothesis' places.
         """
         return await ask(request, _single)
 
     @router.post(
         "/v1/localize/sequence",
         operation_id="localizeSequence",
-        summary="Localize frames of a drive, or the cameras of a rig, as one",
+        summary="Localize frames of a traversal, or the cameras of a rig, as one",
         response_model=schema.LocalizeAnswer,
         responses=problems(404, 413, 415, 422, 503, 504),
         openapi_extra={"requestBody": _numbered("SequenceRequest")},
     )
     async def localize_sequence(request: Request) -> Response:
-        """The pose of the first frame; the others say what it leaves open, as in a street of repeating blocks.
+        """Return the pose of the first frame.
 
-        Every other frame comes with `T_reference_camera`: odometry, or where the camera sits on the rig.
+        The other frames decide what the first frame leaves open, for example in a street of repeating blocks.
+        Every other frame has `T_reference_camera`: odometry, or the pose of the camera on the rig.
         """
         return await ask(request, _sequence)
 
     @router.post(
         "/v1/localize/batch",
         operation_id="localizeBatch",
-        summary="Localize several pairs, each on its own",
+        summary="Localize several image pairs, each on its own",
         response_model=BatchAnswer,
         responses=problems(413, 415, 422, 503, 504),
         openapi_extra={"requestBody": _numbered("BatchRequest")},
     )
     async def localize_batch(request: Request) -> Response:
-        """An outcome for each request, in their order: an answer, or the problem that it alone would have got."""
+        """Return an outcome for each request, in their order.
+
+        An outcome is an answer, or the problem that the request would also have got alone.
+        """
         return await ask(request, _batch)
 
     async def ask(request: Request, work: Work) -> Response:
@@ -139,7 +151,15 @@ def router_for(asking: Asking) -> APIRouter:
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """A body that has come in whole."""
+    """A complete body and what its request says.
+
+    Attributes:
+        body: the body.
+        content_type: header of the request.
+        request_id: of the request.
+        span: of the request.
+        geopose_alone: answer with a GeoPose only.
+    """
 
     body: Body
     content_type: str
@@ -148,7 +168,7 @@ class Given:
     geopose_alone: bool = False
 
     def parts(self) -> dict[str, bytes]:
-        """Its parts."""
+        """Split the body into its parts by name."""
         return self.body.split(self.content_type, max_parts=MOST_PARTS)
 
 
@@ -176,7 +196,7 @@ async def _sequence(engine: Engine, given: Given) -> bytes:
 
 
 async def _batch(engine: Engine, given: Given) -> bytes:
-    """Requests of a batch take workers one by one, as if each had come alone; those beyond the queue get their own problem."""
+    """Answer a batch. Each request takes a worker as a single request does; one beyond the queue gets its own problem."""
 
     def split() -> list[tuple[schema.LocalizeRequest, bytes, bytes]]:
         parts = given.parts()

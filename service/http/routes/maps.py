@@ -1,4 +1,4 @@
-"""GET /v1/maps and what belongs to a map."""
+"""Routes for maps: list, serving version, streets and coverage."""
 
 import asyncio
 from typing import Any
@@ -18,7 +18,7 @@ from service.runtime.engine import Engine
 GEOJSON = "application/geo+json"
 _STREETS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "A GeoJSON FeatureCollection of polygons; empty where the map has no streets.",
+        "description": "A GeoJSON FeatureCollection of polygons. It is empty if the map has no streets.",
         "content": {GEOJSON: {"schema": {"type": "object"}}},
     },
     **problems(404, 422, 503),
@@ -30,18 +30,22 @@ _SERVE_VERSION: dict[str, Any] = {
 }  # fmt: skip
 _COVERAGE: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "A GeoJSON FeatureCollection with a MultiPolygon of each map; longitude and latitude where the map is "
-        "georeferenced, else metres of the map frame (`properties.frame`).",
+        "description": "A GeoJSON FeatureCollection with one MultiPolygon per map. Coordinates are longitude and latitude if the map is "
+        "georeferenced, else metres of the map frame. `properties.frame` names the frame.",
         "content": {GEOJSON: {"schema": {"type": "object"}}},
     }
 }
 
 
 def router_for(engine: Engine) -> APIRouter:
-    """The routes, bound to an engine."""
+    """Create the routes.
+
+    Args:
+        engine: holds the maps.
+    """
     router = APIRouter(tags=["maps"])
 
-    @router.get("/v1/maps", operation_id="listMaps", summary="All mounted maps")
+    @router.get("/v1/maps", operation_id="listMaps", summary="List all mounted maps")
     async def list_maps() -> schema.MapList:
         registry = engine.registry
         return schema.MapList(
@@ -51,17 +55,18 @@ def router_for(engine: Engine) -> APIRouter:
     @router.put(
         "/v1/maps/{map}/serving",
         operation_id="serveVersion",
-        summary="Let another version of a map serve",
+        summary="Select the serving version of a map",
         responses=problems(401, 403, 404, 413, 422),
         openapi_extra={"requestBody": _SERVE_VERSION},
     )
     async def serve_version(map: str, request: Request) -> schema.MapEntry:  # noqa: A002
-        """Roll back, or forward again, at once and whole; requests that run end on the version they began with.
+        """Roll back, or forward again, in one step. Running requests end on the version that they began with.
 
-        With several workers all change at once: as soon as any of them has answered from the chosen version, none answers from the
-        one before. The choice holds, also if a worker is started again, until a version that is newer than all open ones is mounted
-        or the chosen one is taken out. A restart of the service serves the newest: to keep an old version for good, take the new
-        one out of the folder. It needs an operator's key (`streetfix keys --operator`), or a service on loopback without keys.
+        All workers change at the same time. As soon as one worker has answered from the chosen version, none answers from the
+        version before. The choice also holds if a worker restarts. It ends when a version that is newer than all open ones is
+        mounted, or when the chosen version is removed. After a restart, the service serves the newest version. To keep an old
+        version permanently, remove the new version from the folder. The route needs an operator's key
+        (`streetfix keys --operator`), or a service on loopback without keys.
         """
         require_operator(request, engine.settings)
         with engine.memory.hold() as hold:
@@ -74,7 +79,7 @@ def router_for(engine: Engine) -> APIRouter:
     @router.get(
         "/v1/maps/{map}/streets",
         operation_id="getStreets",
-        summary="The streets of a map",
+        summary="Get the streets of a map",
         response_class=Response,
         responses=_STREETS,
     )
@@ -84,7 +89,7 @@ def router_for(engine: Engine) -> APIRouter:
     @router.get(
         "/v1/coverage",
         operation_id="getCoverage",
-        summary="Where the maps can answer",
+        summary="Get the area where the maps can answer",
         response_class=Response,
         responses=_COVERAGE,
     )

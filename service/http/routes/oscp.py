@@ -1,4 +1,4 @@
-"""The OSCP GeoPose Protocol, version 2, so that its clients work unchanged."""
+"""The OSCP GeoPose Protocol 2.0, so that its clients work without changes."""
 
 import re
 import time
@@ -17,7 +17,7 @@ from service.http.body import Body
 from service.http.geopose import sure_geopose
 from service.http.routes.localize import problems
 
-#: Of a JSON body: itself as bytes, its strings, and the pictures that they spell.
+#: Copies of a JSON body in memory: its bytes, its strings, and the images decoded from them.
 _COPIES = 3
 MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"
 _VERSION = re.compile(r"application/vnd\.oscp\+json\s*;\s*version\s*=\s*\"?([0-9.]+)", re.IGNORECASE)
@@ -27,11 +27,17 @@ _BODY: dict[str, Any] = {
 
 
 def router_for(asking: Asking) -> APIRouter:
-    """The routes, bound to an engine."""
+    """Create the routes.
+
+    Args:
+        asking: reads the bodies; holds the engine.
+    """
     router = APIRouter(tags=["geopose"])
     engine = asking.engine
 
-    @router.get("/geopose", operation_id="getGeoPoseStatus", summary="Whether the protocol is served")
+    @router.get(
+        "/geopose", operation_id="getGeoPoseStatus", summary="Tell whether the service speaks the OSCP GeoPose Protocol"
+    )
     async def status() -> dict[str, str]:
         return {"status": "running", "protocol": "OSCP GeoPose Protocol", "version": "2.0"}
 
@@ -44,12 +50,15 @@ def router_for(asking: Asking) -> APIRouter:
         openapi_extra={"requestBody": _BODY},
     )
     async def geopose(request: Request, map: Annotated[str | None, Query(max_length=64)] = None) -> Response:  # noqa: A002
-        """Where a camera stands on the Earth: colour and DEPTH readings in, a GeoPose out.
+        """Return the pose of a camera on the Earth: colour and DEPTH readings in, a GeoPose out.
 
-        `Accept: application/vnd.oscp+json;version=2.0` names the version; who names none (no Accept, `*/*`, `application/json`, as the
-        reference clients do) gets this one, another version is refused. Intrinsics are COLMAP's (the corner of the first pixel is (0, 0));
-        DEPTH is a 16-bit PNG in millimetres or a float TIFF in metres; the accelerometer's axes are W3C's. An answer that is not sure
-        is the problem `no-pose`, since the protocol has no word for doubt. `map` chooses among several maps.
+        `Accept: application/vnd.oscp+json;version=2.0` names the version. A request that names no version gets this one: no Accept,
+        `*/*`, or `application/json`, as the reference clients send. The service refuses any other version.
+
+        Intrinsics follow COLMAP: the corner of the first pixel is (0, 0). DEPTH is a 16-bit PNG in millimetres or a float TIFF in
+        metres. The axes of the accelerometer follow W3C. `map` selects one of several maps.
+
+        If the answer is not LOCALIZED, the response is the problem `no-pose`, because the protocol cannot express uncertainty.
         """
         _require_version(request.headers.get("accept", ""))
 
@@ -72,7 +81,7 @@ def router_for(asking: Asking) -> APIRouter:
 
 
 def _require_version(accept: str) -> None:
-    """Who speaks of the protocol has to name this version; who accepts anything, or any JSON, has said nothing of it."""
+    """Refuse another version of the protocol. An ``Accept`` header without the OSCP media type passes."""
     found = _VERSION.search(accept)
     if found is None and "vnd.oscp" not in accept.lower():
         return

@@ -1,4 +1,4 @@
-"""Pairs of pictures that lie beside the maps."""
+"""Routes for sample image pairs of the console."""
 
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from service.runtime.settings import Settings
 _MEDIA_TYPES = ("image/jpeg", "image/png", "image/webp", "image/tiff", "application/octet-stream")
 _PICTURE: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The picture.",
+        "description": "The image.",
         "content": {each: {"schema": {"type": "string", "format": "binary"}} for each in _MEDIA_TYPES},
     },
     **problems(404, 422),
@@ -21,23 +21,26 @@ _PICTURE: dict[int | str, dict[str, Any]] = {
 
 
 def router_for(settings: Settings) -> APIRouter:
-    """The routes, over the folder that the settings name.
+    """Create the routes for the sample folder of the settings.
+
+    Args:
+        settings: of the service.
 
     Raises:
-        DatasetError: it is not there, or a pair in it is incomplete.
+        DatasetError: the folder is missing, or a pair in it is incomplete.
     """
     router = APIRouter(tags=["console"])
     samples = Samples() if settings.samples is None else Samples.open(settings.samples)
 
-    @router.get("/v1/samples", operation_id="listSamples", summary="Pairs of pictures to try the service with")
+    @router.get("/v1/samples", operation_id="listSamples", summary="List image pairs to try the service with")
     async def list_samples() -> schema.SampleList:
-        """Those of the folder that the setting `samples` names; `streetfix demo` makes some."""
+        """List the image pairs in the folder that the setting `samples` names. `streetfix demo` creates some."""
         return schema.SampleList(samples=[each.message() for each in samples.by_name.values()])
 
     @router.get(
         "/v1/samples/{sample}/{part}",
         operation_id="getSample",
-        summary="A picture of a sample pair",
+        summary="Get an image of a sample pair",
         response_class=Response,
         responses=_PICTURE,
     )
