@@ -1,1 +1,1 @@
-"""Measurements behind the reports; run by make targets, apart from the tests."""
+"""Measurements behind the reports. Make targets run them, apart from the tests."""

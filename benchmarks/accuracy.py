@@ -1,7 +1,10 @@
-"""``make evaluate``: retrieval by the stock encoder and by one trained on the paper's city, the raw image, registration.
+"""``make evaluate``: measure accuracy on simulated cities and real frames -> reports/accuracy.json.
 
-Everything is simulated, built and measured here from seeds that no training uses (``model_training.training.recipe``). What is
-finished is kept under ``--work`` and reused, so an interrupted run goes on.
+The parts cover retrieval by the stock encoder, retrieval by an encoder trained on the paper's city, the raw range
+image, and registration.
+The command simulates the cities from seeds that no training uses (``model_training.training.recipe``). It keeps
+finished work under ``--work``
+and reuses it. An interrupted run therefore continues.
 """
 
 import argparse
@@ -26,14 +29,21 @@ from model_training.simulation.plan import SimulationPlan
 from model_training.stock import ENCODER
 from service.localization.encoder import Encoder
 
-#: Query sets of the unseen cities: how their rows are called, and the bar of R@1.
+#: Query sets of the unseen cities: the label of their rows, and the bar of R@1.
 UNSEEN = {
     "drive1_precise": ("precise", 0.985), "drive1_stereo": ("stereo", 0.95), "blocked25_precise": ("precise_blocked_25", 0.90),
 }  # fmt: skip
 
 
 def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None:
-    """The paper's city with one encoder."""
+    """Add the rows of the paper's city with one encoder.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+        prefix: first part of the row ids.
+        barred: whether the rows have bars.
+    """
     dataset = runs.dataset(paper_plan())
     bundle = runs.bundle(dataset)
     bars_of = {"precise": (0.9752, 0.98, 0.998), "stereo": (0.95, 0.95, None)}
@@ -52,12 +62,22 @@ def paper_rows(report: Report, runs: Runs, prefix: str, *, barred: bool) -> None
 
 
 def unseen_rows(report: Report, runs: Runs) -> None:
-    """Three unseen cities with the stock encoder, clear and blocked."""
+    """Add the retrieval rows of three unseen cities with the stock encoder, clear and blocked.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     _retrieval_rows(report, runs, "unseen", unseen_plan, barred=True)
 
 
 def large_rows(report: Report, runs: Runs) -> None:
-    """What twice the size of a city costs: the same queries by retrieval, with registration, and by the raw image."""
+    """Add the rows of cities of twice the size: retrieval, registration and the raw image, each for the same queries.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     _retrieval_rows(report, runs, "large", large_plan, barred=False)
     for preset in BOTH:
         datasets = [runs.dataset(large_plan(index)) for index in range(3)]
@@ -82,7 +102,13 @@ def _retrieval_rows(
 
 
 def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
-    """Real stereo frames; the rows stay, with a reason, where the recordings are not there."""
+    """Add the rows of real stereo frames; without recordings, each row gives the reason.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+        data: folder with the recordings ``kitti_stereo`` and ``kitti_drive``.
+    """
     kitti, drive = data / "kitti_stereo", data / "kitti_drive"
     if not (kitti.exists() and drive.exists()):
         for name in ("real", "raw"):
@@ -105,7 +131,13 @@ def kitti_rows(report: Report, runs: Runs, data: Path) -> None:
 
 
 def trained_there_rows(report: Report, work: Path, encoder: Path) -> None:
-    """An encoder that has seen the paper's city."""
+    """Add the rows of an encoder that was trained on the paper's city.
+
+    Args:
+        report: collects the rows.
+        work: folder for datasets and maps.
+        encoder: file of that encoder; it may be absent.
+    """
     if encoder.exists():
         paper_rows(report, Runs(work, encoder), "trained_on_paper_city", barred=False)
         return
@@ -114,7 +146,7 @@ def trained_there_rows(report: Report, work: Path, encoder: Path) -> None:
 
 
 def main() -> None:
-    """Parse, run the parts, write the report."""
+    """Parse the arguments, run the parts and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--work", type=Path, default=ROOT / "data" / "evaluate", help="where datasets and maps are kept"
@@ -158,12 +190,12 @@ def main() -> None:
         parser.error(f"--only: there is no part {unknown[0]!r}; there are: {', '.join(parts)}")
     if arguments.only is not None:
         report.keep_others()
-    if arguments.note or arguments.only is not None:  # an earlier run's note does not speak of this one
+    if arguments.note or arguments.only is not None:  # an earlier note does not describe this run
         report.notes["run"] = arguments.note
     for name in wanted:
         print(f"--- {name}", flush=True)
         parts[name]()
-        report.write()  # a defect or a stop in a later part costs that part alone
+        report.write()  # write after each part: a failure later costs only the later parts
 
 
 if __name__ == "__main__":

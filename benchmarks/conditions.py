@@ -1,4 +1,4 @@
-"""Hard conditions: each with the clear day's drive through the same city beside it."""
+"""Hard conditions, each next to the clear day's traversal of the same city."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,14 +15,18 @@ BARS = {"blocked_50": 0.75, "depth_15m": 0.88} | dict.fromkeys(WEATHER_AND_LIGHT
 BAR = 0.95
 
 
-#: A condition, its map, its queries.
+#: A condition with its map, dataset and query set.
 Asked = tuple[str, MapBundle, Dataset, str]
 
 
 def asked_of(runs: Runs) -> Iterator[Asked]:
-    """The clear day, every condition of the drive, and of the survey."""
+    """Yield the clear day, every condition of the queries, and every condition of the survey.
+
+    Args:
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     dataset = runs.dataset(hard_plan())
-    bundle = runs.bundle(runs.dataset(unseen_plan(0)))  # of the same city: hard_plan has its seed
+    bundle = runs.bundle(runs.dataset(unseen_plan(0)))  # the same city: hard_plan has its seed
     for name in ("clear", *HARD):
         yield name, bundle, dataset, f"{name}_precise"
     yield (
@@ -36,7 +40,12 @@ def asked_of(runs: Runs) -> Iterator[Asked]:
 
 
 def condition_rows(report: Report, runs: Runs) -> None:
-    """Each condition, and depth that ends at 15 m with five frames."""
+    """Add rows for each condition, and for depth that ends at 15 m with five frames.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     for name, bundle, dataset, queries in asked_of(runs):
         bar = None if name == "clear" else BARS.get(name, BAR)
         _rows(report, name, runs.figures(bundle, dataset, [queries], refine=True), bar)
@@ -46,7 +55,7 @@ def condition_rows(report: Report, runs: Runs) -> None:
 
 
 def _rows(report: Report, name: str, figures: dict[str, Any], bar: float | None) -> None:
-    """What was right and accepted, and where the rest was lost: by retrieval, by what follows it, or by doubt."""
+    """Add the share of correct accepted answers, and the losses by retrieval, by later steps and by confidence."""
     (answers,) = figures["predictions"].values()
     row = f"full.condition.{name}"
     share(report, f"{row}.within_1_m", figures, "within_1_m", bar)

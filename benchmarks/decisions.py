@@ -1,4 +1,4 @@
-"""The index of the decision log, ``docs/decisions/index.md``, by topic."""
+"""Write the index of the decision log, ``docs/decisions/index.md``, by topic."""
 
 import re
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from benchmarks.provenance import ROOT
 
 FOLDER = ROOT / "docs" / "decisions"
 INDEX = FOLDER / "index.md"
-#: In the order of the index.
+#: Topics in the order of the index.
 TOPICS = (
     "simulator", "import", "map", "imaging", "retrieval", "encoder", "registration", "scoring", "confidence", "covariance", "sequences",
     "serving", "performance", "security", "evaluation", "comparison", "tools", "platforms",
@@ -66,7 +66,10 @@ def read_decision(path: Path) -> Decision:
 
 
 def decisions(folder: Path = FOLDER) -> list[Decision]:
-    """All decisions, newest first.
+    """Read all decisions, newest first.
+
+    Args:
+        folder: folder of the decision log.
 
     Raises:
         ValueError: a file does not have the form, or a number occurs twice or does not exist.
@@ -83,7 +86,7 @@ def decisions(folder: Path = FOLDER) -> list[Decision]:
 
 
 def index_of(found: list[Decision]) -> str:
-    """The text of the index.
+    """Return the text of the index.
 
     Args:
         found: decisions, newest first.

@@ -1,8 +1,11 @@
-"""Run the code blocks of README and docs as a reader would, page after page, in a folder of their own.
+"""Run the code blocks of README and docs as a reader would, page after page, in a temporary folder.
 
-A fence says what it holds: ``sh`` and ``python`` run, ``json`` and ``yaml`` must parse, ``text`` is no code. ``<!-- not run: WHY -->``
-above a fence says why it cannot run here; ``<!-- file: NAME -->`` writes the block there first. ``streetfix serve`` goes on
-in the background until its block ends; a block that asks a service without starting one finds one.
+The fence gives the kind of a block. ``sh`` and ``python`` run, ``json`` and ``yaml`` must parse, ``text`` is not code.
+A comment
+``<!-- not run: WHY -->`` above a fence says why the block cannot run here. A comment ``<!-- file: NAME -->`` writes the
+block to a file
+first. ``streetfix serve`` runs in the background until its block ends. A block that needs a service, but does not start
+one, gets one.
 """
 
 import json
@@ -24,20 +27,29 @@ import yaml
 
 from benchmarks.report import ROOT, Report
 
-#: The README first: it makes the dataset and the map that the other pages ask.
+#: The README comes first: it makes the dataset and the map that the other pages use.
 PAGES = ("README.md", "start", "survey", "recordings", "maps", "robot", "python", "deploy", "serving", "console", "confidence", "measuring",
          "api", "problems", "formats", "how_it_works", "architecture", "paper", "limits", "faq", "index", "contributing", "development",
          "decisions/index")  # fmt: skip
 KINDS = ("sh", "python", "json", "yaml", "text")
 _MARK = re.compile(r"<!-- (not run|file): (.+) -->")
-#: What the pages say and what is free here.
+#: Addresses in the pages. Free ports replace them here.
 _HTTP, _GRPC = "127.0.0.1:8000", "50051"
 _BLOCK_S, _READY_S = 1800.0, 90.0
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A fenced block: where, what kind, its text; ``why_not`` it is not run, ``file`` that it is written to."""
+    """A fenced block.
+
+    Attributes:
+        page: name of the file.
+        line: line of the fence, from 1.
+        kind: one of ``KINDS``.
+        text: content.
+        why_not: reason why it is not run; None if it runs.
+        file: file to write the text to; None for none.
+    """
 
     page: str
     line: int
@@ -48,20 +60,23 @@ class Block:
 
     @property
     def runs(self) -> bool:
-        """Whether it is code that can run, or parse, here."""
+        """Whether the block can run or parse here."""
         return self.kind != "text" and self.why_not is None
 
 
 def pages() -> list[Path]:
-    """README and every page of ``docs``, in the order in which they are run."""
+    """Return README and every page of ``docs`` in the order in which they run."""
     return [ROOT / name if name.endswith(".md") else ROOT / "docs" / f"{name}.md" for name in PAGES]
 
 
 def blocks_of(page: Path) -> list[Block]:
-    """All fenced blocks of a page.
+    """Return all fenced blocks of a page.
+
+    Args:
+        page: Markdown file.
 
     Raises:
-        ValueError: a fence does not say what it holds, or is not closed.
+        ValueError: a fence has no known kind, or is not closed.
     """
     found, lines, number = [], page.read_text().splitlines(), 0
     while number < len(lines):
@@ -84,14 +99,22 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 def commands_of(block: Block) -> list[str]:
-    """A shell block's commands, one each, without comments; continued lines are one."""
+    """Return the commands of a shell block without comments; a continued line is one command.
+
+    Args:
+        block: a block of kind ``sh``.
+    """
     joined = block.text.replace("\\\n", " ")
     bare = [re.sub(r"\s+#\s.*$", "", line).strip() for line in joined.splitlines()]
     return [line for line in bare if line and not line.startswith("#")]
 
 
 def code_blocks_run(only: tuple[str, ...] = PAGES) -> tuple[int, int]:
-    """Run what can run here of these pages; how many ran, of how many. What fails is printed."""
+    """Run the blocks that can run; print each result; return how many ran and how many should.
+
+    Args:
+        only: names of the pages.
+    """
     blocks = [block for page, name in zip(pages(), PAGES, strict=True) if name in only for block in blocks_of(page)]
     wanted = [block for block in blocks if block.runs]
     ran = 0
@@ -110,7 +133,7 @@ def code_blocks_run(only: tuple[str, ...] = PAGES) -> tuple[int, int]:
 
 
 def _environment(work: Path) -> dict[str, str]:
-    """With the command ``streetfix`` of this interpreter on the path, and ports that are free."""
+    """Return an environment with this interpreter's ``streetfix`` on the path and free ports."""
     program = work / ".bin" / "streetfix"
     program.parent.mkdir()
     program.write_text(
@@ -130,7 +153,7 @@ def _free_port() -> int:
 
 
 def _failure(block: Block, work: Path, environment: dict[str, str]) -> str | None:
-    """Run or parse a block; what went wrong, or None."""
+    """Run or parse a block; return the failure, or None."""
     if block.file is not None:
         (work / block.file).write_text(block.text + "\n")
     try:
@@ -175,7 +198,7 @@ def _call(arguments: list[str], work: Path, environment: dict[str, str]) -> None
 
 @contextmanager
 def _in_background(command: str | None, work: Path, environment: dict[str, str]) -> Iterator[None]:
-    """A service that is ready, for as long as a block lasts; nothing for None."""
+    """Run a ready service for as long as a block lasts; nothing for None."""
     if command is None:
         yield
         return
@@ -196,8 +219,8 @@ def _wait_until_ready(url: str, process: "subprocess.Popen[bytes]") -> None:
         if process.poll() is not None:
             raise subprocess.CalledProcessError(process.returncode, process.args)
         try:
-            urllib.request.urlopen(url, timeout=2).close()  # noqa: S310  # of our own making
-        except OSError:  # not yet
+            urllib.request.urlopen(url, timeout=2).close()  # noqa: S310  # our own URL
+        except OSError:  # not ready yet
             time.sleep(0.2)
         else:
             return

@@ -1,4 +1,4 @@
-"""Does confidence know what it does not know? Another city's queries, streets that the map lacks, pictures that show nothing."""
+"""Quality of the confidence: queries of another city, of streets that the map lacks, and images without a street."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ from service.localization.localizer import Localizer
 from service.localization.query import Query
 
 RIGHT_M = 1.0
-#: Cities whose maps are built once more with every second street left out.
+#: Cities whose maps are built again without every second street.
 PARTIAL = (0, 1, 2)
-#: Shares of strangers at which the curves of accepts are told.
+#: Shares of accepted out-of-map queries at which the curves are given.
 ACCEPTED = (0.0, 0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0)
-#: Draws one picture: depth (z, m, 0 for none) and grey.
+#: Draws one image: depth (z, metres, 0 for none) and grey level.
 Picture = Callable[[np.random.Generator], tuple[NDArray[np.float64], NDArray[np.float64]]]
 FALSE_BARS = {("other_city", "precise"): 0.003, ("removed_streets", "precise"): 0.005,
               ("other_city", "stereo"): 0.02, ("removed_streets", "stereo"): 0.03}  # fmt: skip
@@ -35,25 +35,43 @@ FALSE_BARS = {("other_city", "precise"): 0.003, ("removed_streets", "precise"): 
 
 @dataclass(frozen=True)
 class Strangers:
-    """Queries that are in no map: what confidence each gets, and whether it is accepted by default."""
+    """Out-of-map queries: confidence of each, and whether the default accepts it.
+
+    Attributes:
+        confidence: confidence (N,).
+        accepted: accepted by default (N,).
+    """
 
     confidence: NDArray[np.float64]
     accepted: NDArray[np.bool_]
 
     @staticmethod
     def of(answers: Predictions) -> "Strangers":
-        """No answer is no confidence."""
+        """Take confidence and status of answers; no answer counts as confidence 0.
+
+        Args:
+            answers: answers to out-of-map queries.
+        """
         return Strangers(np.nan_to_num(answers.confidence), answers.localized)
 
 
 def confidence_and_right(answers: Predictions) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Of every query; no answer is no confidence."""
+    """Return confidence (N,) and correctness (N,) of every query; no answer counts as confidence 0.
+
+    Args:
+        answers: answers with ground truth.
+    """
     distance = np.linalg.norm(answers.T_answer[:, :2, 3] - answers.T_true[:, :2, 3], axis=1)
     return np.nan_to_num(answers.confidence), np.nan_to_num(distance, nan=np.inf) <= RIGHT_M
 
 
 def doubt_rows(report: Report, runs: Runs) -> None:
-    """False accepts by kind, calibration error, Brier score."""
+    """Add false accepts by kind, calibration error and Brier score.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     inside: list[tuple[NDArray[np.float64], NDArray[np.bool_]]] = []
     outside: list[NDArray[np.float64]] = []
     own_of: dict[str, tuple[NDArray[np.float64], NDArray[np.bool_]]] = {}
@@ -89,7 +107,7 @@ def doubt_rows(report: Report, runs: Runs) -> None:
 
 
 def _of_another_city(runs: Runs, preset: str) -> Predictions:
-    """The second city's queries, asked of the first one's map."""
+    """Answer the second city's queries by the first city's map."""
     bundle = runs.bundle(runs.dataset(unseen_plan(0)))
     first = runs.figures(bundle, runs.dataset(unseen_plan(1)), [f"drive1_{preset}"], refine=True)["predictions"]
     second = runs.figures(bundle, runs.dataset(more_plan(1)), [f"drive3_{preset}"], refine=True)["predictions"]
@@ -97,7 +115,7 @@ def _of_another_city(runs: Runs, preset: str) -> Predictions:
 
 
 def _where_streets_are_missing(runs: Runs, preset: str) -> tuple[Strangers, NDArray[np.float64], NDArray[np.bool_]]:
-    """The queries outside; confidence and rightness of those inside: maps with every second street."""
+    """Answer by maps without every second street: the queries outside, then confidence and correctness of those inside."""
     away, near, right = [], [], []
     for index in PARTIAL:
         dataset, more = runs.dataset(unseen_plan(index)), runs.dataset(more_plan(index))
@@ -137,7 +155,15 @@ def _false_rows(
 def curve(
     confidence: NDArray[np.float64], right: NDArray[np.bool_], negative: NDArray[np.float64]
 ) -> list[tuple[float, float]]:
-    """Share of the strangers that are accepted at most, and of the queries accepted and right, for each of ``ACCEPTED``."""
+    """Return, for each share of ``ACCEPTED``, the share of queries that are accepted and correct.
+
+    The share is the largest share of out-of-map queries that a threshold may accept.
+
+    Args:
+        confidence: confidence of the queries (N,).
+        right: their correctness (N,).
+        negative: confidence of the out-of-map queries (M,).
+    """
     falling = np.sort(negative)[::-1]
     refused = [falling[int(share * len(falling) + 1e-9)] if share < 1 else -np.inf for share in ACCEPTED]
     return [
@@ -149,16 +175,22 @@ def curve(
 def average_precision(
     confidence: NDArray[np.float64], right: NDArray[np.bool_], negative: NDArray[np.float64]
 ) -> float:
-    """Area under precision over recall of true accepts, false ones being answers outside the map."""
+    """Return the average precision of accepts: correct answers against answers to out-of-map queries.
+
+    Args:
+        confidence: confidence of the queries (N,).
+        right: their correctness (N,).
+        negative: confidence of the out-of-map queries (M,).
+    """
     score = np.concatenate([confidence[right], negative])
     true = np.r_[np.ones(int(right.sum()), bool), np.zeros(len(negative), bool)]
-    true = true[np.lexsort((true, -score))]  # of equal ones the false come first
+    true = true[np.lexsort((true, -score))]  # among equal confidences the false ones come first
     precision = np.cumsum(true) / np.arange(1, len(true) + 1)
     return float(precision[true].mean())
 
 
 def _told(localizer: Localizer, query: Query) -> tuple[float, bool]:
-    """Confidence, and whether the answer is accepted."""
+    """Return the confidence, and whether the answer is accepted."""
     try:
         answer = localizer.localize(query)
     except NoDepthError:
@@ -167,13 +199,19 @@ def _told(localizer: Localizer, query: Query) -> tuple[float, bool]:
 
 
 def nonsense(rng: np.random.Generator, preset: str, count: int = 100) -> dict[str, list[Query]]:
-    """Pictures that no street shows, as a depth camera of the preset measures them."""
+    """Make queries that no street shows, as a depth camera of the preset measures them.
+
+    Args:
+        rng: source of randomness.
+        preset: depth preset, a key of ``DEPTHS``.
+        count: queries per kind.
+    """
     drawn: dict[str, Picture] = {"indoor": _room, "blank_wall": _wall, "covered_lens": _covered, "sky": _sky, "noise": _noise}  # fmt: skip
     return {kind: [_measured(rng, kind, one, preset) for _ in range(count)] for kind, one in drawn.items()}
 
 
 _CAMERA = PinholeCamera(640, 480, 320.0, 320.0, 319.5, 239.5)
-#: What is drawn of these are stray measurements already, of nothing; of the others surfaces, which a camera measures.
+#: Kinds that draw stray measurements directly. The other kinds draw surfaces, which the simulated camera measures.
 _STRAY = ("covered_lens", "sky")
 
 
@@ -193,7 +231,7 @@ def _rays() -> NDArray[np.float64]:
 
 
 def _box_depth(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Depth of the inside of a box around the camera (optical frame)."""
+    """Return the depth of the inside of a box around the camera (optical frame)."""
     rays = _rays()
     with np.errstate(divide="ignore"):
         reach = np.where(rays > 0, high / rays, low / rays)
@@ -201,7 +239,7 @@ def _box_depth(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[n
 
 
 def _room(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A room or a corridor with some furniture."""
+    """Draw a room or a corridor with some furniture."""
     half, height = rng.uniform(1.2, 6.0), rng.uniform(2.4, 3.5)
     low = np.array([-half * rng.uniform(0.4, 1), -(height - 1.5), -1.0])
     high = np.array([half * rng.uniform(0.4, 1), 1.5, rng.uniform(3.0, 18.0)])
@@ -217,7 +255,7 @@ def _room(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _wall(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A wall before the camera, turned a little."""
+    """Draw a wall in front of the camera, slightly rotated."""
     normal = np.array([np.sin(turn := rng.uniform(-0.6, 0.6)), 0.0, np.cos(turn)])
     z = rng.uniform(1.0, 6.0) / np.maximum((_rays() @ normal), 0.05)
     ground = np.where(_rays()[..., 1] > 1e-3, 1.5 / np.maximum(_rays()[..., 1], 1e-3), np.inf)
@@ -225,25 +263,25 @@ def _wall(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _covered(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Something on the lens: no depth but some noise near by."""
+    """Draw a covered lens: no depth but some noise at short range."""
     z = np.where(rng.random((480, 640)) < 0.1, rng.uniform(0.2, 0.6, (480, 640)), 0.0)
     return z, np.full(z.shape, rng.uniform(0, 30))
 
 
 def _sky(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Looking up: depth is invented here and there."""
+    """Draw the sky: stray depth here and there."""
     z = np.where(rng.random((480, 640)) < 0.02, rng.uniform(5.0, 60.0, (480, 640)), 0.0)
     return z, np.full(z.shape, rng.uniform(150, 250))
 
 
 def _noise(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depth without any surface."""
+    """Draw depth without any surface."""
     coarse = rng.uniform(1.0, 40.0, (30, 40))
     return np.kron(coarse, np.ones((16, 16))), rng.uniform(0, 255, (480, 640))
 
 
 def _reliability(report: Report, confidence: NDArray[np.float64], right: NDArray[np.bool_]) -> None:
-    """The diagram's points, for the page of reports."""
+    """Add the points of the reliability diagram for the page of reports."""
     order = np.argsort(confidence, kind="stable")
     report.notes["reliability"] = [
         {

@@ -1,12 +1,13 @@
-"""Figures in documents that come from a report or from the code, not from somebody's memory.
+"""Insert figures of reports, or of the code, into documents.
 
 A document marks such a figure by comments, which Markdown does not show::
 
     <!-- figure: serving full.answers_per_s .0f -->41<!-- /figure -->
     <!-- figure: code false_accept_rate .0% -->2 %<!-- /figure -->
 
-The first word is a report or ``code``, the second a row's id or a name of ``CODE``, the third a format of Python's (a percentage gets
-its space). ``make reports`` writes the figures anew; a test fails where one is not up to date.
+The first word is a report or ``code``. The second is the id of a row or a name of ``CODE``. The third is a format of
+Python; a percentage
+gets a space. ``make reports`` writes the figures again. A test fails if one is out of date.
 """
 
 import json
@@ -24,14 +25,18 @@ _FIGURE = re.compile(r"(<!-- figure: (\S+) (\S+) (\S+) -->)(.*?)(<!-- /figure --
 
 
 def stock_calibration() -> Calibration:
-    """The calibration that comes with the stock encoder."""
+    """Return the calibration of the stock encoder.
+
+    Raises:
+        ValueError: the stock encoder is not calibrated.
+    """
     calibration = read_calibration(CALIBRATION.read_bytes(), path=str(CALIBRATION))
     if calibration is None:
         raise ValueError(f"{CALIBRATION}: the stock encoder is not calibrated")
     return calibration
 
 
-#: What documents may take from the code.
+#: Figures that documents may take from the code.
 CODE: dict[str, Callable[[], float]] = {
     "false_accept_rate": lambda: FALSE_ACCEPT_RATE,
     "least_false_accept_rate": lambda: stock_calibration().least_false_accept_rate,
@@ -40,7 +45,7 @@ CODE: dict[str, Callable[[], float]] = {
 
 
 def documents() -> list[Path]:
-    """README, the pages of ``docs``, and what else may hold figures."""
+    """Return README, the pages of ``docs``, and the model card."""
     return [
         ROOT / "README.md",
         *sorted((ROOT / "docs").glob("*.md")),
@@ -49,7 +54,12 @@ def documents() -> list[Path]:
 
 
 def figure(source: str, name: str, form: str) -> str:
-    """A figure as a document shows it.
+    """Return a figure as a document shows it.
+
+    Args:
+        source: name of a report, or ``code``.
+        name: id of a row, or name in ``CODE``.
+        form: format specification of Python.
 
     Raises:
         ValueError: there is no such report, row or name, or the row has no value.
@@ -70,21 +80,28 @@ def figure(source: str, name: str, form: str) -> str:
 
 
 def with_figures(text: str) -> str:
-    """A document with all its marked figures as they are now.
+    """Return a document with all marked figures up to date.
+
+    Args:
+        text: the document.
 
     Raises:
-        ValueError: a figure's source is not there.
+        ValueError: the source of a figure does not exist.
     """
     return _FIGURE.sub(lambda found: found[1] + figure(found[2], found[3], found[4]) + found[6], text)
 
 
 def without_figures(text: str) -> str:
-    """What is left of a document: the figures that somebody typed, and no others."""
+    """Return a document without its marked figures, so only hand-written ones remain.
+
+    Args:
+        text: the document.
+    """
     return _FIGURE.sub("", text)
 
 
 def write_figures() -> list[Path]:
-    """Bring all documents up to date; which of them changed."""
+    """Update all documents; return those that changed."""
     changed = []
     for page in documents():
         text = page.read_text()

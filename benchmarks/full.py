@@ -1,4 +1,4 @@
-"""The full answer: registration after retrieval, position, heading and covariance."""
+"""The full answer: registration after retrieval, with position, heading and covariance."""
 
 from typing import Any
 
@@ -18,7 +18,12 @@ COVERAGE_BAR = (0.90, 0.98)
 
 
 def full_paper_rows(report: Report, runs: Runs) -> None:
-    """The paper's city: five other drives with Table I's counts."""
+    """Add the rows of the paper's city: five other traversals with Table I's counts.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     dataset = runs.dataset(paper_plan())
     bundle = runs.bundle(dataset)
     for preset, street in (("precise", 0.998), ("stereo", 0.985)):
@@ -35,7 +40,12 @@ def full_paper_rows(report: Report, runs: Runs) -> None:
 
 
 def unseen_answers(runs: Runs, preset: str) -> list[Predictions]:
-    """Answers to 1,000 queries of each of the three unseen cities, by their own maps."""
+    """Answer 1,000 queries of each of the three unseen cities by their own maps.
+
+    Args:
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+        preset: depth preset.
+    """
     found = []
     for index in range(3):
         dataset, more = runs.dataset(unseen_plan(index)), runs.dataset(more_plan(index))
@@ -47,7 +57,12 @@ def unseen_answers(runs: Runs, preset: str) -> list[Predictions]:
 
 
 def full_unseen_rows(report: Report, runs: Runs) -> None:
-    """Three unseen cities: shares over all queries, medians over the accepted ones."""
+    """Add the rows of three unseen cities: shares over all queries, medians over accepted answers.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     headings = {"precise": 0.12, "stereo": 0.35}
     coverage: dict[str, float] = {}
     gaps: dict[str, float] = {}
@@ -93,12 +108,17 @@ def full_unseen_rows(report: Report, runs: Runs) -> None:
 
 
 def _numbered(answers: Predictions) -> list[str]:
-    """Names for the streets, which are not shown."""
+    """Return placeholder names for the streets; they are not shown."""
     return [str(number) for number in range(1 + int(max(answers.street_true.max(), answers.street_answer.max())))]
 
 
 def pose_errors(answers: Predictions, rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Errors (n, 6) of translation (m) and rotation (rad), map axes, as the covariance counts them."""
+    """Return errors (n, 6) of translation (m) and rotation (rad) about map axes, in the covariance's order.
+
+    Args:
+        answers: answers with ground truth.
+        rows: mask (N,) of the answers to use.
+    """
     T, truth = answers.T_answer[rows], answers.T_true[rows]
     R = T[:, :3, :3] @ truth[:, :3, :3].transpose(0, 2, 1)
     angle = np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1) / 2, -1, 1))
@@ -108,7 +128,12 @@ def pose_errors(answers: Predictions, rows: NDArray[np.bool_]) -> NDArray[np.flo
 
 
 def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) -> float:
-    """Share of normalised squared errors between the 2.5 % and 97.5 % quantiles of chi-square."""
+    """Return the share of normalised squared errors between the 2.5 % and 97.5 % quantiles of chi-square.
+
+    Args:
+        errors: errors (n, d).
+        covariances: covariances (n, d, d) of the errors.
+    """
     squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
     low, high = chi2.ppf([0.025, 0.975], errors.shape[1])
     return float(((squared >= low) & (squared <= high)).mean())
@@ -117,9 +142,15 @@ def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) ->
 def sigma_gaps(
     answers: Predictions, rows: NDArray[np.bool_], errors: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> dict[str, float]:
-    """Largest difference of 1, 2 and 3 sigma coverage from the normal distribution's, axis by axis.
+    """Return, per axis, the largest difference of 1, 2 and 3 sigma coverage from the normal distribution.
 
-    A street's queries look along it, 15 degrees off at most: the camera's heading stands for the street's.
+    Queries look along their street within 15 degrees, so the camera's heading stands for the street's.
+
+    Args:
+        answers: answers with ground truth.
+        rows: mask (N,) of the answers to use.
+        errors: errors (n, 6) of ``pose_errors``.
+        covariances: covariances (n, 6, 6).
     """
     heading = np.array([heading_of_camera(T) for T in answers.T_true[rows]])
     axes = np.zeros((4, len(heading), 6))

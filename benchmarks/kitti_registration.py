@@ -18,8 +18,8 @@ from service.localization.refine import RefineSettings, settings_for_rig
 from service.registration.points import blocks_of, inverse_depth_noise, movable_of, points_from
 from service.registration.rays import adjust, picture_of
 from service.registration.register import Start, register
-from service.registration.sight import Sights
 from service.registration.surfel_map import SurfelMap
+from service.registration.visibility import SurfelRaycaster
 
 IN_SIGHT = "not held out: turned starts and the last stage's weights were chosen with these frames in sight"
 STARTS, AWAY_M, TURN_DEG = 20, 2.0, 10.0
@@ -88,7 +88,7 @@ def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.
             start = Start(rotation_z(turn) @ upright, truth[:3, 3] + away, 0)
             began = time.process_time()
             best = register(cloud, points, [start], level.height_m, refining.registration)[0]
-            adjusted = adjust(Sights(cloud, refining.rays), [picture], best, refining.rays)
+            adjusted = adjust(SurfelRaycaster(cloud, refining.rays), [picture], best, refining.rays)
             best = best if adjusted is None else adjusted[0]
             aligned_s.append(time.process_time() - began)
             found.append(float(np.linalg.norm(transform_from(best.R_map_level, best.camera_m)[:3, 3] - truth[:3, 3])))

@@ -1,10 +1,15 @@
-"""``make chaos``: random operators, disks, clients and deaths against a running service -> reports/serving.json.
+"""``make chaos``: disturb a running service at random and check its answers -> reports/serving.json.
 
-Every step does one thing to a service of several workers: a signal, a worker killed, map versions that come, go, are damaged or half
-copied, a version chosen, slow and aborted connections, a full disk, other API keys. After it both faces must answer a known pair
-rightly, from the version that should serve, or refuse it with a clear error; and all workers must agree. Meanwhile others ask.
+Each step does one thing to a service with several workers. It sends a signal, kills a worker, opens slow connections,
+aborts connections,
+fills the disk or changes the API keys. It also adds, removes, damages or half copies map versions, or chooses one.
+After the step, REST
+and gRPC must answer a known query correctly, from the version that should serve. Otherwise they must refuse with a
+clear error. All
+workers must agree. Other threads send requests meanwhile.
+The same seed repeats the same steps.
 
-The same seed does the same things again: --seed 7 --steps 120.
+Example: python -m benchmarks.chaos --seed 7 --steps 120
 """
 
 import argparse
@@ -24,7 +29,7 @@ STEPS = 1000
 
 
 def main() -> None:
-    """Parse, do the steps, write the report; leaves with 1 where anything was wrong."""
+    """Parse the arguments, do the steps and write the report; exit with 1 if anything was wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--steps", type=int, default=STEPS)
@@ -62,12 +67,21 @@ def main() -> None:
 
 
 def pair_of(site: Site) -> Pair:
-    """The first pair of the site's queries."""
+    """Return the first query of the site.
+
+    Args:
+        site: map and queries.
+    """
     return Pair(site.payloads(refine=True)[0], site.payloads(refine=False)[0])
 
 
 def rows(report: Report, found: Findings) -> None:
-    """What came of a run."""
+    """Add the rows of a run.
+
+    Args:
+        report: collects the rows.
+        found: findings of the run.
+    """
     report.row("chaos.steps", found.steps, "count", bar=STEPS, n=found.answers)
     for name, told in (
         ("chaos.wrong_or_lost_answers", found.wrong),

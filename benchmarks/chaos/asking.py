@@ -1,4 +1,4 @@
-"""Asks a service on a new connection each time, so that any worker may answer, and says what came of it."""
+"""Send requests to a service, each on a new connection so that any worker may answer, and record the outcomes."""
 
 import http.client
 import itertools
@@ -24,13 +24,13 @@ Kind = Literal["answer", "refusal", "lost"]
 What = Literal["maps", "full", "retrieval", "stream"]
 Face = Literal["rest", "grpc"]
 FACES: tuple[Face, ...] = ("rest", "grpc")
-#: How fast answers come is not judged here, and other work may share the machine.
+#: Generous on purpose: this check does not measure speed, and other work may share the machine.
 TIMEOUT_S = 150.0
 _OPTIONS = (("grpc.use_local_subchannel_pool", 1), ("grpc.max_receive_message_length", -1), ("grpc.enable_retries", 0))
 
 
 def _codes() -> frozenset[str]:
-    """Codes of every problem that tells a caller what is wrong; `internal` tells nothing."""
+    """Return the codes of all problems that tell a caller what is wrong; `internal` tells nothing."""
     kinds, waiting = set[str](), [errors.StreetfixError]
     while waiting:
         kind = waiting.pop()
@@ -44,19 +44,20 @@ KNOWN_CODES = _codes()
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of one request.
+    """Outcome of one request.
 
     Attributes:
-        began_s: monotonic time before it was sent.
-        ended_s: when its outcome was known.
-        face: that was asked.
-        what: that was asked for.
-        kind: an answer; a clear error (a problem with a known code, or a gRPC status with its details); or neither.
-        version: of the map that answered.
-        listed: open versions, where maps were asked for.
-        position_m: of the answer, or of its best hypothesis where it has no pose.
+        began_s: monotonic time before the request was sent, seconds.
+        ended_s: monotonic time when its outcome was known, seconds.
+        face: ``rest`` or ``grpc``.
+        what: kind of request.
+        kind: ``answer``; ``refusal`` for a clear error (a problem with a known code, or a gRPC status with details);
+            ``lost`` for anything else.
+        version: map version that answered.
+        listed: open versions, if the request listed maps.
+        position_m: position of the answer in the map frame, or of its best hypothesis if it has no pose.
         told: code of the error, or what happened.
-        with_key: whose validity the answer says something about.
+        with_key: API key of the request.
     """
 
     began_s: float
@@ -77,20 +78,20 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """The known pair of pictures, as a request with registration and as one without."""
+    """The known query, as a request with registration and as one without."""
 
     full: Payload
     retrieval: Payload
 
 
 class Caller:
-    """Asks one service; its key may be changed at any time.
+    """Client of one service; its key may change at any time.
 
     Args:
-        port: of REST.
-        grpc_port: of gRPC.
-        pair: what is asked.
-        key: of a caller.
+        port: port of REST.
+        grpc_port: port of gRPC.
+        pair: the query to send.
+        key: API key of a caller.
     """
 
     def __init__(self, port: int, grpc_port: int, pair: Pair, key: str) -> None:
@@ -98,14 +99,26 @@ class Caller:
         self.pair, self.key = pair, key
 
     def ask(self, face: Face, what: What, *, key: str | None = None) -> Outcome:
-        """One request on a connection of its own; never raises for what the service does."""
+        """Send one request on its own connection; never raise for what the service does.
+
+        Args:
+            face: ``rest`` or ``grpc``.
+            what: kind of request.
+            key: API key; None takes the client's key.
+        """
         used = self.key if key is None else key
         began = time.monotonic()
         kind, told = self._rest(what, used) if face == "rest" else self._grpc(what, used)
         return Outcome(began, time.monotonic(), face, what, kind, with_key=used, **told)
 
     def put(self, name: str, version: str, operator_key: str) -> tuple[int, str]:
-        """Let a version serve: status and code of the answer; status 0 where there is none."""
+        """Choose the version that serves; return HTTP status and problem code, with status 0 if there is no answer.
+
+        Args:
+            name: name of the map.
+            version: version to serve.
+            operator_key: API key of an operator.
+        """
         headers = {"Authorization": f"Bearer {operator_key}", "Content-Type": "application/json"}
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)
         try:
@@ -181,7 +194,7 @@ def _of_answer(version: str, at: tuple[float, ...]) -> tuple[Kind, dict[str, Any
 
 
 def _problem(response: http.client.HTTPResponse, content: bytes) -> str:
-    """Code of a problem; else what came instead."""
+    """Return the code of a problem, or the raw response if it is not a problem document."""
     if response.getheader("Content-Type", "").startswith("application/problem+json"):
         try:
             problem = json.loads(content)
@@ -207,12 +220,12 @@ def _of_status(error: grpc.RpcError) -> tuple[Kind, dict[str, Any]]:
 
 
 class Asking:
-    """Threads that ask all the time, each request on a connection of its own.
+    """Threads that send requests continuously, each request on its own connection.
 
     Args:
-        caller: that asks.
-        threads: how many.
-        pause_s: of each thread between two requests.
+        caller: client that sends.
+        threads: number of threads.
+        pause_s: pause of each thread between two requests, seconds.
     """
 
     def __init__(self, caller: Caller, *, threads: int = 2, pause_s: float = 0.08) -> None:
@@ -228,13 +241,13 @@ class Asking:
         self._threads = [threading.Thread(target=self._run, args=(turns[k % 2],), daemon=True) for k in range(threads)]
 
     def __enter__(self) -> Callable[[], list[Outcome]]:
-        """What came since the last call, as a function."""
+        """Start the threads; return a function that gives the outcomes since its last call."""
         for thread in self._threads:
             thread.start()
         return self._take
 
     def __exit__(self, *_: object) -> None:
-        """Let the last requests end."""
+        """Wait until the last requests end."""
         self._over.set()
         for thread in self._threads:
             thread.join()
@@ -246,7 +259,7 @@ class Asking:
                 outcome = self._caller.ask(*next(each))
             except (
                 Exception
-            ) as error:  # a defect of ours: without this thread the rest of the run would see less than it says
+            ) as error:  # a defect of the benchmark: a silent end of this thread would hide later failures
                 self._failed = error
                 return
             with self._lock:

@@ -1,4 +1,4 @@
-"""A small disk that can be full: a tmpfs of its own where mounting is allowed, else a limit on the size of the service's files."""
+"""A small disk that can be full: a tmpfs where mounting is allowed, else a limit on the file sizes of the service."""
 
 import errno
 import os
@@ -10,17 +10,18 @@ from contextlib import contextmanager
 from pathlib import Path
 
 _CHUNK = bytes(2**18)
-#: A disk is never filled for more than this, whatever it says of its size.
+#: Upper limit of the filler file, whatever size the disk reports.
 _MOST_BYTES = 2**31
 
 
 class Disk:
-    """A folder whose disk can be full.
+    """Folder whose disk can be full.
 
     Attributes:
-        folder: on it.
-        is_mounted: whether it is a file system of its own. If not, being full means that the service's processes may write no file.
-        is_full: now.
+        folder: folder on the disk.
+        is_mounted: whether the disk is its own file system. If not, "full" means that the service's processes may not
+            write any file.
+        is_full: whether the disk is full now.
     """
 
     def __init__(self, folder: Path, *, is_mounted: bool) -> None:
@@ -28,10 +29,13 @@ class Disk:
         self._limited: set[int] = set()
 
     def fill(self, pids: Iterable[int]) -> None:
-        """No byte is left.
+        """Fill the disk to the last byte.
 
         Args:
-            pids: of the service; those that they start inherit the limit.
+            pids: processes of the service; processes that they start inherit the limit.
+
+        Raises:
+            OSError: writing failed for another reason than a full disk.
         """
         self.is_full = True
         if not self.is_mounted:
@@ -50,10 +54,10 @@ class Disk:
                         raise
 
     def free(self, pids: Iterable[int]) -> None:
-        """There is space again.
+        """Free the disk again.
 
         Args:
-            pids: of the service.
+            pids: processes of the service.
         """
         self.is_full = False
         (self.folder / ".filler").unlink(missing_ok=True)
@@ -72,11 +76,11 @@ class Disk:
 
 @contextmanager
 def small_disk(mib: int, *, may_mount: bool = True) -> Iterator[Disk]:
-    """A disk of so many MiB for as long as the context lasts.
+    """Provide a small disk for as long as the context lasts.
 
     Args:
-        mib: of a file system of its own.
-        may_mount: whether to try; without, or where it is not allowed, it is a plain folder.
+        mib: size of the file system, MiB.
+        may_mount: whether to try to mount; otherwise, or if mounting is not allowed, the disk is a plain folder.
     """
     with tempfile.TemporaryDirectory(prefix="streetfix-chaos-") as name:
         folder = Path(name) / "disk"
@@ -90,5 +94,5 @@ def small_disk(mib: int, *, may_mount: bool = True) -> Iterator[Disk]:
         try:
             yield Disk(folder, is_mounted=is_mounted)
         finally:
-            if is_mounted:  # lazily: a process that holds a file there must not keep it
+            if is_mounted:  # lazily: a process that holds a file there must not block it
                 subprocess.run(["umount", "--lazy", str(folder)], check=True)

@@ -1,8 +1,8 @@
-"""What a service must answer from, worked out from what was done to it."""
+"""Model of the service: which map version must answer after each action."""
 
 from dataclasses import dataclass, field, replace
 
-#: Versions of one map that stay open (docs/serving.md): the one that serves, and what may be rolled back to.
+#: Number of versions of one map that stay open (docs/serving.md): the serving one and those for a rollback.
 MOST_OPEN = 3
 
 
@@ -11,8 +11,8 @@ class Version:
     """One version of the map.
 
     Attributes:
-        number: later ones were made later.
-        id: as the service names it.
+        number: order of creation; later versions have larger numbers.
+        id: name of the version in the service.
     """
 
     number: int
@@ -21,12 +21,12 @@ class Version:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What may serve after something was done.
+    """Versions that may serve after an action.
 
     Attributes:
         path: versions in the order in which they may serve; the last one stays.
         instead: versions that may stay in place of the last one, where the service has a choice.
-        dropped: versions that the service must not list any more.
+        dropped: versions that the service must no longer list.
     """
 
     path: tuple[str, ...]
@@ -35,27 +35,36 @@ class Expected:
 
     @property
     def finals(self) -> frozenset[str]:
-        """What may serve when all has settled."""
+        """Versions that may serve when all workers have settled."""
         return self.instead | {self.path[-1]}
 
     def then(self, after: "Expected") -> "Expected":
-        """This, and then that."""
+        """Return the expectation for this action followed by another one.
+
+        Args:
+            after: expectation of the second action.
+        """
         path = self.path + after.path[after.path[:1] == self.path[-1:] :]
         return Expected(path, self.instead | after.instead, self.dropped | after.dropped)
 
 
 @dataclass
 class Oracle:
-    """Bundles on the disk, open versions, and the one that serves.
+    """Bundles on the disk, open versions, and the serving version.
 
-    Rules: a new bundle serves if no open version is newer. Another one serves when an operator chooses it. A bundle whose folder was
-    removed stays open until SIGHUP. A service that starts serves the newest bundle. One that cannot be opened changes nothing.
+    Rules:
+    - A new bundle serves if no open version is newer.
+    - Another version serves when an operator chooses it.
+    - A bundle whose folder was removed stays open until SIGHUP.
+    - A service that starts serves the newest bundle.
+    - A bundle that cannot be opened changes nothing.
 
     Attributes:
-        on_disk: complete and good bundles by folder.
+        on_disk: complete and valid bundles by folder.
         open: versions that the service has open, the newest first.
-        serving: one of them.
-        is_unsure: a worker was killed while a version was open whose folder is gone; whoever knows that it has started again resets it.
+        serving: the serving version, one of ``open``.
+        is_unsure: a worker was killed while a version without folder was open. Code that knows that the worker has
+            restarted resets this flag.
     """
 
     on_disk: dict[str, Version]
@@ -63,23 +72,28 @@ class Oracle:
     serving: Version = field(init=False)
     is_unsure: bool = field(init=False)
     _seen: dict[str, Version] = field(init=False)
-    _unseen_by_some: set[str] = field(init=False)  # a worker started when they were away
+    _unseen_by_some: set[str] = field(init=False)  # folders that were absent when a worker started
 
     def __post_init__(self) -> None:
         self.start()
 
     def start(self) -> Expected:
-        """The service starts: the newest bundle serves."""
+        """Start the service: the newest bundle serves."""
         self._seen, self._unseen_by_some, self.is_unsure = dict(self.on_disk), set(), False
         self.open = sorted(set(self.on_disk.values()), reverse=True)[:MOST_OPEN]
         self.serving = self.open[0]
         return Expected((self.serving.id,))
 
     def appeared(self, folder: str, version: Version) -> Expected:
-        """A good bundle lies in a folder, and the service has looked."""
+        """Add a valid bundle that the service has noticed.
+
+        Args:
+            folder: name of the bundle's folder.
+            version: its version.
+        """
         before = self.serving
         self.on_disk[folder] = version
-        if self._seen.get(folder) == version:  # it was away, but no SIGHUP came meanwhile
+        if self._seen.get(folder) == version:  # the folder was absent, but no SIGHUP came meanwhile
             is_new_to_some = folder in self._unseen_by_some and version == max(version, *self.open)
             return Expected((self.serving.id,), frozenset({version.id} if is_new_to_some else ()))
         self._seen[folder] = version
@@ -87,11 +101,15 @@ class Oracle:
         return Expected(_path(before, self.serving))
 
     def removed(self, folder: str) -> None:
-        """A bundle's folder is gone; nothing changes before SIGHUP."""
+        """Remove the folder of a bundle; nothing changes before SIGHUP.
+
+        Args:
+            folder: name of the bundle's folder.
+        """
         del self.on_disk[folder]
 
     def sighup(self) -> Expected:
-        """What lies in no folder any more is dropped."""
+        """Send SIGHUP: the service drops versions without a folder."""
         before = self.serving
         self._unseen_by_some.clear()
         self._seen = {folder: version for folder, version in self._seen.items() if folder in self.on_disk}
@@ -107,38 +125,46 @@ class Oracle:
                 self._mount(self.serving)
         elif max(there) > max(
             self.open
-        ):  # there is room again for one that was left out, and it is newer than all that are open
+        ):  # room again for a version that was left out, and that is newer than all open ones
             instead.add(max(there).id)
         return Expected(_path(before, self.serving), frozenset(instead - {before.id}), dropped)
 
     def choose(self, version: Version) -> Expected:
-        """An operator chose an open version."""
+        """Let an operator choose an open version.
+
+        Args:
+            version: the chosen version.
+        """
         before, self.serving = self.serving, version
         return Expected(_path(before, version))
 
     def worker_started_again(self) -> Expected:
-        """A worker cannot open again what lies in no folder; all may then agree to drop that, now or when it has started."""
+        """Restart a worker. It cannot reopen a version without folder, so all workers may drop that version now or after the restart."""
         self._unseen_by_some |= set(self._seen) - set(self.on_disk)
         self.is_unsure = self.is_unsure or any(map(self.is_gone, self.open))
         return self.unchanged()
 
     def unsure(self, expected: Expected) -> Expected:
-        """What else may serve as long as it is not known what workers have dropped: the newest bundle on the disk."""
+        """Widen an expectation by the newest bundle on the disk, while it is unknown what the workers have dropped.
+
+        Args:
+            expected: expectation to widen.
+        """
         if not self.is_unsure:
             return expected
         return replace(expected, instead=expected.instead | {max(self.on_disk.values()).id})
 
     def unchanged(self) -> Expected:
-        """Whatever happened, the same version serves."""
+        """Expect the same version to serve."""
         return Expected((self.serving.id,))
 
     def adopt(self, serving: str, listed: set[str], known: dict[str, Version]) -> str | None:
-        """Take over what the service says it has open; why that cannot be, or None.
+        """Take over the versions that the service reports; return why they are impossible, or None.
 
         Args:
-            serving: one of the expected ones.
+            serving: serving version, one of the expected ones.
             listed: open versions that all workers list.
-            known: every version that was ever made.
+            known: every version that was ever created, by id.
         """
         strange = [each for each in listed if each not in known]
         newest = max(self.on_disk.values())
@@ -151,7 +177,11 @@ class Oracle:
         return None
 
     def is_gone(self, version: Version) -> bool:
-        """Whether a version lies in no folder."""
+        """Return whether a version has no folder.
+
+        Args:
+            version: the version to look up.
+        """
         return version not in self.on_disk.values()
 
     def _mount(self, version: Version) -> None:

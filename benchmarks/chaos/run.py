@@ -1,4 +1,4 @@
-"""Random steps against a running service; after each it must answer rightly, and all its workers alike."""
+"""Random steps against a running service; after each, all its workers must answer correctly and alike."""
 
 import os
 import signal
@@ -27,9 +27,9 @@ from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.runtime.keys import hash_of, new_key
 
-#: Until all workers must agree, and until a service must have ended.
+#: Longest time until all workers must agree, and until a stopped service must have ended.
 SETTLED_S, ENDED_S = 120.0, 120.0
-#: Until every worker has looked at the folder after SIGHUP.
+#: Time within which every worker has read the folder after SIGHUP.
 _LOOKED_S = 3.0
 _SAME_M = 0.01
 _MOST_BUNDLES, _MOST_DAMAGED, _MOST_HALVES, _MOST_SOCKETS, _FULL_STEPS = 6, 3, 2, 24, 5
@@ -37,17 +37,19 @@ _MOST_BUNDLES, _MOST_DAMAGED, _MOST_HALVES, _MOST_SOCKETS, _FULL_STEPS = 6, 3, 2
 
 @dataclass
 class Findings:
-    """What came of a run.
+    """Findings of a run.
 
     Attributes:
-        seed: that it is replayed with.
-        steps: done.
-        answers: that were checked.
-        refusals: clear errors, by code.
-        wrong: answers that were wrong, lost or no clear error, and services that ended or did not.
-        disagreements: of workers: two versions at once, or an old one after a new one.
-        actions: how often each was done.
-        disk: what stood for the full disk.
+        seed: seed that repeats the run.
+        steps: number of steps done.
+        answers: number of answers checked.
+        refusals: number of clear errors, by code.
+        wrong: answers that were wrong, lost or no clear error; also services that ended, or did not end, against
+            expectation.
+        disagreements: disagreements of workers: two versions at once, or an old version after a new one.
+        actions: how often each action was done.
+        tracebacks: number of tracebacks in the service's log.
+        disk: how a full disk was simulated.
     """
 
     seed: int
@@ -63,14 +65,14 @@ class Findings:
 
 @dataclass
 class Step:
-    """What a step did.
+    """Effect of a step.
 
     Attributes:
-        expected: what may serve after it.
-        strict_s: from when on nothing but the last version may answer; None: when it has settled.
-        cut: spans from the moment when a worker was killed until it was gone: a request that ran then may be lost.
-        is_away: spans of time in which the service was down: a request that began then may be lost.
-        outcomes: that the step itself has seen.
+        expected: versions that may serve after it.
+        strict_s: time from which only the last version may answer; None means after settling.
+        cut: spans from the kill of a worker until it was gone; a request that ran then may be lost.
+        is_away: spans in which the service was down; a request that began then may be lost.
+        outcomes: outcomes of the step's own requests.
     """
 
     expected: Expected
@@ -80,7 +82,11 @@ class Step:
     outcomes: list[Outcome] = field(default_factory=list)
 
     def excuses(self, outcome: Outcome) -> bool:
-        """Whether a request could not be answered, whatever the service did."""
+        """Return whether the step itself made an answer impossible.
+
+        Args:
+            outcome: outcome of a request.
+        """
         cut = any(outcome.began_s <= gone and outcome.ended_s >= killed for killed, gone in self.cut)
         return cut or any(start <= outcome.began_s <= end for start, end in self.is_away)
 
@@ -89,13 +95,13 @@ class Chaos:
     """One run.
 
     Args:
-        disk: where maps and temporary files of the service lie.
+        disk: disk of the maps and of the service's temporary files.
         bundle: the map.
-        pair: the known pair.
-        seed: of all choices.
-        workers: of the service.
-        tell: takes a line for people.
-        log: takes a line of what is done, and of what the service logs.
+        pair: the known query.
+        seed: seed of all choices.
+        workers: number of workers of the service.
+        tell: receives a line for the user.
+        log: receives a line for each action, and the lines that the service logs.
     """
 
     def __init__(
@@ -107,7 +113,8 @@ class Chaos:
         self._shelf = Shelf(disk.folder, bundle, self._random)
         self._temporary = disk.folder / "tmp"
         self._temporary.mkdir()
-        self._keys_file = disk.folder.parent / "keys.txt"  # on another disk: it can be replaced while this one is full
+        # on another disk, so that it can be replaced while this one is full
+        self._keys_file = disk.folder.parent / "keys.txt"
         self._operator, self._retired = new_key(), deque[str](maxlen=4)
         self._keys_are_broken = False
         self._sockets: list[socket.socket] = []
@@ -127,11 +134,14 @@ class Chaos:
         self._serving = version.id
 
     def run(self, steps: int, *, stop_at_first: bool = False) -> Findings:
-        """Do so many steps.
+        """Do the steps and return the findings.
 
         Args:
-            steps: how many.
-            stop_at_first: end with the first wrong, lost or differing answer.
+            steps: number of steps.
+            stop_at_first: end at the first wrong, lost or differing answer.
+
+        Raises:
+            RuntimeError: the service does not start, or does not answer the known query.
         """
         try:
             self._start()
@@ -185,7 +195,7 @@ class Chaos:
         self._judge(before, step, settled_s, [*heard(), *step.outcomes, *probes])
 
     def _choose(self, number: int) -> str:
-        """The next action, among those that make sense now."""
+        """Return the next action, among those that make sense now."""
         if self._disk.is_full and number - self._full_since >= _FULL_STEPS:
             return "free disk"
         oracle, shelf = self._oracle, self._shelf
@@ -201,9 +211,9 @@ class Chaos:
         }  # fmt: skip
         if len(oracle.on_disk) >= _MOST_BUNDLES:
             possible |= {"add": 0, "restore": 0, "finish copy": 0, "delete": 15}
-        if self._disk.is_full:  # what is killed now need not come again before there is space
+        if self._disk.is_full:  # a killed worker may fail to restart before there is space
             possible |= {"kill several": 0, "kill all": 0}
-        if self._keys_are_broken:  # a worker that is killed comes again when they are mended, so one must be left
+        if self._keys_are_broken:  # a killed worker restarts only after the keys are repaired, so one must remain
             possible |= {
                 "new keys": 15,
                 "kill": 0,
@@ -214,7 +224,7 @@ class Chaos:
             }
         return self._random.choices(list(possible), list(possible.values()))[0]
 
-    # What can be done. Each says what must hold after it.
+    # Actions. Each returns what must hold after it.
 
     def _add(self) -> Step:
         try:
@@ -233,7 +243,7 @@ class Chaos:
         return self._same(f"{name}: the disk was full") if version is None else self._appeared(name, version)
 
     def _appeared(self, name: str, version: Version) -> Step:
-        """A good bundle has appeared; the service sees it by itself, or is told to look."""
+        """Expect a new valid bundle: the service notices it by itself, or SIGHUP tells it to look."""
         expected = self._oracle.appeared(name, version)
         self._note(f"{name} {version.id}")
         if self._random.random() < 0.5:
@@ -265,9 +275,9 @@ class Chaos:
         return self._removed(name, lambda: self._shelf.delete(name))
 
     def _removed(self, name: str, remove: Callable[[], None]) -> Step:
-        """A bundle goes away; SIGHUP says so to the service, or nothing does."""
+        """Remove a bundle; SIGHUP may or may not announce it."""
         told = self._random.random() < 0.5 or not self._is_whole()
-        if not told:  # no worker may find out because of an earlier SIGHUP
+        if not told:  # wait, so that no worker notices the removal because of an earlier SIGHUP
             time.sleep(max(0.0, self._sighup_s + _LOOKED_S - time.monotonic()))
         remove()
         self._oracle.removed(name)
@@ -275,7 +285,7 @@ class Chaos:
         return self._sighup() if told else self._same()
 
     def _is_whole(self) -> bool:
-        """Whether all workers answer and have done what waited for them when they started, as an earlier SIGHUP."""
+        """Return whether all workers answer and have processed what was pending at their start, such as an earlier SIGHUP."""
         self._note_whole()
         if self._whole_s is None:
             return False
@@ -283,7 +293,7 @@ class Chaos:
         return True
 
     def _note_whole(self) -> None:
-        """Keep since when all workers answer."""
+        """Record the time since which all workers answer."""
         if len(_listeners(self._caller.port, self._pids())) < self._workers:
             self._whole_s = None
         elif self._whole_s is None:
@@ -305,7 +315,7 @@ class Chaos:
         return Step(self._oracle.sighup())
 
     def _choose_version(self) -> Step:
-        """What an operator does; whatever is open may be chosen, and what lies in no folder any more may be refused."""
+        """Let an operator choose any open version; the service may refuse one without a folder."""
         version = self._random.choice([each for each in self._oracle.open if each != self._oracle.serving])
         status, code = self._caller.put(self._shelf.name, version.id, self._operator)
         gone = self._oracle.is_gone(version)
@@ -342,7 +352,7 @@ class Chaos:
         return step
 
     def _kill_workers(self, count: int) -> Step:
-        """Kill so many workers; one that answers is left, unless all are to go."""
+        """Kill some workers; keep one that answers unless all must go."""
         there = sorted(self._pids() - {self._running.process.pid})
         victims = self._random.sample(there, min(count, len(there)))
         answering = _listeners(self._caller.port, there)
@@ -352,9 +362,9 @@ class Chaos:
         for pid in victims:
             try:
                 os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:  # it ended by itself
+            except ProcessLookupError:  # already ended
                 continue
-        while any(Path(f"/proc/{pid}").exists() for pid in victims):  # its sockets are closed when its last thread ends
+        while any(Path(f"/proc/{pid}").exists() for pid in victims):  # its sockets close when its last thread ends
             time.sleep(0.005)
         cut = [(killed, time.monotonic())]
         self._note(f"{len(victims)} of {len(there)}")
@@ -368,7 +378,7 @@ class Chaos:
         return Step(self._oracle.start(), is_away=[(began, time.monotonic())])
 
     def _restart_at_once(self) -> Step:
-        """SIGTERM while the service starts, as when a deployment is undone; then a start that lasts."""
+        """Send SIGTERM while the service starts, as when a deployment is undone, then start it for good."""
         began = time.monotonic()
         self._end(signal.SIGTERM)
         started = self._launch()
@@ -386,7 +396,7 @@ class Chaos:
         return Step(self._oracle.start(), is_away=[(began, time.monotonic())])
 
     def _slow(self) -> Step:
-        """Connections that begin and do not go on; they stay open for some steps."""
+        """Open connections that begin a request and then stall; they stay open for some steps."""
         request = _request_head(self._caller.key, len(self._caller.pair.full.body), self._caller.pair.full.content_type)
         beginnings = [
             (self._caller.port, b""),
@@ -403,7 +413,7 @@ class Chaos:
         return self._same(f"{len(self._sockets)} are open")
 
     def _abort(self) -> Step:
-        """Requests that are cut off: their connection is reset, or their call cancelled."""
+        """Cut requests off: reset their connection, or cancel their call."""
         body, content_type = self._caller.pair.full.body, self._caller.pair.full.content_type
         head = _request_head(self._caller.key, len(body), content_type)
         for sent in (head + body[: self._random.randrange(len(body))], head + body):
@@ -432,7 +442,7 @@ class Chaos:
         return self._same()
 
     def _new_keys(self) -> Step:
-        """Other keys in place of all that there were."""
+        """Replace all keys by new ones."""
         old = [*self._valid]
         self._valid = [new_key()]
         self._operator = new_key()
@@ -444,7 +454,7 @@ class Chaos:
         return Step(self._oracle.sighup())
 
     def _more_keys(self) -> Step:
-        """Another key beside those that there are."""
+        """Add a key to the existing ones."""
         self._valid.append(new_key())
         self._write_keys()
         self._signal(signal.SIGHUP)
@@ -453,7 +463,7 @@ class Chaos:
         return Step(self._oracle.sighup())
 
     def _break_keys(self) -> Step:
-        """A file of keys that is none: those that held go on to hold."""
+        """Write an invalid key file: the previous keys stay valid."""
         self._keys_are_broken = True
         self._keys_file.write_text(self._random.choice(["", "robot\n", "robot 12\n", "\0\n"]))
         self._signal(signal.SIGHUP)
@@ -461,7 +471,7 @@ class Chaos:
         return Step(self._oracle.sighup())
 
     def _stream(self) -> Step:
-        """A robot's stream of three frames; each is answered from what serves."""
+        """Send a stream of three frames; the serving version must answer each."""
         frames = [pb.LocalizeStreamRequest(frame=self._caller.pair.full.message)] * 3
         metadata = (("authorization", f"Bearer {self._caller.key}"),)
         began = time.monotonic()
@@ -493,10 +503,10 @@ class Chaos:
         "new keys": _new_keys, "more keys": _more_keys, "broken keys": _break_keys, "stream": _stream,
     }  # fmt: skip
 
-    # What must hold.
+    # Checks.
 
     def _settle(self, expected: Expected) -> tuple[list[Outcome], float]:
-        """Ask until all answer alike and rightly, twice in a row; what came, and when it had."""
+        """Send requests until all answers are alike and correct twice in a row; return the outcomes and the time of settling."""
         probes, alike, until = list[Outcome](), 0, time.monotonic() + SETTLED_S
         while True:
             began = time.monotonic()
@@ -531,7 +541,7 @@ class Chaos:
             self._wrong(f"no answer: {told}; {'; '.join(sorted(others)[:3])}")
 
     def _judge(self, before: str, step: Step, settled_s: float, outcomes: list[Outcome]) -> None:
-        """Count what came during a step, and what of it was wrong."""
+        """Count the outcomes of a step, and record the wrong ones."""
         path, finals = step.expected.path, step.expected.finals
         allowed = {before, *path, *finals}
         order = {version: k for k, version in enumerate(path)}
@@ -555,7 +565,7 @@ class Chaos:
                 self._disagree(f"{each}, though {self._serving} serves")
             elif step.strict_s is not None and each.began_s > step.strict_s and each.version not in finals:
                 self._disagree(f"{each}, though {path[-1]} was chosen")
-        # Once an answer has named a version, none that is asked for later may name one before it.
+        # Once an answer names a version, no later request may get an answer from an earlier version.
         for k in range(1, len(path)):
             ends = [each.ended_s for each in answers if order.get(each.version, len(path)) >= k]
             for each in answers if ends else ():
@@ -568,7 +578,7 @@ class Chaos:
             self._wrong(f"a key that was taken out of the file is not refused: {found}")
 
     def _until_keys_hold(self, old: Iterable[str]) -> None:
-        """Ask until every worker takes the keys that hold and none takes an old one, twice in a row."""
+        """Send requests until every worker accepts the valid keys and refuses the old ones, twice in a row."""
         alike, until = 0, time.monotonic() + SETTLED_S
         while alike < 2:
             asked = [(key, True) for key in self._valid] + [(key, False) for key in old]
@@ -586,7 +596,7 @@ class Chaos:
                 return
 
     def _learn(self) -> None:
-        """The right answers, before anything is done."""
+        """Record the correct answers before the first action."""
         for face in FACES:
             for what in ("full", "retrieval"):
                 found = self._caller.ask(face, what)
@@ -609,7 +619,7 @@ class Chaos:
     def _pids(self) -> set[int]:
         try:
             return descendants(self._running.process.pid)
-        except StreetfixError:  # it has ended
+        except StreetfixError:  # already ended
             return set()
 
     def _settings(self) -> dict[str, object]:
@@ -625,7 +635,7 @@ class Chaos:
         )  # fmt: skip
 
     def _start(self) -> None:
-        """Start, and keep what it logs.
+        """Start the service and keep its log.
 
         Raises:
             RuntimeError: it ended before it was ready, or not all workers answer.
@@ -634,7 +644,7 @@ class Chaos:
             self._shelf.folder, core=None, port=self._caller.port, grpc_port=self._caller.grpc_port,
             log=self._take_line, temporary=self._temporary, **self._settings(),
         )  # fmt: skip
-        # Until each worker has answered once the service starts: what goes wrong then ends it.
+        # Wait for all workers: a failure before each has answered once counts as a failed start and ends the service.
         until = time.monotonic() + SETTLED_S
         while len(_listeners(self._caller.port, self._pids())) < self._workers:
             if time.monotonic() > until:
@@ -647,7 +657,7 @@ class Chaos:
         self.findings.tracebacks += line.startswith("Traceback")
 
     def _start_or_free(self) -> None:
-        """Start; a full disk may prevent it, if the service says so, but not once it is free."""
+        """Start the service; a full disk may prevent it if the service says so, but a free disk may not."""
         try:
             self._start()
         except RuntimeError as error:
@@ -661,10 +671,10 @@ class Chaos:
                 raise _ServiceError(str(again)) from again
 
     def _end(self, number: signal.Signals) -> None:
-        """Tell the service to end, and wait.
+        """Send a signal to end the service, and wait.
 
         Raises:
-            _ServiceError: it did not end, or not well.
+            _ServiceError: it did not end, or ended with an error.
         """
         self._signal(number)
         try:
@@ -685,7 +695,7 @@ class Chaos:
             self._server = None
 
     def _begin_again(self, heard: Callable[[], list[Outcome]]) -> None:
-        """After a finding: the same bundles, a new service."""
+        """Start a new service over the same bundles after a finding."""
         self._kill()
         self._close_sockets()
         self._disk.free(())
@@ -732,12 +742,12 @@ class Chaos:
         findings.append(f"step {self._number}: {told}")
         self._record(f"{kind}, step {self._number}: {told}")
         here = sum(each.startswith(f"step {self._number}: ") for each in findings[-4:])
-        if here <= 3:  # one cause may have hundreds of answers
+        if here <= 3:  # one cause may affect hundreds of answers
             self._tell(f"{kind}, step {self._number}: {told}")
 
 
 class _ServiceError(Exception):
-    """The service did what it must not."""
+    """The service violated its contract."""
 
 
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
@@ -751,14 +761,14 @@ def _request_head(key: str, length: int, content_type: str) -> bytes:
 
 
 def _listeners(port: int, pids: Iterable[int]) -> set[int]:
-    """Those of some processes that listen on a port of 127.0.0.1."""
+    """Return the processes among ``pids`` that listen on a port of 127.0.0.1."""
     rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     sockets = {f"socket:[{row[9]}]" for row in rows if row[1] == f"0100007F:{port:04X}" and row[3] == "0A"}
     found = set()
     for pid in pids:
         try:
             files = {os.readlink(each) for each in Path(f"/proc/{pid}/fd").iterdir()}
-        except OSError:  # it has ended, or closes a file
+        except OSError:  # the process ended, or closed a file meanwhile
             continue
         if files & sockets:
             found.add(pid)

@@ -1,4 +1,4 @@
-"""The folder of bundles that a service watches: versions that come and go, damaged ones, and half-copied ones."""
+"""The folder of bundles that a service watches: complete, damaged and half-copied versions."""
 
 import errno
 import itertools
@@ -16,7 +16,7 @@ from service.maps.manifest import Manifest, read_manifest
 
 @dataclass
 class _Half:
-    """A bundle that is being copied: what it will be, and the files that are missing or incomplete."""
+    """A bundle during its copy: version, manifest, and the files that are missing or incomplete."""
 
     version: Version
     manifest: Manifest
@@ -24,10 +24,10 @@ class _Half:
 
 
 class Shelf:
-    """Bundles in a folder, each a version of the same map: files are hard links of it, the manifest is their own.
+    """Bundles in a folder, each a version of the same map: files are hard links, the manifest differs.
 
     Args:
-        disk: folder; the watched one is ``maps`` in it.
+        disk: folder on the disk; the watched folder is ``maps`` in it.
         bundle: the map.
         random: source of all choices.
     """
@@ -48,7 +48,7 @@ class Shelf:
         self.halves: dict[str, _Half] = {}
 
     def add(self) -> tuple[str, Version]:
-        """A new version, which appears whole; its folder's name and itself.
+        """Add a new version that appears complete; return its folder name and the version.
 
         Raises:
             OSError: the disk is full; nothing has appeared.
@@ -67,21 +67,34 @@ class Shelf:
         return name, version
 
     def stash(self, name: str, version: Version) -> None:
-        """Take a bundle away; it may come back."""
+        """Take a bundle away for now.
+
+        Args:
+            name: name of its folder.
+            version: its version.
+        """
         (self.folder / name).rename(self._stash / name)
         self.stashed[name] = version
 
     def restore(self, name: str) -> Version:
-        """Bring a bundle back."""
+        """Bring a bundle back and return its version.
+
+        Args:
+            name: name of its folder.
+        """
         (self._stash / name).rename(self.folder / name)
         return self.stashed.pop(name)
 
     def delete(self, name: str) -> None:
-        """Take a bundle away for good, file by file."""
+        """Delete a bundle, file by file.
+
+        Args:
+            name: name of its folder.
+        """
         shutil.rmtree(self.folder / name)
 
     def damage(self) -> str:
-        """A bundle that must not serve appears; what is wrong with it."""
+        """Add a bundle that must not serve; return its name and defect."""
         version, manifest = self._next()
         name = f"v{version.number:04}"
         part = self.folder / f".part-{version.number}"
@@ -102,21 +115,21 @@ class Shelf:
         try:
             (part / MANIFEST_FILE).write_bytes(manifest.to_bytes())
             kinds[kind](part)
-        except OSError:  # a full disk damages it as well
+        except OSError:  # a full disk damages the bundle as well
             kind = "what a full disk left of it"
         part.rename(self.folder / name)
         self.damaged.append(name)
         return f"{name}: {kind}"
 
     def clear_damaged(self) -> str:
-        """A damaged bundle goes away."""
+        """Delete a damaged bundle and return its name."""
         name = self.damaged.pop(self._random.randrange(len(self.damaged)))
         path = self.folder / name
         shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
         return name
 
     def begin_copy(self) -> str:
-        """Half of a new version appears under its final name, as if copied in place; what was copied."""
+        """Copy a part of a new version in place, under its final name; return what is missing."""
         version, manifest = self._next()
         name = f"v{version.number:04}"
         files = [path.relative_to(self._base) for path in sorted(self._base.rglob("*")) if path.is_file()]
@@ -133,7 +146,11 @@ class Shelf:
         return f"{name}: {len(half.left)} files are missing or incomplete"
 
     def finish_copy(self, name: str) -> Version | None:
-        """The rest of a copy; None where the disk is full, and it stays what it is."""
+        """Finish a copy; return None, and keep it incomplete, if the disk is full.
+
+        Args:
+            name: name of its folder.
+        """
         half = self.halves[name]
         try:
             while half.left:
@@ -145,7 +162,11 @@ class Shelf:
         return half.version
 
     def drop_copy(self, name: str) -> None:
-        """A half-copied bundle goes away."""
+        """Delete a half-copied bundle.
+
+        Args:
+            name: name of its folder.
+        """
         self.delete(name)
         del self.halves[name]
 
@@ -157,7 +178,7 @@ class Shelf:
         return Version(number, manifest.version), manifest
 
     def _copy_next(self, name: str, half: _Half, *, share: float = 1.0) -> None:
-        """Copy the next file, or go on with it where it was left; a share of it leaves it incomplete."""
+        """Copy the next file, or continue with it; a share below 1 leaves it incomplete."""
         file = half.left[0]
         source, out = self._base / file, self.folder / name / file
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -180,7 +201,7 @@ class Shelf:
         path = self._some_file(bundle)
         content = bytearray(path.read_bytes())
         content[self._random.randrange(len(content))] ^= 1 << self._random.randrange(8)
-        path.unlink()  # a link: the map's own must stay
+        path.unlink()  # the file is a link: keep the original
         path.write_bytes(content)
 
     def _shorten(self, bundle: Path) -> None:

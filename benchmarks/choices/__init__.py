@@ -1,1 +1,1 @@
-"""Design choices, each measured against its alternatives in a watch city -> ``reports/choices.json``."""
+"""Design choices, each measured against its alternatives in a validation city -> ``reports/choices.json``."""

@@ -1,7 +1,8 @@
-"""``make choices``: what each design choice brings, in a city that no training and no bar has seen -> ``reports/choices.json``.
+"""``make choices``: measure each design choice in a validation city -> reports/choices.json.
 
-Encoders are trained alike for a few hundred steps, each with one thing changed: figures compare with each other, not with the
-stock encoder's. Runs are kept under ``--work``; the same command goes on after a stop.
+No training and no bar uses this city. The command trains encoders for a few hundred steps, each with one change.
+Compare their figures
+with each other, not with the stock encoder's. The command keeps runs under ``--work`` and continues after a stop.
 """
 
 import argparse
@@ -24,12 +25,18 @@ from service.localization.hypotheses import ClusterSettings, similarity_weights
 
 STEPS = 1000
 KS = (1, 3, 5, 9, 15, 21)
-#: Views of a place, of the fan's 24.
+#: Views per place, of the 24 that a map has.
 FANS = (24, 12, 8, 4, 2)
 
 
 def encoder_rows(report: Report, city: WatchCity, seen: dict[str, Seen]) -> None:
-    """R@1 and R@10 of every variation."""
+    """Add R@1 and R@10 of every variation.
+
+    Args:
+        report: collects the rows.
+        city: places and queries of the validation city.
+        seen: descriptors by variation.
+    """
     for name, each in seen.items():
         for queries in city.sets:
             preset, likeness = queries.rpartition("_")[2], each.likeness(queries)
@@ -38,7 +45,13 @@ def encoder_rows(report: Report, city: WatchCity, seen: dict[str, Seen]) -> None
 
 
 def fan_rows(report: Report, city: WatchCity, stock: Seen) -> None:
-    """Fewer views a place: from the principal heading by PCA on, or from map x on."""
+    """Add rows for fewer views per place, counted from the principal heading (PCA) or from the map's x axis.
+
+    Args:
+        report: collects the rows.
+        city: places and queries of the validation city.
+        stock: descriptors of the stock encoder.
+    """
     places, headings, size = stock.views.shape
     turns = np.arange(headings)
     for count in FANS:
@@ -55,7 +68,7 @@ def fan_rows(report: Report, city: WatchCity, stock: Seen) -> None:
 
 
 def _nearest_to_fixed(headings_rad: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
-    """(P, headings) the view of each place that is nearest to each of ``count`` headings of the map frame."""
+    """Select, for each place, the view nearest to each of ``count`` headings of the map frame: a mask (P, headings)."""
     wanted = 2 * np.pi * np.arange(count) / count
     away = np.abs(np.angle(np.exp(1j * (headings_rad[:, :, None] - wanted))))
     allowed = np.zeros(headings_rad.shape, bool)
@@ -64,7 +77,13 @@ def _nearest_to_fixed(headings_rad: NDArray[np.float64], count: int) -> NDArray[
 
 
 def neighbour_rows(report: Report, city: WatchCity, stock: Seen) -> None:
-    """Street by the vote of the k most similar places, as the service counts it: weighed by similarity."""
+    """Add street accuracy by the vote of the k most similar places, weighted by similarity as in the service.
+
+    Args:
+        report: collects the rows.
+        city: places and queries of the validation city.
+        stock: descriptors of the stock encoder.
+    """
     place_street, true_street = city.streets()
     for queries in city.sets:
         likeness = stock.likeness(queries)
@@ -84,7 +103,7 @@ def _vote(streets: NDArray[np.int64], likeness: NDArray[np.float32]) -> int:
 
 
 def main() -> None:
-    """Parse, train, ask, write."""
+    """Parse the arguments, train, measure and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "choices")
     parser.add_argument("--steps", type=int, default=STEPS, help="of each training")

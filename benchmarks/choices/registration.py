@@ -1,4 +1,4 @@
-"""What registration brings, and what its weights do, in the watch city."""
+"""Effect of registration, and of its point weights, in the validation city."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,22 +18,30 @@ from service.localization.localizer import Localizer
 from service.registration.kernel import QueryPoints
 from service.registration.points import PointSettings
 
-#: The function of ``refine`` that makes points; its result is changed here.
+#: The function of ``refine`` that makes points. The benchmark patches it to change the result.
 POINTS = "points_from"
 Sureness = Callable[[QueryPoints], QueryPoints]
 
 
 def alike(points: QueryPoints) -> QueryPoints:
-    """Every point as sure as the median one."""
+    """Give every point the median standard deviation.
+
+    Args:
+        points: points of a query.
+    """
     return replace(points, sigma=np.full_like(points.sigma, np.median(points.sigma)))
 
 
 def as_it_is(points: QueryPoints) -> QueryPoints:
-    """Each point as uncertain as its distance makes it."""
+    """Keep the standard deviation of each point, which depends on its range.
+
+    Args:
+        points: points of a query.
+    """
     return points
 
 
-#: How points count: the function that says how sure they are, and the settings.
+#: Variants by row name: a function that sets the standard deviations, and the settings.
 WEIGHTS: dict[str, tuple[Sureness, PointSettings]] = {
     "weighted": (as_it_is, PointSettings()),
     "unweighted": (alike, PointSettings()),
@@ -42,7 +50,13 @@ WEIGHTS: dict[str, tuple[Sureness, PointSettings]] = {
 
 
 def registration_rows(report: Report, runs: Runs, dataset: Dataset) -> None:
-    """Distance errors without registration, with it, and with its weights switched off; every query forced to answer."""
+    """Add distance errors without registration, with it, and without its weights; forced figures.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+        dataset: the validation city.
+    """
     bundle, points_from = runs.bundle(dataset), getattr(refine, POINTS)
     plain = Localizer.open(bundle)
     for name in dataset.query_sets(with_truth=True):

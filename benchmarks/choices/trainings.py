@@ -1,4 +1,4 @@
-"""Encoders that differ from the stock recipe in one thing each, trained alike: short, in half precision, without a second round."""
+"""Encoders that differ from the stock recipe in one thing each: short trainings in half precision, without a second round."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,11 +18,11 @@ CITIES = 26
 
 @dataclass(frozen=True)
 class Variation:
-    """One thing done otherwise.
+    """One change of the recipe.
 
     Attributes:
-        changed: fields of ``TrainingConfig``.
-        cities: trained on.
+        changed: changed fields of ``TrainingConfig``.
+        cities: number of training cities.
     """
 
     changed: dict[str, Any] = field(default_factory=dict)
@@ -30,12 +30,12 @@ class Variation:
 
     @property
     def blind(self) -> tuple[str, ...]:
-        """Planes that queries do without, in training and when they are asked."""
+        """Planes that queries lack, in training and in the measurement."""
         found: tuple[str, ...] = self.changed.get("blind", ())
         return found
 
 
-#: By the name of its rows. Brightness is what colour and a LiDAR's intensity share; the paper's fusion has none of it.
+#: Variations by row name. Colour and LiDAR intensity share only brightness; the paper's fusion does not use it.
 VARIATIONS = {
     "reference": Variation(),
     "planes.ihs": Variation({"blind": ("brightness",)}),
@@ -53,7 +53,14 @@ VARIATIONS = {
 
 
 def trained(name: str, work: Path, steps: int, report: Callable[[str, int, int], None]) -> Path:
-    """The ONNX file of a variation, trained where it is not there yet; a training that was stopped goes on."""
+    """Return the ONNX file of a variation; train it if it is absent, and continue a stopped training.
+
+    Args:
+        name: name of the variation.
+        work: folder for runs and training data.
+        steps: training steps.
+        report: receives name, step and number of steps.
+    """
     variation, run = VARIATIONS[name], work / "runs" / f"{name}-{steps}"
     encoder = run / "encoder.onnx"
     if encoder.exists():
@@ -66,7 +73,7 @@ def trained(name: str, work: Path, steps: int, report: Callable[[str, int, int],
     def show(progress: Progress) -> None:
         report(name, progress.step, progress.steps)
 
-    with one_thread():  # so that two of them may run side by side
+    with one_thread():  # so that two trainings can run side by side
         train(packs, run, config, device="cpu", report=show)
     export(load_run(run), encoder)
     return encoder

@@ -1,4 +1,4 @@
-"""A watch city, looked at by several encoders at once: which places are most like each query."""
+"""The validation city, encoded by several encoders at once: the most similar places of each query."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,25 +23,30 @@ REACH_M = 5.0
 
 
 def watch_plan() -> SimulationPlan:
-    """A city that no training and no bar has seen."""
+    """Plan a city that no training and no bar has seen."""
     drive = QueryPlan(name="drive1", traversal=1, count=500, depths=("precise", "stereo"))
     return SimulationPlan(name="watch", seed=WATCH_SEEDS[1], queries=(drive,))
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What an encoder makes of the city.
+    """Descriptors of the city by one encoder.
 
     Attributes:
-        views: descriptors of the map's views (P, headings, D).
-        queries: of each set's queries, at each turn (Q, T, D).
+        views: descriptors of the map views (P, headings, D).
+        queries: descriptors of each query set, at each turn (Q, T, D).
     """
 
     views: NDArray[np.float32]
     queries: dict[str, NDArray[np.float32]]
 
     def likeness(self, name: str, allowed: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Similarity of each query's best turn to each place's best view (Q, P); of the views that are allowed (P, headings)."""
+        """Compute the similarity (Q, P) of each query's best turn to each place's best view.
+
+        Args:
+            name: name of the query set.
+            allowed: mask (P, headings) of views to use; None uses all.
+        """
         places, headings, size = self.views.shape
         flat = self.views.reshape(-1, size)
         best = np.empty((len(self.queries[name]), places), np.float32)
@@ -52,7 +57,12 @@ class Seen:
 
 
 class WatchCity:
-    """The city's places and queries, cut into views once for all encoders."""
+    """Places and queries of the city, rendered as views once for all encoders.
+
+    Args:
+        dataset: the validation city.
+        grid: view grid.
+    """
 
     def __init__(self, dataset: Dataset, grid: ViewGrid) -> None:
         self.dataset, self.grid = dataset, grid
@@ -63,25 +73,25 @@ class WatchCity:
 
     @cached_property
     def xy(self) -> NDArray[np.float64]:
-        """Of the places (P, 2)."""
+        """Positions of the places (P, 2), metres, map frame."""
         return np.asarray(self.poses[self.kept][:, :2, 3])
 
     @cached_property
     def true_xy(self) -> dict[str, NDArray[np.float64]]:
-        """Of each set's queries (Q, 2)."""
+        """Ground-truth positions of each set's queries (Q, 2), metres, map frame."""
         truths = {name: [frame.T_map_camera for frame in self.dataset.queries(name)] for name in self.sets}
         return {name: np.array([T[:2, 3] for T in each if T is not None]) for name, each in truths.items()}
 
     @cached_property
     def headings_rad(self) -> NDArray[np.float64]:
-        """Of the views (P, headings), map frame; the first is the place's principal heading."""
+        """Headings of the map views (P, headings), radians, map frame; the first is the place's principal heading."""
         turns = fan(self.settings.headings)
         scans = levelled_scans(self.dataset, self.kept, self.settings)
         rows = [heading_of_body(scan.T_map_level(self.poses[scan.number])) + scan.start_rad + turns for scan in scans]
         return np.stack(rows)
 
     def streets(self) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
-        """Number of each place's street, and of each query's by set; -1 for none."""
+        """Return the street index of each place (P,), and of each query (Q,) by set; -1 for none."""
         polygons = Streets.from_geojson(self.dataset.streets() or {"type": "FeatureCollection", "features": []})
 
         def of(xy: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -92,7 +102,12 @@ class WatchCity:
     def seen_by(
         self, encoders: dict[str, tuple[Encoder, tuple[str, ...]]], report: Callable[[str, int, int], None]
     ) -> dict[str, Seen]:
-        """What each encoder makes of the map and of the queries, the latter without the planes that it was trained without."""
+        """Encode the map and the queries by each encoder; leave out the query planes that its training lacked.
+
+        Args:
+            encoders: encoder and its missing planes, by name.
+            report: receives a label, the number done and the total.
+        """
         turns, views = fan(self.settings.headings), {name: list[NDArray[np.float32]]() for name in encoders}
         for k, scan in enumerate(levelled_scans(self.dataset, self.kept, self.settings), 1):
             planes = np.stack([
@@ -120,7 +135,13 @@ class WatchCity:
         }
 
     def right(self, name: str, likeness: NDArray[np.float32], *, first: int = 1) -> NDArray[np.bool_]:
-        """(Q) whether one of the ``first`` most similar places lies within 5 m of the query."""
+        """Return for each query (Q,) whether one of the ``first`` most similar places is within 5 m.
+
+        Args:
+            name: name of the query set.
+            likeness: similarities (Q, P).
+            first: number of places to consider.
+        """
         ranked = np.argsort(-likeness, axis=1, kind="stable")[:, :first]
         away = np.linalg.norm(self.xy[ranked] - self.true_xy[name][:, None], axis=2)
         return np.asarray((away <= REACH_M).any(axis=1))

@@ -1,1 +1,1 @@
-"""The browser console in a real browser: flows, times, size, accessibility."""
+"""The browser console in a real browser: flows, times, size and accessibility."""

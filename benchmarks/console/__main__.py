@@ -1,6 +1,6 @@
-"""``make test-console``: the console in Debian's Chromium -> reports/console.json.
+"""``make test-console``: test the console in Debian's Chromium -> reports/console.json.
 
-Run it on an idle machine: WebGL is drawn by the processor here, which the service works on, too.
+Use an idle machine. The processor draws WebGL here, and the service needs the processor too.
 """
 
 import argparse
@@ -30,7 +30,13 @@ PARTS = ("flows", "size", "axe", "answer", "frames")
 
 
 def axe_rows(report: Report, browser: object, url: str) -> None:
-    """What axe finds serious or critical, on a desk and on a phone, light and dark, before and after an answer."""
+    """Add the number of serious or critical findings of axe: desktop and phone, light and dark, before and after an answer.
+
+    Args:
+        report: collects the rows.
+        browser: browser of Playwright.
+        url: address of the service.
+    """
     if not AXE.exists():
         report.row("console.axe_serious", None, "findings", bar=0, better="lower", why="axe-core is not there: npm ci")
         return
@@ -49,7 +55,7 @@ def axe_rows(report: Report, browser: object, url: str) -> None:
 
 
 def main() -> int:
-    """Measure, and write the report."""
+    """Measure and write the report; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts")
     only = parser.parse_args().only
@@ -70,7 +76,7 @@ def main() -> int:
         for name, rows in in_browser.items():
             if name in only:
                 rows(report, browser, url)
-                report.write()  # what was measured stays, whatever comes after
+                report.write()  # write now: a later failure keeps these rows
     report.write()
     return 0
 

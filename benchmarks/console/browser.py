@@ -1,4 +1,4 @@
-"""Debian's Chromium through Playwright, and the console's page in it."""
+"""Debian's Chromium through Playwright, with the console's page."""
 
 import shutil
 from collections.abc import Iterator
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
 WEB = ROOT / "service" / "console" / "web"
 AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
-#: WebGL in software, and nothing that a browser asks its maker for.
+#: WebGL in software, and no background requests to the browser's vendor.
 FLAGS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 READY_MS, ANSWER_MS = 120_000, 60_000
 DESKTOP, LAPTOP, PHONE = (1440, 900), (1024, 768), (390, 844)
 
 
 def chromium() -> str | None:
-    """Where it is installed."""
+    """Return the path of Chromium, or None."""
     return shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 def why_not() -> str:
-    """Why there is no browser to test in; empty where there is one."""
+    """Return why no browser is available; empty if one is."""
     if chromium() is None:
         return "there is no chromium: apt-get install chromium"
     try:
@@ -37,7 +37,7 @@ def why_not() -> str:
 
 @contextmanager
 def browsing() -> Iterator["Browser"]:
-    """A browser for as long as the block lasts."""
+    """Provide a browser for as long as the block lasts."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -49,7 +49,14 @@ def browsing() -> Iterator["Browser"]:
 
 
 def open_page(browser: "Browser", *, size: tuple[int, int] = DESKTOP, dark: bool = False, **context: Any) -> "Page":
-    """An empty page, of a context of its own; what goes wrong in it is kept in ``page.mishaps``."""
+    """Open an empty page in its own context; keep its errors in ``page.mishaps``.
+
+    Args:
+        browser: browser of Playwright.
+        size: width and height, CSS pixels.
+        dark: whether to request the dark colour scheme.
+        **context: further options of the browser context.
+    """
     page = browser.new_page(
         viewport={"width": size[0], "height": size[1]}, color_scheme="dark" if dark else "light", **context
     )
@@ -63,21 +70,35 @@ def open_page(browser: "Browser", *, size: tuple[int, int] = DESKTOP, dark: bool
 
 
 def open_console(page: "Page", url: str) -> None:
-    """Until the map is drawn."""
+    """Open the console and wait until the map is drawn.
+
+    Args:
+        page: page to use.
+        url: address of the service.
+    """
     page.goto(f"{url}/console/")
     page.wait_for_selector("[data-ready]", timeout=READY_MS)
 
 
 def click_sample(page: "Page", name: str) -> None:
-    """Until its answer stands on the page."""
+    """Click a sample and wait for its answer.
+
+    Args:
+        page: page with the console.
+        name: name of the sample.
+    """
     page.evaluate("document.querySelector('.verdict')?.remove()")
     page.click(f"[data-sample='{name}']")
     page.wait_for_selector(".verdict", timeout=ANSWER_MS)
 
 
 def serious(page: "Page") -> list[str]:
-    """What axe finds serious or critical."""
-    page.evaluate(AXE.read_text())  # a script element of it would be against the page's own policy
+    """Return the serious or critical findings of axe.
+
+    Args:
+        page: page with the console.
+    """
+    page.evaluate(AXE.read_text())  # the page's content security policy forbids a script element
     found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
     return [
         f"{each['id']}: {node['target']} {node['failureSummary']}"
@@ -86,7 +107,11 @@ def serious(page: "Page") -> list[str]:
 
 
 def bundle_kb(static: Path) -> float:
-    """Of all files of the page, compressed, 1000 bytes each."""
+    """Return the compressed size of all files of the page, in kB of 1000 bytes.
+
+    Args:
+        static: folder of the built page.
+    """
     from service.console.page import built_files
 
     return sum(len(file.compressed) for file in built_files(static).values()) / 1000

@@ -1,4 +1,4 @@
-"""Rows of the flows: the browser tests themselves, counted."""
+"""Rows of the flows: results of the browser tests."""
 
 import subprocess
 import sys
@@ -14,7 +14,11 @@ FLOWS = ROOT / "tests" / "console" / "test_flows.py"
 
 
 def flow_rows(report: Report) -> None:
-    """Run the flows; one that was skipped was not passed."""
+    """Run the flows; a skipped flow counts as not passed.
+
+    Args:
+        report: collects the rows.
+    """
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder) / "results.xml"
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={results}", str(FLOWS)]

@@ -1,4 +1,4 @@
-"""The demo's map and its sample pairs, and the real service over them."""
+"""The demo's map and samples, and the real service over them."""
 
 import os
 import re
@@ -21,14 +21,19 @@ DEMO = ROOT / "out" / "demo"
 
 @dataclass(frozen=True, slots=True)
 class Demo:
-    """Where ``streetfix demo`` has put things."""
+    """Output of ``streetfix demo``.
+
+    Attributes:
+        bundle: folder of the map bundle.
+        samples: folder of the sample queries.
+    """
 
     bundle: Path
     samples: Path
 
 
 def demo() -> Demo:
-    """Made once, by the command that users run."""
+    """Return the demo's folders; run the user's command if they are absent."""
     found = Demo(DEMO / "map", DEMO / "samples")
     if not (found.bundle / FILE).exists() or not found.samples.is_dir():
         subprocess.run([*COMMAND, "demo", "--once"], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
@@ -36,27 +41,36 @@ def demo() -> Demo:
 
 
 def other_version(bundle: Path, out: Path) -> str:
-    """The same map under another licence, a day younger: another version, at no cost of disk; its name."""
+    """Write the same map as another version with another licence and a later date, by hard links; return its version.
+
+    Args:
+        bundle: the map bundle.
+        out: folder of the new version.
+    """
     shutil.copytree(bundle, out, copy_function=os.link)
     manifest = read_manifest(bundle)
     changed = manifest.model_copy(
         update={"licence": "CC0-1.0", "made_at": manifest.made_at + timedelta(days=1)}
     ).stamped()
-    (out / FILE).unlink()  # a link to the first one's
+    (out / FILE).unlink()  # a hard link: keep the original
     (out / FILE).write_bytes(changed.to_bytes())
     return changed.version
 
 
 @contextmanager
 def serving(*arguments: str | Path) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
-    """``streetfix serve`` with these arguments: its address and its process."""
+    """Run ``streetfix serve``; yield its address and its process.
+
+    Args:
+        *arguments: further arguments of the command.
+    """
     process = subprocess.Popen(
         [*COMMAND, "serve", *map(str, arguments), "--port", "0"], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
     try:
         yield _address(process), process
     finally:
-        process.send_signal(signal.SIGCONT)  # a stopped one would not hear
+        process.send_signal(signal.SIGCONT)  # a stopped process does not handle SIGTERM
         process.terminate()
         process.communicate(timeout=60)
 

@@ -1,4 +1,4 @@
-"""Rows of time: from the click on a sample to its answer on the screen, and frames of a large cloud."""
+"""Rows of time: from the click on a sample to its answer, and the frame rate of a large cloud."""
 
 import struct
 from pathlib import Path
@@ -13,12 +13,14 @@ from benchmarks.report import ROOT, Report
 CLICKS, MOST_ANSWER_S = 20, 1.5
 SIZE, POINTS, LEAST_RATIO = (1280, 800), 2_000_000, 0.8
 _WARM_MS, _ROUNDS = 3000, 3
-#: Frames counted, unless that takes longer than the milliseconds: in software two million points take seconds a frame.
+#: Number of frames to count, and the time limit in milliseconds. In software, a frame of two million points takes
+#: seconds.
 _FRAMES, _MOST_MS = 30, 30_000
 BARE = ROOT / "tests" / "console" / "bare"
 _HALF_M = 200.0
 
-#: From the click's own time stamp until two frames after the new answer stands in the page: it has been painted then.
+#: Time from the click's time stamp until two frames after the new answer is in the page. The browser has painted it by
+#: then.
 _WATCH = """() => {
   window.timed = {};
   document.addEventListener('click', event => { window.timed = {clicked: event.timeStamp}; }, true);
@@ -29,7 +31,7 @@ _WATCH = """() => {
     requestAnimationFrame(() => requestAnimationFrame(() => { window.timed = {seconds: (performance.now() - clicked) / 1000}; }));
   }).observe(document.body, {subtree: true, childList: true});
 }"""
-#: Moves the map by keys as fast as it draws.
+#: Move the map by keys as fast as it draws.
 _MOVE = """() => {
   const map = document.querySelector('.map-surface');
   let turn = 0;
@@ -40,7 +42,7 @@ _MOVE = """() => {
   move();
 }"""
 
-#: From one drawn frame to another; the first is that of warming up.
+#: Time between drawn frames. The first frame is warm-up.
 _COUNT = """([most, mostMs]) => new Promise(resolve => {
   const began = performance.now();
   let last = null, first = null, changes = 0, changed = 0;
@@ -58,7 +60,13 @@ _COUNT = """([most, mostMs]) => new Promise(resolve => {
 
 
 def answer_rows(report: Report, browser: Any, url: str) -> None:
-    """Click through the samples, the map at rest before each click."""
+    """Add the time from click to answer; the map rests before each click.
+
+    Args:
+        report: collects the rows.
+        browser: browser of Playwright.
+        url: address of the service.
+    """
     page = open_page(browser, size=SIZE)
     open_console(page, url)
     samples = page.eval_on_selector_all("[data-sample]", "cards => cards.map(card => card.dataset.sample)")
@@ -76,7 +84,13 @@ def answer_rows(report: Report, browser: Any, url: str) -> None:
 
 
 def frame_rows(report: Report, browser: Any, url: str) -> None:
-    """The console drawing every point, and what the library draws by itself, by turns; then the console as users have it."""
+    """Add frame rates: the console with every point and the bare library in turns, then the console with its defaults.
+
+    Args:
+        report: collects the rows.
+        browser: browser of Playwright.
+        url: address of the service.
+    """
     cloud = cloud_of(POINTS)
 
     def console(*, every_point: bool) -> float:
@@ -107,7 +121,11 @@ def frame_rows(report: Report, browser: Any, url: str) -> None:
 
 
 def cloud_of(points: int) -> bytes:
-    """A city's worth of points in the cloud's format: blocks of walls on flat ground."""
+    """Make a cloud of the size of a city in the cloud's format: blocks of walls on flat ground.
+
+    Args:
+        points: number of points.
+    """
     rng = np.random.default_rng(0)
     records = np.zeros(points, np.dtype([("xyz", "<u2", (3,)), ("upright", "<u2")]))
     records["xyz"] = rng.integers(0, 65536, (points, 3))
@@ -140,7 +158,7 @@ def _bare_file(url: str) -> Path:
 
 
 def _rate(page: Any, frames: str) -> float:
-    """Frames a second between the first change of their number and the last; the page is closed then."""
+    """Return frames per second between the first and the last counted frame, and close the page."""
     counted, seconds = page.evaluate(_COUNT % frames, [_FRAMES, _MOST_MS])
     page.context.close()
     return float(counted / seconds)

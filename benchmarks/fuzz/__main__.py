@@ -1,7 +1,8 @@
-"""``make fuzz``: a million inputs over all that takes bytes from outside, changed by Atheris with feedback of coverage.
+"""``make fuzz``: fuzz every parser of untrusted input with a million inputs -> reports/serving.json.
 
-Each target runs in a process of its own, so that one that falls takes nothing with it; what made it fall is kept under ``--work``
-and becomes a test.
+Atheris mutates the inputs, guided by coverage. Each target runs in its own process, so a crash stops only that target.
+The command keeps
+the crashing input under ``--work``. Turn each into a test.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from benchmarks.report import ROOT, Report
 
 
 def main() -> None:
-    """Parse, fuzz, write the report."""
+    """Parse the arguments, fuzz and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=1_000_000, help="over all targets")
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "fuzz", help="corpus and crashes")
@@ -66,7 +67,7 @@ def main() -> None:
 
 
 def _bundle(folder: Path) -> Path:
-    """The tests' own small map."""
+    """Write the small map of the tests."""
     from service.maps.writer import write_bundle
 
     spec = spec_from_file_location("tests_conftest", ROOT / "tests" / "conftest.py")
@@ -79,7 +80,7 @@ def _bundle(folder: Path) -> Path:
 
 
 def _fuzz(name: str, bundle: Path, runs: int, work: Path) -> None:
-    """One target, in this process, which Atheris ends."""
+    """Fuzz one target in this process, which Atheris ends."""
     import atheris
 
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"

@@ -1,4 +1,4 @@
-"""Any bytes as the messages of any call, to a real server over a real socket; no call may end in UNKNOWN or INTERNAL."""
+"""Arbitrary bytes as messages of every gRPC call to a real server; no call may end in UNKNOWN or INTERNAL."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,12 +13,12 @@ from service.runtime.engine import Engine
 from service.runtime.settings import Limits, Settings
 
 _REFLECTION = reflection_pb2.DESCRIPTOR.services_by_name["ServerReflection"].full_name
-#: Every call that the server answers; the first byte of an input chooses one.
+#: Every call of the server. The first byte of an input chooses one.
 METHODS = (
     *(f"/{SERVICE}/{name}" for name in pb.DESCRIPTOR.services_by_name["LocalizationService"].methods_by_name),
     f"/{HEALTH}/Check", f"/{HEALTH}/Watch", f"/{_REFLECTION}/ServerReflectionInfo",
 )  # fmt: skip
-#: How a call may end.
+#: Allowed status codes.
 _ANSWERS = {
     grpc.StatusCode.OK, grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE,
     grpc.StatusCode.UNIMPLEMENTED,
@@ -27,7 +27,7 @@ _DEADLINE_S = 60.0
 
 
 class GrpcCalls:
-    """A server of a small map and a client that sends bytes, for as long as this lives.
+    """A server of a small map, and a client that sends bytes.
 
     Args:
         bundle: the map.
@@ -42,10 +42,13 @@ class GrpcCalls:
         self._calls = [channel.stream_stream(method) for method in METHODS]
 
     def take(self, data: bytes) -> None:
-        """Send what follows the first byte as the message of the call that the first byte chooses; of a stream twice.
+        """Send the bytes as the message of a call; a streaming call gets them twice.
+
+        Args:
+            data: the first byte chooses the call, the rest is the message.
 
         Raises:
-            AssertionError: the call ended as no bad request of ours does.
+            AssertionError: the call ended with a status that is not allowed for a bad request.
         """
         if not data:
             return
@@ -95,5 +98,5 @@ def _seeds() -> Iterator[bytes]:
         yield bytes([number]) + (b"" if message is None else message.SerializeToString())
 
 
-#: A good message of each call, behind the call's number.
+#: A valid message of each call, after the call's number.
 SEEDS = tuple(_seeds())

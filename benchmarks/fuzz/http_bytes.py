@@ -1,4 +1,4 @@
-"""What a caller writes on a connection, through the protocol that splits it into requests, with no socket between."""
+"""Arbitrary bytes of a connection, passed to the HTTP protocol handler without a socket."""
 
 import asyncio
 import weakref
@@ -11,7 +11,7 @@ from uvicorn.server import ServerState
 from service.http.protocol import HEAD_BYTES, PIPELINED, BoundedHttp
 
 _BODY = b"a=1&" * 40
-#: Good ones, and two beyond the bounds; the first byte says into how large pieces a connection would have cut the rest.
+#: Valid requests, and two beyond the limits. The first byte gives the size of the pieces that the connection delivers.
 SEEDS = (
     b"\x00GET /livez HTTP/1.1\r\nHost: localhost\r\nAccept: */*\r\n\r\n",
     b"\x09POST /v1/localize?a=%%41 HTTP/1.1\r\nHost: localhost\r\nContent-Length: %d\r\nExpect: 100-continue\r\n\r\n%s"
@@ -22,39 +22,47 @@ SEEDS = (
     b"\xffGET / HTTP/1.1\r\n" + HEAD_BYTES // 64 * (b"X-A: " + 90 * b"a" + b"\r\n"),
     b"\x20GET / HTTP/1.0\r\nConnection: upgrade\r\nUpgrade: websocket\r\n\r\n",
 )  # fmt: skip
-_SETTLED = 40  # turns of the loop that an application which waits for nothing needs by far
+#: Turns of the event loop, far more than an application needs that waits for nothing.
+_SETTLED = 40
 
 
 class Wire(asyncio.Transport):
-    """A connection that keeps what is written on it."""
+    """Connection that keeps the bytes written to it."""
 
     def __init__(self) -> None:
         super().__init__({"peername": ("127.0.0.1", 1), "sockname": ("127.0.0.1", 2)})
         self.written, self.closed = bytearray(), False
 
     def write(self, data: Any) -> None:
-        """Keep it; after the close nothing may come."""
+        """Keep bytes.
+
+        Args:
+            data: bytes that the service writes.
+
+        Raises:
+            AssertionError: the service writes after it closed the connection.
+        """
         if self.closed:
             raise AssertionError("written after the close")
         self.written += data
 
     def close(self) -> None:
-        """By the service."""
+        """Record that the service closed the connection."""
         self.closed = True
 
     def is_closing(self) -> bool:
-        """Has it been closed?"""
+        """Return whether the connection is closed."""
         return self.closed
 
     def pause_reading(self) -> None:
-        """Bytes come all the same: the worst that a caller can do."""
+        """Ignore the request: bytes still arrive, as from the worst caller."""
 
     def resume_reading(self) -> None:
-        """As before."""
+        """Do nothing, since reading never pauses."""
 
 
 class Connections:
-    """Each input is what one caller writes before it hangs up."""
+    """Event loop that treats each input as all bytes of one caller before it hangs up."""
 
     def __init__(self) -> None:
         self._wrong = wrong = list[dict[str, Any]]()
@@ -67,10 +75,14 @@ class Connections:
         self._config.load()
 
     def take(self, data: bytes) -> None:
-        """One connection.
+        """Run one connection.
+
+        Args:
+            data: the first byte is the size of the pieces, the rest is sent.
 
         Raises:
-            AssertionError: an answer is no HTTP, more is held than the bounds allow, or something of it outlives the caller.
+            AssertionError: an answer is not HTTP, the service holds more than the limits allow, or work continues after
+                the caller has gone.
         """
         if data:
             self._loop.run_until_complete(self._connection(data[0], data[1:]))
@@ -99,7 +111,7 @@ class Connections:
 
 
 def _answering(protocol: BoundedHttp) -> bool:
-    """Has all of a request come, and its answer not gone?"""
+    """Return whether a request is complete and its answer is not."""
     cycle = protocol.cycle
     return bool(cycle is not None and not cycle.more_body and not cycle.response_complete)
 
@@ -112,7 +124,7 @@ async def _until(settled: Any) -> None:
 
 
 class _Codes:
-    """What httptools tells of answers."""
+    """Status codes that httptools parses."""
 
     def __init__(self) -> None:
         self.parser: Any = None
@@ -123,7 +135,7 @@ class _Codes:
 
 
 def _require_answers(written: bytes) -> None:
-    """What the service wrote is HTTP, and every answer one that it gives."""
+    """Require that the service wrote HTTP with expected status codes only."""
     found = _Codes()
     found.parser = httptools.HttpResponseParser(found)
     if written:
@@ -133,7 +145,7 @@ def _require_answers(written: bytes) -> None:
 
 
 async def _length_of_body(scope: Any, receive: Any, send: Any) -> None:
-    """An application that reads all that comes."""
+    """An application that reads the whole body and returns its length."""
     length, message = 0, cast("dict[str, Any]", {"more_body": True})
     while message.get("more_body"):
         message = await receive()

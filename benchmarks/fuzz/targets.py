@@ -1,4 +1,4 @@
-"""What is handed bytes from outside: each target takes any bytes, and only our own errors may come of them."""
+"""Parsers of untrusted input: each target takes any bytes and may raise only the project's own errors."""
 
 import contextlib
 import hashlib
@@ -44,12 +44,12 @@ _DOCUMENT = {
 
 @dataclass(frozen=True)
 class Target:
-    """One.
+    """One fuzz target.
 
     Attributes:
-        take: what is done with the bytes; it raises what is no error of ours.
-        seeds: good bytes, which the fuzzer changes.
-        share: of all inputs; what is slow gets fewer.
+        take: handles the bytes; an unexpected exception is a finding.
+        seeds: valid inputs that the fuzzer mutates.
+        share: share of all inputs; slow targets get fewer.
     """
 
     take: Callable[[bytes], object]
@@ -58,10 +58,10 @@ class Target:
 
 
 def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
-    """All of them.
+    """Return all targets by name.
 
     Args:
-        bundle: a small map that opens.
+        bundle: a small valid map.
         scratch: folder for damaged copies of it.
     """
     rng = np.random.default_rng(0)
@@ -95,7 +95,12 @@ def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
 
 
 def survives(take: Callable[[bytes], object], data: bytes) -> None:
-    """Do it; our own errors are answers."""
+    """Run a target on an input; the project's own errors are allowed.
+
+    Args:
+        take: function of the target.
+        data: the input.
+    """
     with contextlib.suppress(StreetfixError):
         take(data)
 
@@ -121,7 +126,7 @@ def _oscp(data: bytes) -> None:
 
 
 def _depth(data: bytes) -> None:
-    """The first byte says how it is to be read."""
+    """Decode a depth image; the first byte chooses the format."""
     if not data:
         return
     how, data = data[0], data[1:]
@@ -167,7 +172,7 @@ def _rows_of(depth: np.ndarray) -> bytes:
 
 
 def _png_rows(data: bytes) -> None:
-    """Rows behind right checksums, where changed files do not come."""
+    """Decode PNG rows with correct checksums, which random mutation does not reach."""
     if len(data) < 2:
         return
 
@@ -192,7 +197,7 @@ def _oscp_seed() -> bytes:
 
 
 def _bundle_of(bundle: Path, scratch: Path) -> Callable[[bytes], None]:
-    """Changes one file of a bundle, as a forger would who makes the manifest agree; what opens must answer, or refuse."""
+    """Change one file of a bundle and make the manifest agree, as a forger would; what opens must answer or refuse."""
     files = sorted(path.relative_to(bundle) for path in bundle.rglob("*") if path.is_file())
     pristine = {name: (bundle / name).read_bytes() for name in files}
     own = scratch / "bundle"
@@ -219,7 +224,7 @@ def _bundle_of(bundle: Path, scratch: Path) -> Callable[[bytes], None]:
 
 
 def _agree(own: Path, name: Path, content: bytes) -> None:
-    """Make the manifest say what the file is now."""
+    """Write the file's new hash and size into the manifest."""
     manifest = read_manifest(own)
     document = manifest.model_dump(mode="json")
     document["files"][name.as_posix()] = {"sha256": hashlib.sha256(content).hexdigest(), "size": len(content)}
@@ -227,7 +232,7 @@ def _agree(own: Path, name: Path, content: bytes) -> None:
 
 
 def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
-    """Any intrinsics, gravity and depth that pass the edge."""
+    """Localize with arbitrary intrinsics, gravity and depth that pass validation."""
     localizer = Localizer.open(MapBundle.open(bundle))
     good = _tiny_query()
 

@@ -1,1 +1,1 @@
-"""How readable the code and the documents are: ``make house`` writes ``reports/house.json``."""
+"""Readability of code and documents: ``make house`` writes ``reports/house.json``."""

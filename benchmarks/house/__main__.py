@@ -1,4 +1,4 @@
-"""``make house``: rows on readability -> ``reports/house.json``."""
+"""``make house``: measure the readability of code and documents -> ``reports/house.json``."""
 
 import argparse
 import json
@@ -22,7 +22,7 @@ MOST_LINES, LONGEST_LINE, EASE = 120, 200, 55.0
 
 
 def main() -> None:
-    """Measure the parts that are wanted; rows of the others stay."""
+    """Measure the chosen parts; rows of the others stay."""
     parts: dict[str, Callable[[Report], None]] = {
         "documents": _document_rows, "docstrings": _docstring_rows, "request": _request_rows, "blocks": _block_rows
     }  # fmt: skip
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def _document_rows(report: Report) -> None:
-    """Length of README, the longest line of the documents, and reading ease of documents and docstrings."""
+    """Add length of README, longest line of the documents, and reading ease."""
     documents = [page.read_text() for page in pages()]
     report.row("readme.lines", len(documents[0].splitlines()), "lines", bar=MOST_LINES, better="lower")
     longest = max(len(line) for text in documents for line in text.splitlines())
@@ -51,14 +51,14 @@ def _document_rows(report: Report) -> None:
 
 
 def _block_rows(report: Report) -> None:
-    """Share of the code blocks in README and docs that run."""
+    """Add the share of code blocks in README and docs that run."""
     ran, total = code_blocks_run()
     why = None if ran == total else f"{total - ran} of {total} failed"
     report.row("docs.code_blocks_run", ran / total, "share", bar=1.0, n=total, why=why)
 
 
 def _reading_rows(report: Report, documents: list[str]) -> None:
-    """Flesch reading ease of the documents, of the docstrings, and of both together."""
+    """Add the Flesch reading ease of documents, of docstrings, and of both together."""
     of_documents = "\n".join(prose_of_markdown(text) for text in documents)
     of_docstrings = "\n".join(docstrings())
     report.row("docs.reading_ease.documents", reading_ease(of_documents), "points")
@@ -67,7 +67,7 @@ def _reading_rows(report: Report, documents: list[str]) -> None:
 
 
 def _docstring_rows(report: Report) -> None:
-    """Public docstrings that say arguments, shapes and errors, and the length of the localizer."""
+    """Add the share of complete public docstrings, the length of the localizer, and the client's dependencies."""
     found, count = all_lacking()
     for each in found:
         print(f"  {each.name}: {each.what}")
@@ -79,7 +79,7 @@ def _docstring_rows(report: Report) -> None:
 
 
 def _request_rows(report: Report) -> None:
-    """Files that one request to a small simulated map passes through."""
+    """Add the files that one request to a small simulated map passes through."""
     with tempfile.TemporaryDirectory(prefix="house-") as folder:
         data, bundle = Path(folder, "data"), Path(folder, "map")
         plan = SimulationPlan(

@@ -36,8 +36,8 @@ from service.registration.kernel import (
 from service.registration.points import PointSettings, blocks_of, inverse_depth_noise, points_of
 from service.registration.rays import RayPicture, RaySettings, adjust
 from service.registration.register import Registered
-from service.registration.sight import Sights
 from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.visibility import SurfelRaycaster
 
 Floats = NDArray[np.float64]
 
@@ -195,7 +195,7 @@ def _rays(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -
     height, width = min(height, 96), min(width, 128)
     camera = camera_of(rng, height, width)
     settings = RaySettings(fewest=1, patch=int(rng.choice([1, 6, 16])))
-    sights = Sights(cloud, settings)
+    sights = SurfelRaycaster(cloud, settings)
     R, t = rotation_z(rng.uniform(-np.pi, np.pi)), np.r_[rng.uniform(-20, 20), rng.uniform(-5, 5), 1.5]
     T_level_camera = transform_from(R_BODY_OPTICAL, np.zeros(3))
     met = sights.meet(transform_from(R, t) @ T_level_camera, camera)

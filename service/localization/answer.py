@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from service.errors import NotFiniteError
 from service.geometry.rigid import Transform
 from service.localization.hypotheses import Hypothesis
-from service.localization.judge import Candidate
 from service.localization.reasons import Reason
+from service.localization.scoring import Candidate
 from service.localization.search import Neighbour
 from service.localization.spread import Spread
 from service.localization.street_vote import StreetVote

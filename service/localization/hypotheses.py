@@ -103,7 +103,7 @@ def cluster(matches: ViewMatches, settings: ClusterSettings) -> tuple[Hypothesis
     return tuple(sorted(found, key=lambda hypothesis: -hypothesis.weight))
 
 
-def believed(hypotheses: tuple[Hypothesis, ...], prior: Prior | None) -> tuple[Hypothesis, ...]:
+def rerank_with_prior(hypotheses: tuple[Hypothesis, ...], prior: Prior | None) -> tuple[Hypothesis, ...]:
     """Sort clusters by the log of their weight plus the log weight of the prior, the largest sum first.
 
     Args:

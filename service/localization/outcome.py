@@ -10,11 +10,11 @@ from service.errors import RequestError
 from service.geometry.rigid import heading_of_camera
 from service.localization.answer import Status
 from service.localization.decide import decide
-from service.localization.judge import Candidate
 from service.localization.query import Query
 from service.localization.reasons import Reason, reasons_of
 from service.localization.refine import Refined
 from service.localization.rivals import distinct_candidates, shares_of
+from service.localization.scoring import Candidate
 from service.localization.spread import Extent, Spread, spread_of
 from service.maps.calibration import Calibration
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.localization.judge import SupportWeights
+from service.localization.scoring import SupportWeights
 from service.maps.calibration import FEATURES, Calibration
 
 #: A confidence feature is out of range if it is more than this many standard deviations from the mean of the calibration data.

@@ -9,23 +9,23 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import heading_of_camera, transform_from
 from service.localization.frames import Frame
-from service.localization.judge import Candidate, Judge, NearWeights, SupportWeights
 from service.localization.prior import Prior
 from service.localization.rivals import distinct_candidates
+from service.localization.scoring import Candidate, LocalScoreWeights, PoseScorer, SupportWeights
 from service.localization.similar import similarities_at
 from service.localization.starts import Likeness, StartSettings, level_from, starts_from
 from service.maps.reader import MapBundle
-from service.registration.around import AroundSettings, poses_around
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
 from service.registration.kernel import QueryPoints
+from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.photometry import PhotometrySettings
 from service.registration.points import DepthBlocks, PointSettings, blocks_of, movable_of, points_from
 from service.registration.rays import RayPicture, RaySettings, adjust, picture_of
 from service.registration.register import RegistrationSettings, register
-from service.registration.rendered import seen_by
-from service.registration.scatter import disagreement, scatter_of
-from service.registration.sight import Sights
+from service.registration.rendered import project_points
+from service.registration.scatter import disagreement, score_outer_product
 from service.registration.surfel_map import SurfelMap
+from service.registration.visibility import SurfelRaycaster
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,8 +51,8 @@ class RefineSettings:
     starts: StartSettings = field(default_factory=StartSettings)
     points: PointSettings = field(default_factory=PointSettings)
     registration: RegistrationSettings = field(default_factory=RegistrationSettings)
-    around: AroundSettings = field(default_factory=AroundSettings)
-    near: NearWeights = field(default_factory=NearWeights)
+    around: LocalSearchSettings = field(default_factory=LocalSearchSettings)
+    near: LocalScoreWeights = field(default_factory=LocalScoreWeights)
     rays: RaySettings = field(default_factory=RaySettings)
     photometry: PhotometrySettings = field(default_factory=PhotometrySettings)
 
@@ -135,7 +135,8 @@ def refine(
     each = [_points(frame, own, settings) for frame, own in zip(frames, blocks, strict=True)]
     merged = each[0] if len(each) == 1 else _merged(frames, each)
     seen = [
-        seen_by(points, frame.query.camera, frame.R_level_camera) for frame, points in zip(frames, each, strict=True)
+        project_points(points, frame.query.camera, frame.R_level_camera)
+        for frame, points in zip(frames, each, strict=True)
     ]
     if len(merged) < settings.fewest_points:
         return None
@@ -145,22 +146,22 @@ def refine(
     )  # fmt: skip
     found = register(cloud, merged, starts, reference.views.height_m, settings.registration)
     pictures = _pictures(frames, blocks, settings)
-    sights = Sights(cloud, settings.rays)
-    judge = Judge(
+    sights = SurfelRaycaster(cloud, settings.rays)
+    scorer = PoseScorer(
         bundle, sights, frames, seen, blocks, pictures, prior, settings.support, settings.near, settings.photometry
     )
-    candidates = judge.with_brightness(judge.candidates(found))
+    candidates = scorer.with_brightness(scorer.candidates(found))
     noise = float(np.median([frame.noise for frame in frames]))
     independent = float(np.median([frame.independent_noise for frame in frames]))
     if cloud.brightness is not None and independent >= settings.around.from_noise:
-        near = poses_around(
+        near = search_locally(
             cloud, merged, candidates[0].registered, reference.views.height_m, settings.registration, settings.around
         )
-        candidates[0] = judge.best_near(candidates[0], near)
+        candidates[0] = scorer.select_local_optimum(candidates[0], near)
     best = candidates[0].registered
     adjusted = adjust(sights, pictures, best, settings.rays)
     if adjusted is None:
-        scatter, model = scatter_of(cloud, merged, best, settings.registration), OF_POINTS
+        scatter, model = score_outer_product(cloud, merged, best, settings.registration), OF_POINTS
     else:
         (best, scatter), model = adjusted, OF_RAYS
         T_map_camera = transform_from(best.R_map_level @ reference.R_level_camera, best.camera_m)
@@ -171,7 +172,7 @@ def refine(
 
     def covariance_at(candidate: Candidate) -> Float64[NDArray[np.float64], "6 6"]:
         pose = candidate.registered
-        pulled = scatter_of(cloud, merged, pose, settings.registration)
+        pulled = score_outer_product(cloud, merged, pose, settings.registration)
         return covariance_of(pose.information, pulled, noise, heading_of_camera(candidate.T_map_camera), OF_POINTS)
 
     return Refined(tuple(candidates), covariance, len(merged), disagreement(best.information, scatter), covariance_at)

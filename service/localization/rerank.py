@@ -6,7 +6,7 @@ Hausler et al., Patch-NetVLAD, CVPR 2021; Vidanapathirana et al., Spectral Geome
 
 import numpy as np
 
-from service.localization.judge import Candidate
+from service.localization.scoring import Candidate
 from service.localization.search import Neighbour
 
 #: Largest distance at which a registered pose verifies a place.

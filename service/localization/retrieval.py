@@ -10,7 +10,7 @@ from service.imaging.query_view import query_views
 from service.imaging.view_grid import ViewGrid
 from service.localization.encoder import Encoder
 from service.localization.frames import Frame
-from service.localization.hypotheses import ClusterSettings, Hypothesis, believed, cluster
+from service.localization.hypotheses import ClusterSettings, Hypothesis, cluster, rerank_with_prior
 from service.localization.query import Query
 from service.localization.search import Neighbour, distinct_places, search_views
 from service.localization.street_vote import StreetVote, vote
@@ -84,7 +84,7 @@ def retrieve(bundle: MapBundle, frame: Frame, clusters: ClusterSettings) -> Retr
     """
     query = frame.query
     neighbours = distinct_places(frame.matches, places_of(query))
-    hypotheses = believed(cluster(frame.matches, clusters), query.prior)
+    hypotheses = rerank_with_prior(cluster(frame.matches, clusters), query.prior)
     streets = None if bundle.streets is None else vote(neighbours[: query.neighbours], clusters.temperature)
     return Retrieved(neighbours, hypotheses, streets)
 

@@ -63,7 +63,7 @@ def covariance_of(
 
     Args:
         information: of the measurements, without priors. Order: translation (m), rotation (rad), log scale, disparity offset (px).
-        scatter: scatter of the patches' gradients in the same order, as ``scatter_of`` or ``adjust`` returns it.
+        scatter: scatter of the patches' gradients in the same order, as ``score_outer_product`` or ``adjust`` returns it.
         noise: standard deviation of one pixel's inverse depth, 1/m.
         heading_rad: heading of the view in the map frame, rad.
         model: ``OF_POINTS`` or ``OF_RAYS``, as the pose was found.

@@ -66,7 +66,7 @@ def agreement_of_brightness(
 
     Args:
         brightness: LiDAR intensity of each surfel, NaN where unknown.
-        met: index of the surfel in each pixel of the small image, -1 for none, as ``Sights.meet`` returns it.
+        met: index of the surfel in each pixel of the small image, -1 for none, as ``SurfelRaycaster.meet`` returns it.
         grey: logarithmic grey levels, as ``grey_of`` returns them.
         settings: of the score.
     """

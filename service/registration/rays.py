@@ -22,8 +22,8 @@ from service.geometry.rigid import Rotation, Transform, transform_from
 from service.registration.kernel import SURFEL, UNKNOWNS
 from service.registration.points import DepthBlocks
 from service.registration.register import Registered
-from service.registration.sight import LIBRARY, DiscSettings, Sights, View
 from service.registration.surfel_map import SurfelMap
+from service.registration.visibility import LIBRARY, DiscSettings, SurfelRaycaster, View
 
 #: Largest edge of a patch, px. ``rays.c`` has room for this many pixels squared.
 MOST_PATCH = 16
@@ -170,8 +170,10 @@ class _Pull:
     pixels: int
 
 
-def met_by(sights: Sights, pictures: list[RayPicture], found: Registered) -> list[Int32[NDArray[np.int32], "H W"]]:
-    """Cast the rays of all images from a registered pose (``Sights.meet``).
+def met_by(
+    sights: SurfelRaycaster, pictures: list[RayPicture], found: Registered
+) -> list[Int32[NDArray[np.int32], "H W"]]:
+    """Cast the rays of all images from a registered pose (``SurfelRaycaster.meet``).
 
     Args:
         sights: ray casting on the map.
@@ -190,7 +192,7 @@ def _state_of(cloud: SurfelMap, found: Registered) -> _State:
 
 
 def adjust(
-    sights: Sights, pictures: list[RayPicture], found: Registered, settings: RaySettings
+    sights: SurfelRaycaster, pictures: list[RayPicture], found: Registered, settings: RaySettings
 ) -> tuple[Registered, Float64[NDArray[np.float64], "8 8"]] | None:
     """Adjust a registered pose so that the measured inverse depths of all images agree best with the map along their rays.
 
@@ -201,7 +203,8 @@ def adjust(
         settings: of the adjustment.
 
     Returns:
-        The adjusted pose and the scatter of the patches' gradients, as in ``scatter_of``. The pose's ``information`` excludes the priors.
+        The adjusted pose and the scatter of the patches' gradients, as in ``score_outer_product``.
+        The pose's ``information`` excludes the priors.
         None if fewer than ``settings.fewest`` pixels intersect the map.
     """
     cloud, state = sights.cloud, _state_of(sights.cloud, found)
@@ -259,7 +262,7 @@ def _pull(
 def _scattered(pulls: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sum of the outer products of the gradients, joined over 2 x 2 patches because a car that has moved is as wide.
 
-    The factor for few patches is as in ``scatter_of``.
+    The factor for few patches is as in ``score_outer_product``.
     """
     padded = np.pad(pulls, [(0, pulls.shape[0] % 2), (0, pulls.shape[1] % 2), (0, 0)])
     joint = (padded[0::2, 0::2] + padded[1::2, 0::2] + padded[0::2, 1::2] + padded[1::2, 1::2]).reshape(-1, UNKNOWNS)

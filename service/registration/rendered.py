@@ -55,7 +55,7 @@ class Agreement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class ProjectedPoints:
     """Points of a query, projected into the small image that the map is rendered to; the same for every pose.
 
     Attributes:
@@ -78,7 +78,7 @@ class Seen:
         return len(self.z)
 
 
-def seen_by(points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation) -> Seen:
+def project_points(points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation) -> ProjectedPoints:
     """Project the points of a query for ``agreement``.
 
     Args:
@@ -93,10 +93,10 @@ def seen_by(points: QueryPoints, camera: PinholeCamera, R_level_camera: Rotation
     row = np.rint(optical[:, 1] / z * small.fy + small.cy).astype(np.intp).clip(0, small.height - 1)
     pixel = (row * small.width + column).astype(np.int32)
     sigma = (points.sigma * (points.ray @ R_level_camera[:, 2])).astype(np.float64)
-    return Seen(small, R_level_camera, pixel, z.astype(np.float64), sigma, points.q)
+    return ProjectedPoints(small, R_level_camera, pixel, z.astype(np.float64), sigma, points.q)
 
 
-def agreement(cloud: SurfelMap, seen: Seen, candidate: Registered) -> Agreement:
+def agreement(cloud: SurfelMap, seen: ProjectedPoints, candidate: Registered) -> Agreement:
     """Render the map at a candidate's pose and compare the query's depth with it.
 
     Args:

@@ -18,7 +18,7 @@ _TOLD = 1e-4
 _LEAST = 1e-6
 
 
-def scatter_of(
+def score_outer_product(
     cloud: SurfelMap, points: QueryPoints, found: Registered, settings: RegistrationSettings
 ) -> Float64[NDArray[np.float64], "8 8"]:
     """Sum the outer products of the patches' gradients at a registered pose, scaled up for few patches.
@@ -53,7 +53,7 @@ def disagreement(
 
     Args:
         information: information matrix of the pose, without priors.
-        scatter: scatter of the patches' gradients in the same order, as ``scatter_of`` or ``adjust`` returns it.
+        scatter: scatter of the patches' gradients in the same order, as ``score_outer_product`` or ``adjust`` returns it.
     """
     sizes = np.sqrt(np.maximum(np.diag(information), 1e-300))
     strength, axes = np.linalg.eigh(information / np.outer(sizes, sizes))

@@ -17,8 +17,8 @@ from typer.main import get_command
 from benchmarks.docs_blocks import PAGES, Block, blocks_of, commands_of, pages
 from service.cli.main import app_for
 from service.localization.hypotheses import ClusterSettings
-from service.localization.judge import SupportWeights
 from service.localization.query import FALSE_ACCEPT_RATE
+from service.localization.scoring import SupportWeights
 from service.localization.starts import StartSettings
 from service.registration.points import PointSettings
 from service.registration.register import RegistrationSettings

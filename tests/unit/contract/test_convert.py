@@ -10,10 +10,10 @@ from service.contract.convert import answer_from, parsed, query_from
 from service.contract.schema import LocalizeRequest
 from service.errors import RequestError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
-from service.localization.judge import Candidate
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
 from service.localization.query import Query
+from service.localization.scoring import Candidate
 from service.maps.reader import MapBundle
 from service.registration.register import Registered
 from service.registration.rendered import Agreement

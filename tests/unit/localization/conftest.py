@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
-from service.localization.judge import Candidate
+from service.localization.scoring import Candidate
 from service.registration.register import Registered
 from service.registration.rendered import Agreement
 

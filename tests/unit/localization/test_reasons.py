@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from service.localization.judge import SupportWeights
 from service.localization.reasons import FAR, GROUPS, reasons_of, support_of
+from service.localization.scoring import SupportWeights
 from service.maps.calibration import FEATURES, UNWEIGHED
 
 

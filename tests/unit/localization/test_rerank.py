@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from service.localization.judge import Candidate
 from service.localization.rerank import VERIFIED_M, reranked
+from service.localization.scoring import Candidate
 from service.localization.search import Neighbour
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, transform_from
 from service.registration.photometry import PhotometrySettings, agreement_of_brightness, grey_of, squared_correlation
-from service.registration.sight import DiscSettings, Sights
+from service.registration.visibility import DiscSettings, SurfelRaycaster
 
 SETTINGS = PhotometrySettings(patch=2, flat=0.0)
 CAMERA = PinholeCamera(96, 72, 60.0, 60.0, 47.5, 35.5)
@@ -94,7 +94,9 @@ def told(cloud, rgb, T_map_camera):
     T = T_map_camera.copy()
     T[:3, 3] -= cloud.origin_m
     grey = grey_of(rgb, CAMERA, (1.0, 1.0), PATCHES)
-    return agreement_of_brightness(cloud.brightness, Sights(cloud, DiscSettings()).meet(T, CAMERA), grey, PATCHES)
+    return agreement_of_brightness(
+        cloud.brightness, SurfelRaycaster(cloud, DiscSettings()).meet(T, CAMERA), grey, PATCHES
+    )
 
 
 @pytest.mark.parametrize("aside_m", [-3.0, -1.0, -0.5, 0.5, 1.0, 3.0])

@@ -12,8 +12,8 @@ from service.registration import rays
 from service.registration.kernel import SURFEL
 from service.registration.rays import RayPicture, RaySettings
 from service.registration.register import Registered
-from service.registration.sight import Sights
 from service.registration.surfel_map import SurfelMap
+from service.registration.visibility import SurfelRaycaster
 
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
 SETTINGS = RaySettings(radius_m=0.25, fewest=100)
@@ -23,7 +23,7 @@ ORIGIN = np.array([500.0, -300.0, 40.0])
 
 
 def adjust(cloud, pictures, found, of):
-    return rays.adjust(Sights(cloud, of), pictures, found, of)
+    return rays.adjust(SurfelRaycaster(cloud, of), pictures, found, of)
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +64,11 @@ def test_a_faultless_picture_is_put_where_it_was_taken(city, street, pose, away,
     assert (got.hypothesis, got.inliers) == (3, 0.9)
 
 
-def test_what_a_judge_has_looked_up_already_is_not_looked_up_again(city, street, pose, monkeypatch):
+def test_what_a_scorer_has_looked_up_already_is_not_looked_up_again(city, street, pose, monkeypatch):
     pictures, start = [picture_of(street, pose)], found_at(pose, away=(0.1, 0.05, 0))
-    sights, asked, kept = Sights(city, SETTINGS), [], Sights._look_up
+    sights, asked, kept = SurfelRaycaster(city, SETTINGS), [], SurfelRaycaster._look_up
     rays.met_by(sights, pictures, start)
-    monkeypatch.setattr(Sights, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
+    monkeypatch.setattr(SurfelRaycaster, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
     rays.adjust(sights, pictures, start, replace(SETTINGS, rounds=1))
     assert asked == []
 
@@ -86,8 +86,8 @@ def test_what_a_judge_has_looked_up_already_is_not_looked_up_again(city, street,
 def test_rays_are_looked_up_until_the_pose_stands_still(
     city, street, pose, monkeypatch, away, still_m, rounds, looked_up
 ):
-    asked, kept = [], Sights._look_up
-    monkeypatch.setattr(Sights, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
+    asked, kept = [], SurfelRaycaster._look_up
+    monkeypatch.setattr(SurfelRaycaster, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
     s = replace(SETTINGS, rounds=rounds, still_m=still_m, still_rad=1e9)
     adjust(city, [picture_of(street, pose)], found_at(pose, away=(away, 0, 0)), s)
     assert looked_up[0] <= len(asked) <= looked_up[1]
@@ -214,7 +214,7 @@ def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
     picture = replace(picture_of(street, pose, noise=2e-3, seed=seed), movable=movable)
     pictures = [picture] * (2 if again else 1)
     state = rays._State(R, t, float(np.log(scale)), float(offset))
-    met = [Sights(city, s).meet(state.camera_of(picture), CAMERA)] * len(pictures)
+    met = [SurfelRaycaster(city, s).meet(state.camera_of(picture), CAMERA)] * len(pictures)
     got = rays._pull(city, pictures, met, state, s, scattered=True)
     J, r, w, patches = plain(city, picture, met[0], R, t, scale=scale, offset=offset, s=s)
     H, b = J.T @ (J * w[:, None]), J.T @ (w * r)

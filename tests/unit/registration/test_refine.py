@@ -7,17 +7,17 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
 from service.localization import refine as refining
 from service.localization import similar
-from service.localization.judge import Judge, NearWeights, SupportWeights
 from service.localization.prior import Prior
 from service.localization.refine import RefineSettings, refine, settings_for_rig
+from service.localization.scoring import LocalScoreWeights, PoseScorer, SupportWeights
 from service.localization.starts import StartSettings
-from service.registration.around import Near
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of
+from service.registration.local_search import LocalPose
 from service.registration.points import inverse_depth_noise
 from service.registration.rays import RaySettings, adjust
 from service.registration.register import RegistrationSettings
-from service.registration.scatter import scatter_of
-from service.registration.sight import Sights
+from service.registration.scatter import score_outer_product
+from service.registration.visibility import SurfelRaycaster
 
 CAMERA = PinholeCamera(80, 60, 50.0, 50.0, 39.5, 29.5)
 R_LEVEL_CAMERA = rotation_y(np.deg2rad(4.0)) @ R_BODY_OPTICAL
@@ -188,12 +188,12 @@ def judged(cloud, monkeypatch):
     """The cloud with some brightness, and what brightness is then said to say of each pose that is asked about: its y."""
     asked_y_m = []
 
-    def brightness(judge, pose):
-        assert judge.sights.cloud.brightness is not None
+    def brightness(scorer, pose):
+        assert scorer.sights.cloud.brightness is not None
         asked_y_m.append(pose.camera_m[1])
         return float(pose.camera_m[1])
 
-    monkeypatch.setattr(Judge, "brightness", brightness)
+    monkeypatch.setattr(PoseScorer, "brightness", brightness)
     return replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32)), asked_y_m
 
 
@@ -232,7 +232,7 @@ def test_the_picture_tells_two_streets_apart_that_differ_in_paint_alone(bundle_l
     camera = CAMERA.scaled_to(160, 120)
     T = TRUE.copy()
     T[:3, 3] -= lit.origin_m
-    met = Sights(lit, RaySettings()).meet(T, camera)
+    met = SurfelRaycaster(lit, RaySettings()).meet(T, camera)
     grey = np.where(met >= 0, 255 - 200 * lit.brightness[np.maximum(met, 0)], 128).astype(np.uint8)
     frame = replace(frame, query=replace(frame.query, rgb=np.repeat(grey[..., None], 3, axis=2)))
     weights = {"inliers": 1.0, "similarity": 2.0, "likelihood": 0.0}
@@ -247,9 +247,9 @@ def test_a_noisy_pictures_best_pose_is_looked_around_and_moves_to_what_shows_the
     """Points say nothing between poses along a bare street; brightness is said to be best 1.4 m ahead of where registration ends."""
     lit = replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32))
     ahead = TRUE[:3, 3] + 1.4 * np.array([np.cos(np.deg2rad(HEADING_DEG)), np.sin(np.deg2rad(HEADING_DEG)), 0])
-    monkeypatch.setattr(Judge, "brightness", lambda _, pose: -float(np.linalg.norm(pose.camera_m - ahead)))
-    near = [Near(each, 0.5) for each in _shifted(refined(bundle_like(0.4, 0.9), lit, seen_in(depth, here)))]
-    monkeypatch.setattr(refining, "poses_around", lambda *_: near)
+    monkeypatch.setattr(PoseScorer, "brightness", lambda _, pose: -float(np.linalg.norm(pose.camera_m - ahead)))
+    near = [LocalPose(each, 0.5) for each in _shifted(refined(bundle_like(0.4, 0.9), lit, seen_in(depth, here)))]
+    monkeypatch.setattr(refining, "search_locally", lambda *_: near)
     still = RaySettings(fewest=10**6)  # nothing is adjusted
     smooth = replace(
         seen_in(depth, here), noise=5e-3
@@ -260,9 +260,9 @@ def test_a_noisy_pictures_best_pose_is_looked_around_and_moves_to_what_shows_the
         ("noisy", noisy, RefineSettings(rays=still)),
         ("exact", seen_in(depth, here), RefineSettings(rays=still)),
         ("smooth", smooth, RefineSettings(rays=still)),
-        ("sure", noisy, RefineSettings(rays=still, near=NearWeights(stay=1e6))),
+        ("sure", noisy, RefineSettings(rays=still, near=LocalScoreWeights(stay=1e6))),
     ):
-        near[0] = Near(_registered_by(bundle_like(0.4, 0.9), lit, frame), 0.5)
+        near[0] = LocalPose(_registered_by(bundle_like(0.4, 0.9), lit, frame), 0.5)
         found[name] = refine(bundle_like(0.4, 0.9), lit, (frame,), None, settings)
     moved, sure = found["noisy"], found["sure"]
     np.testing.assert_allclose(moved.best.T_map_camera[:3, 3], ahead, atol=0.05)
@@ -364,7 +364,7 @@ def asked(monkeypatch):
 
         monkeypatch.setattr(refining, name, call)
 
-    for name in ("adjust", "scatter_of", "covariance_of"):
+    for name in ("adjust", "score_outer_product", "covariance_of"):
         noted(name)
     return calls
 
@@ -401,13 +401,13 @@ def test_where_rays_meet_too_little_the_pose_and_its_covariance_are_those_of_the
     settings = RefineSettings(rays=RaySettings(fewest=10**6))
     found = refine(bundle, cloud, (seen_in(depth, here),), None, settings)
     best = found.best.registered
-    assert [name for name, _ in asked] == ["adjust", "scatter_of", "covariance_of"]
+    assert [name for name, _ in asked] == ["adjust", "score_outer_product", "covariance_of"]
     of_cloud, points, registered, registration = asked[1][1]
     assert (of_cloud is cloud, registered is best, registration is settings.registration) == (True, True, True)
     assert len(points) == found.points
     information, scatter, _, _, model = asked[2][1]
     np.testing.assert_array_equal(information, best.information)
-    np.testing.assert_array_equal(scatter, scatter_of(cloud, points, best, registration))
+    np.testing.assert_array_equal(scatter, score_outer_product(cloud, points, best, registration))
     assert model is OF_POINTS
 
 

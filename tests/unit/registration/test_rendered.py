@@ -11,7 +11,7 @@ from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotat
 from service.registration import rendered
 from service.registration.kernel import BeamModel, agree
 from service.registration.register import Registered
-from service.registration.rendered import Agreement, agreement, seen_by
+from service.registration.rendered import Agreement, agreement, project_points
 from service.registration.surfel_map import SurfelMap
 
 #: Off the middle, and larger than what is drawn: 4 pixels of it are one of the drawn ones.
@@ -62,7 +62,7 @@ def seeing(points_at):
 
 
 def agreed(cloud, points, pose=AT_ORIGIN, *, R_level_camera=R_BODY_OPTICAL):
-    return agreement(cloud, seen_by(points, CAMERA, R_level_camera), pose)
+    return agreement(cloud, project_points(points, CAMERA, R_level_camera), pose)
 
 
 def shares(found):
@@ -253,7 +253,7 @@ def test_a_camera_that_leans_and_turns_agrees_with_what_it_truly_sees(
 @pytest.mark.parametrize("z_m", [0.7, 20.0])
 def test_a_point_lies_in_the_pixel_of_the_small_picture_that_its_ray_meets(seeing, ray, column, row, z_m):
     """50 px of focal length, the middle at (34.5, 32), whatever the depth."""
-    seen = seen_by(seeing(z_m, [ray]), CAMERA, R_BODY_OPTICAL)
+    seen = project_points(seeing(z_m, [ray]), CAMERA, R_BODY_OPTICAL)
     assert (seen.camera.width, seen.camera.height, seen.camera.cx, seen.camera.cy) == (80, 60, 34.5, 32.0)
     assert seen.pixel.tolist() == [row * 80 + column]
 
@@ -262,7 +262,7 @@ def test_depth_and_deviation_are_told_along_the_cameras_axis_and_the_depth_as_it
     """The ray (3, 0, 4) / 5: of 1 m along it 0.8 m are ahead."""
     leaning = rotation_z(0.4) @ rotation_y(0.3) @ R_BODY_OPTICAL
     points = seeing([8.0, 4.0], [(0.75, 0, 1), (0, 0, 1)], sigma=1.0, R_level_camera=leaning, focal_baseline_px_m=80.0)
-    seen = seen_by(points, CAMERA, leaning)
+    seen = project_points(points, CAMERA, leaning)
     assert seen.z.tolist() == pytest.approx([8.0, 4.0], rel=1e-5)
     assert seen.sigma.tolist() == pytest.approx([0.8, 1.0], rel=1e-5)
     np.testing.assert_array_equal(seen.q, points.q)
@@ -273,7 +273,7 @@ def test_depth_and_deviation_are_told_along_the_cameras_axis_and_the_depth_as_it
 def test_a_query_that_was_prepared_once_serves_every_candidate(wall, seeing):
     """The second pose is no worse served for the first, whose scale and offset are its own."""
     points = seeing([8.0, 9.0, 10.0], [(0, 0, 1), (0.1, 0, 1), (0.2, 0.1, 1)], focal_baseline_px_m=80.0)
-    once = seen_by(points, CAMERA, R_BODY_OPTICAL)
+    once = project_points(points, CAMERA, R_BODY_OPTICAL)
     poses = [AT_ORIGIN, replace(AT_ORIGIN, scale=1.1, offset=-1.2), moved(1.0), moved(0, R=rotation_z(0.3)), AT_ORIGIN]
     found = [agreement(wall, once, pose) for pose in poses]
     assert found == [agreed(wall, points, pose) for pose in poses]

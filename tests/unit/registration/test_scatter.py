@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from service.registration.kernel import align, pulls
 from service.registration.register import Registered, RegistrationSettings
-from service.registration.scatter import PATCH_RAD, disagreement, patches, scatter_of
+from service.registration.scatter import PATCH_RAD, disagreement, patches, score_outer_product
 from service.registration.surfel_map import SurfelMap
 
 ORIGIN = np.array([500.0, -300.0, 40.0])
@@ -109,7 +109,9 @@ def test_scatter_is_the_sum_of_outer_products_of_the_patches_pulls(
     for pull in each:
         expected += np.outer(pull, pull)
     expected *= len(each) / max(len(each) - 8, 1)
-    found = scatter_of(city, points, registered(pose, scale=scale, offset=offset), replace(SETTINGS, fine_weight=0.5))
+    found = score_outer_product(
+        city, points, registered(pose, scale=scale, offset=offset), replace(SETTINGS, fine_weight=0.5)
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
 
 
@@ -117,7 +119,7 @@ def test_scatter_is_the_sum_of_outer_products_of_the_patches_pulls(
 @settings(max_examples=30)
 def test_scatter_is_symmetric_and_nowhere_negative(city, wrong, pose, seed, count, away):
     points = wrong.subset(np.random.default_rng(seed).permutation(len(wrong))[:count])
-    found = scatter_of(city, points, registered(pose, away=away), SETTINGS)
+    found = score_outer_product(city, points, registered(pose, away=away), SETTINGS)
     np.testing.assert_allclose(found, found.T, rtol=1e-12)
     values = np.linalg.eigvalsh(found)
     assert values.min() >= -1e-9 * values.max()
@@ -143,7 +145,7 @@ def test_few_patches_that_eight_unknowns_were_fitted_to_count_for_more(wall, poi
     k = np.arange(count)
     ahead = rays(0.2 * (k % 8) - 0.7, 0.2 * (k // 8) - 0.5)
     points = points_at(ahead * (2.9 / ahead[:, :1]), sigma=0.0)
-    found = scatter_of(wall, points, BEFORE_WALL, replace(PLAIN, fine=replace(PLAIN.fine, surface=0.1)))
+    found = score_outer_product(wall, points, BEFORE_WALL, replace(PLAIN, fine=replace(PLAIN.fine, surface=0.1)))
     assert found[0, 0] == pytest.approx(count * factor * (100 * 0.1) ** 2, rel=1e-3)
 
 
@@ -153,12 +155,12 @@ def test_points_on_their_surfaces_do_not_disagree(scene_of, points_at):
     xy = np.random.default_rng(1).uniform(-5, 5, (100, 2))
     points = points_at(np.c_[xy, np.full(100, -1.5)])
     on, above = (Registered(np.eye(3), ORIGIN + [0, 0, z], 1.0, 0.0, 0.9, np.eye(8), 0) for z in (1.5, 1.6))
-    np.testing.assert_allclose(scatter_of(cloud, points, on, SETTINGS), np.zeros((8, 8)), atol=1e-12)
-    assert scatter_of(cloud, points, above, SETTINGS)[2, 2] > 1
+    np.testing.assert_allclose(score_outer_product(cloud, points, on, SETTINGS), np.zeros((8, 8)), atol=1e-12)
+    assert score_outer_product(cloud, points, above, SETTINGS)[2, 2] > 1
 
 
 def test_without_points_there_is_no_scatter(city, pose, points_at):
-    found = scatter_of(city, points_at(np.zeros((0, 3))), registered(pose), SETTINGS)
+    found = score_outer_product(city, points_at(np.zeros((0, 3))), registered(pose), SETTINGS)
     np.testing.assert_array_equal(found, np.zeros((8, 8)))
 
 
@@ -188,7 +190,7 @@ def mean_scatter(wall, taken, fan):
     def mean(*, patchwise):
         rng = np.random.default_rng(7)
         pictures = [taken(rng, patchwise=patchwise) for _ in range(400)]
-        found = np.mean([scatter_of(wall, each, BEFORE_WALL, PLAIN) for each in pictures], axis=0)
+        found = np.mean([score_outer_product(wall, each, BEFORE_WALL, PLAIN) for each in pictures], axis=0)
         return found * (1 - 8 / (patches(fan).max() + 1))
 
     return mean

@@ -18,7 +18,7 @@ from service.registration.surfel_map import SurfelMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AroundSettings:
+class LocalSearchSettings:
     """Settings of the local search, chosen on a validation city in November 2026.
 
     Attributes:
@@ -44,7 +44,7 @@ class AroundSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Near:
+class LocalPose:
     """A pose that the local search found.
 
     Attributes:
@@ -56,9 +56,9 @@ class Near:
     still: float
 
 
-def poses_around(
-    cloud: SurfelMap, points: QueryPoints, found: Registered, height_m: float, settings: RegistrationSettings, around: AroundSettings
-) -> list[Near]:  # fmt: skip
+def search_locally(
+    cloud: SurfelMap, points: QueryPoints, found: Registered, height_m: float, settings: RegistrationSettings, around: LocalSearchSettings
+) -> list[LocalPose]:  # fmt: skip
     """Return the given pose and the best other poses around it.
 
     Args:
@@ -85,11 +85,13 @@ def poses_around(
     score(cloud, points.subset(np.flatnonzero(points.weight == points.weight.max())), alone, height_m, settings)
     still: Float64[NDArray[np.float64], " n"] = alone["inliers"]
     kept = _distinct(states, still, around)
-    near = [Near(registered_of(states[k], found.hypothesis, cloud.origin_m), float(still[k])) for k in kept]
+    near = [LocalPose(registered_of(states[k], found.hypothesis, cloud.origin_m), float(still[k])) for k in kept]
     return [replace(near[0], pose=found), *near[1:]]
 
 
-def _distinct(states: NDArray[Any], still: Float64[NDArray[np.float64], " n"], around: AroundSettings) -> list[int]:
+def _distinct(
+    states: NDArray[Any], still: Float64[NDArray[np.float64], " n"], around: LocalSearchSettings
+) -> list[int]:
     """Row of the first state, then rows of the others to keep, those with the largest share of static inliers first."""
     heading = np.unwrap(np.arctan2(states["R"][:, 1, 0], states["R"][:, 0, 0]))
     at = np.c_[states["t"], around.arm_m * heading]

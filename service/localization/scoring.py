@@ -13,13 +13,13 @@ from service.localization.prior import Prior
 from service.localization.similar import similarities_at
 from service.localization.starts import level_from
 from service.maps.reader import MapBundle
-from service.registration.around import Near
+from service.registration.local_search import LocalPose
 from service.registration.photometry import PhotometrySettings, agreement_of_brightness, grey_of
 from service.registration.points import DepthBlocks
 from service.registration.rays import RayPicture, met_by
 from service.registration.register import Registered
-from service.registration.rendered import Agreement, Seen, agreement
-from service.registration.sight import Sights
+from service.registration.rendered import Agreement, ProjectedPoints, agreement
+from service.registration.visibility import SurfelRaycaster
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +44,7 @@ class SupportWeights:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NearWeights:
+class LocalScoreWeights:
     """Weights for the choice among poses about a metre apart, in nats per unit of each score.
 
     Fitted by a conditional logit over poses around the answers in a validation city. Such poses resemble the same places, so
@@ -87,7 +87,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class PoseScorer:
     """Scorer of one query: compares its frames with the map at any pose.
 
     Attributes:
@@ -104,14 +104,14 @@ class Judge:
     """
 
     bundle: MapBundle
-    sights: Sights
+    sights: SurfelRaycaster
     frames: tuple[Frame, ...]
-    seen: list[Seen]
+    seen: list[ProjectedPoints]
     blocks: list[DepthBlocks]
     pictures: list[RayPicture]
     prior: Prior | None
     weights: SupportWeights
-    near: NearWeights
+    near: LocalScoreWeights
     photometry: PhotometrySettings
 
     def candidates(self, found: tuple[Registered, ...]) -> list[Candidate]:
@@ -191,7 +191,7 @@ class Judge:
         ]
         return sorted(told, key=lambda candidate: -candidate.support)
 
-    def best_near(self, best: Candidate, near: list[Near]) -> Candidate:
+    def select_local_optimum(self, best: Candidate, near: list[LocalPose]) -> Candidate:
         """Choose the best of several poses near a candidate.
 
         Another pose of the same place inherits the support of the candidate, plus its gain over the candidate if positive.

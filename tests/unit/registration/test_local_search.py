@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from service.geometry.rigid import rotation_z
-from service.registration.around import AroundSettings, poses_around
+from service.registration.local_search import LocalSearchSettings, search_locally
 from service.registration.register import Registered, RegistrationSettings
 
 TRUE_M, TURN = np.array([0.7, -0.4, 1.5]), np.deg2rad(8.0)
-AROUND = AroundSettings()
+AROUND = LocalSearchSettings()
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def points(street):
 
 
 def around_of(city, points, found, **changed):
-    return poses_around(city, points, found, TRUE_M[2], RegistrationSettings(), replace(AROUND, **changed))
+    return search_locally(city, points, found, TRUE_M[2], RegistrationSettings(), replace(AROUND, **changed))
 
 
 def found_at(along=0.0, across=0.0, turn=0.0):
@@ -40,7 +40,7 @@ def test_a_pose_in_another_hollow_has_the_true_one_among_those_around_it(city, p
     settings = RegistrationSettings()
     few = replace(settings, fine=replace(settings.fine, iterations=2))
     start = found_at(**off)
-    near = poses_around(city, points, start, TRUE_M[2], few, AROUND)
+    near = search_locally(city, points, start, TRUE_M[2], few, AROUND)
     assert near[0].pose is start
     assert away(near)[0] > 0.8
     best = max(near, key=lambda each: each.still)

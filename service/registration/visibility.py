@@ -112,7 +112,7 @@ class _Gathered:
         return bool(cosine >= np.cos(NEAR_RAD))
 
 
-class Sights:
+class SurfelRaycaster:
     """Ray casting for one request; each pose of a camera is computed once.
 
     Attributes:

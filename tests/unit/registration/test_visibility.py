@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, transform_from
 from service.registration.kernel import SURFEL
-from service.registration.sight import KEPT, NEAR_M, NEAR_RAD, DiscSettings, Sights
 from service.registration.surfel_map import TILE_M, SurfelMap
+from service.registration.visibility import KEPT, NEAR_M, NEAR_RAD, DiscSettings, SurfelRaycaster
 
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
 ORIGIN = np.array([500.0, -300.0, 40.0])
@@ -39,7 +39,7 @@ def looking_ahead(x=0.0, y=0.0, z=0.0):
 
 
 def meet(cloud, T_map_camera, camera, of=SETTINGS):
-    return Sights(cloud, of).meet(T_map_camera, camera)
+    return SurfelRaycaster(cloud, of).meet(T_map_camera, camera)
 
 
 def test_every_ray_meets_the_surfel_nearest_to_where_it_passes():
@@ -142,7 +142,7 @@ def test_from_near_by_the_same_is_met_as_if_it_had_been_gathered_there(seed, foc
     near = transform_from(
         Rotation.from_rotvec(size * NEAR_RAD * axis).as_matrix() @ T[:3, :3], T[:3, 3] + size * NEAR_M * away
     )
-    sights = Sights(cloud, SETTINGS)
+    sights = SurfelRaycaster(cloud, SETTINGS)
     sights.meet(T, camera)
     np.testing.assert_array_equal(sights.meet(near, camera), meet(cloud, near, camera))
     assert len(sights._gathered) == 1
@@ -155,7 +155,7 @@ def test_from_near_by_the_same_is_met_as_if_it_had_been_gathered_there(seed, foc
 )  # fmt: skip
 def test_from_further_off_and_for_another_camera_it_is_gathered_anew(away_m, turn_rad, other, gathered):
     camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5) if other else CAMERA
-    sights = Sights(cloud_of(wall(10)), SETTINGS)
+    sights = SurfelRaycaster(cloud_of(wall(10)), SETTINGS)
     sights.meet(looking_ahead(), CAMERA)
     turned = Rotation.from_rotvec([0, 0, turn_rad]).as_matrix() @ looking_ahead()[:3, :3]
     assert (sights.meet(transform_from(turned, np.array([0.0, away_m, 0.0])), camera) >= 0).any()
@@ -165,7 +165,7 @@ def test_from_further_off_and_for_another_camera_it_is_gathered_anew(away_m, tur
 def test_of_many_places_the_last_ones_are_kept_and_others_gathered_again():
     """As a long sequence asks of several candidates; what is met stays the same."""
     cloud = cloud_of(wall(10, y=(-60, 60)))
-    sights, places = Sights(cloud, SETTINGS), [looking_ahead(y=3.0 * k) for k in range(-10, 10)]
+    sights, places = SurfelRaycaster(cloud, SETTINGS), [looking_ahead(y=3.0 * k) for k in range(-10, 10)]
     for T in places:
         sights.meet(T, CAMERA)
         assert len(sights._gathered) <= KEPT
@@ -177,8 +177,8 @@ def test_of_many_places_the_last_ones_are_kept_and_others_gathered_again():
 
 
 def test_each_pose_is_looked_up_once(monkeypatch):
-    sights, asked, kept = Sights(cloud_of(wall(10)), SETTINGS), [], Sights._look_up
-    monkeypatch.setattr(Sights, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
+    sights, asked, kept = SurfelRaycaster(cloud_of(wall(10)), SETTINGS), [], SurfelRaycaster._look_up
+    monkeypatch.setattr(SurfelRaycaster, "_look_up", lambda *given: (asked.append(given), kept(*given))[1])
     first = sights.meet(looking_ahead(), CAMERA)
     assert sights.meet(looking_ahead().copy(), CAMERA) is first
     sights.meet(looking_ahead(x=0.1), CAMERA)
@@ -199,7 +199,7 @@ def test_where_nothing_is_mapped_nothing_is_met():
 
 def test_the_corner_of_a_tile_beside_the_picture_is_seen_by_who_turns_towards_it():
     cloud = cloud_of(wall(39.9, y=(40, 41), z=(-1, 1)), wall(20, y=(-1, 1)))
-    sights = Sights(cloud, SETTINGS)
+    sights = SurfelRaycaster(cloud, SETTINGS)
     turned = Rotation.from_rotvec([0, 0, 0.09]).as_matrix() @ looking_ahead()[:3, :3]
     seen = []
     for T in (looking_ahead(x=4.0), transform_from(turned, np.array([4.0, 1.9, 0.0]))):
