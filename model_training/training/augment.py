@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from service.imaging.brightness import FLOOR, LEAST_SPREAD, LIMIT
+from service.imaging.ihs import IHS_FROM_RGB
 from service.imaging.view_grid import PLANES, ViewGrid
 
 #: Focal length times baseline of the simulated stereo camera, pixels times metres.
@@ -85,6 +86,8 @@ class Augmenter:
         self.azimuth = torch.tensor(grid.azimuths_rad.copy(), dtype=torch.float32, device=device)[None, :]
         # z along the optical axis per metre of range, for a level camera.
         self.z_of_range = torch.cos(self.elevation) * torch.cos(self.azimuth)
+        # V1 and V2 of eq. 9, from the service.
+        self.colour_of_rgb = torch.tensor(IHS_FROM_RGB[1:], dtype=torch.float32, device=device)
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self._generator, device=self.device)
@@ -250,8 +253,7 @@ class Augmenter:
         known = (self._uniform(len(rgb)) > self.settings.no_colour).nonzero()[:, 0]
         count = len(known)
         balance = 1 + 0.12 * self._normal(count, 3, 1, 1)
-        r, g, b = ((rgb[known] * balance)[:, k] for k in range(3))
-        planes = torch.stack([(2 * b - r - g) / 6**0.5, (g - r) / 2**0.5], dim=1)
+        planes = torch.einsum("kc,bchw->bkhw", self.colour_of_rgb, rgb[known] * balance)
         planes = (planes + 3.0 * self._normal(*planes.shape)) * torch.exp(0.4 * self._normal(count, 1, 1, 1))
         return torch.zeros(len(rgb), *planes.shape[1:], device=self.device).index_copy(0, known, planes)
 

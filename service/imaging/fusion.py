@@ -43,8 +43,25 @@ def fuse_planes(
     Returns:
         Planes depth_m, V1 (within +-208.2) and V2 (within +-180.3), with the plane as first axis.
     """
-    _, v1, v2 = ihs_linear(rgb)
-    return np.stack([depth_m, v1, v2])
+    return fuse_and_keep(rgb, depth_m)[0]
+
+
+def fuse_and_keep(
+    rgb: Float32[NDArray[np.float32], "*shape 3"], depth_m: Float32[NDArray[np.float32], "*shape"]
+) -> tuple[Float32[NDArray[np.float32], "3 *shape"], Float32[NDArray[np.float32], "*shape"]]:
+    """Fuse colour and depth like ``fuse_planes``, and keep the intensity that the depth replaces.
+
+    The request path calls this: the brightness plane of the encoder is made from the intensity.
+
+    Args:
+        rgb: sRGB in 0..255, e.g. resampled.
+        depth_m: depth or range in metres, 0 where nothing was measured.
+
+    Returns:
+        The planes of ``fuse_planes``, and I (eq. 9) in 0..441.67.
+    """
+    intensity, v1, v2 = ihs_linear(rgb)
+    return np.stack([depth_m, v1, v2]), intensity
 
 
 def picture_of(fused: Fused, max_range_m: float) -> Rgb:

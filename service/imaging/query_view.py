@@ -10,8 +10,8 @@ from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, rotation_z
 from service.imaging.brightness import brightness
+from service.imaging.fusion import fuse_and_keep
 from service.imaging.gather import gather
-from service.imaging.ihs import ihs_linear
 from service.imaging.level import level_camera
 from service.imaging.view_grid import PLANES, Planes, ViewGrid, heights_of
 
@@ -122,9 +122,8 @@ def query_views(
     seen &= rows_seen[:, None]
     ranges *= seen
     colour *= seen[..., None]
-    intensity, v1, v2 = ihs_linear(colour)
-    # Depth replaces the intensity, and the colour stays (``service.imaging.fusion``).
-    wide = np.stack([ranges, v1, v2, heights_of(ranges, level.height_m, grid), seen])
+    fused, intensity = fuse_and_keep(colour, ranges)
+    wide = np.concatenate([fused, np.stack([heights_of(ranges, level.height_m, grid), seen])])
     planes = np.empty((len(turns), len(PLANES), grid.rows, grid.columns), np.float32)
     for view, turn in zip(planes, turns, strict=True):
         cut = slice(aside - turn, aside - turn + grid.columns)

@@ -5,7 +5,8 @@ torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
 from model_training.training.augment import Augmentation, Augmenter, brightness, least_of_nine  # noqa: E402  # after the skip
 from service.imaging.brightness import brightness as of_one_view  # noqa: E402
-from service.imaging.view_grid import PLANES, ViewGrid  # noqa: E402
+from service.imaging.ihs import ihs_linear  # noqa: E402
+from service.imaging.view_grid import PLANES, ViewGrid, heights_of  # noqa: E402
 
 GRID = ViewGrid()
 COUNT = 300
@@ -68,6 +69,18 @@ def test_another_generator_gives_another_batch():
         for s in (5, 6)
     )
     assert float((one - other).abs().max()) > 0.1
+
+
+def test_heights_and_colours_are_those_of_the_service(monkeypatch):
+    monkeypatch.setattr(Augmenter, "_normal", lambda _, *shape: torch.zeros(shape))
+    ranges, rgb, height, seen = clean(count=4)
+    ranges[:, ::3] = 0.0
+    planes = augmenter().query(ranges, rgb, height, seen).numpy()
+    of_service = heights_of(planes[:, 0], 1.5, GRID)
+    np.testing.assert_allclose(planes[:, PLANES.index("height_m")], of_service, atol=1e-4)
+    _, v1, v2 = ihs_linear(np.moveaxis(rgb.numpy(), 1, -1))
+    np.testing.assert_allclose(planes[:, PLANES.index("v1")], v1, atol=1e-3)
+    np.testing.assert_allclose(planes[:, PLANES.index("v2")], v2, atol=1e-3)
 
 
 def test_the_given_views_are_left_as_they_are():
