@@ -1,4 +1,4 @@
-"""Registration on real stereo frames, by the protocol of the data folder's README: 7 frames, 20 disturbed starts each."""
+"""Registration on real stereo frames by the protocol of the data folder's README: 7 frames, 20 disturbed starts each."""
 
 import time
 from pathlib import Path
@@ -23,16 +23,25 @@ from service.registration.visibility import SurfelRaycaster
 
 IN_SIGHT = "not held out: turned starts and the last stage's weights were chosen with these frames in sight"
 STARTS, AWAY_M, TURN_DEG = 20, 2.0, 10.0
-#: Of plain GICP: cells that both clouds are thinned to, and how far depth is taken (the prototype's settings).
+#: Settings of plain GICP, from the prototype: voxel size of both clouds, and the largest depth.
 GICP_CELL_M, GICP_REACH_M = 0.2, 40.0
-#: One radius after the other, which serves it best.
+#: Radii of correspondence, one after the other; this order suits GICP best.
 GICP_RADII_M = (2.0, 0.5)
 FOCAL_BASELINE_PX_M = 721.5 * 0.54
 BARS = {"median_m": (0.08, "lower"), "p95_m": (0.15, "lower"), "within_1_m": (1.0, "higher")}
 
 
 def kitti_registration_rows(report: Report, runs: Runs, data: Path) -> None:
-    """Errors of the pose found; the rows stay, with a reason, where the recordings are not there."""
+    """Add errors of the registered poses; without recordings, each row gives the reason.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+        data: folder with the recording ``kitti_stereo``.
+
+    Raises:
+        RuntimeError: the scans give no surface.
+    """
     kitti = data / "kitti_stereo"
     prefix = "real.kitti_stereo.registration"
     if not kitti.exists():
@@ -61,7 +70,12 @@ def kitti_registration_rows(report: Report, runs: Runs, data: Path) -> None:
 
 
 def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.float64], float]:
-    """Distances (m) between the pose found and the truth, of every start of every frame; processor time (ms) of a picture and a start."""
+    """Return position errors (N,) in metres of every start of every frame, and processor time (ms) of an image and a start.
+
+    Args:
+        cloud: map surfaces.
+        dataset: frames with ground truth.
+    """
     refining = settings_for_rig(RefineSettings(), FOCAL_BASELINE_PX_M)
     found, prepared_s, aligned_s = list[float](), list[float](), list[float]()
     for frame in dataset.queries("frames"):
@@ -96,7 +110,13 @@ def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.
 
 
 def gicp_errors(dataset: Dataset) -> tuple[NDArray[np.float64], float]:
-    """The same of small_gicp: all depth of the picture on the frame's own scan, neither weighted; the scan's tree is not counted."""
+    """Return the same for small_gicp: all depth against the frame's own scan, unweighted, without the time of the scan's tree.
+
+    The errors have shape (N,).
+
+    Args:
+        dataset: frames with ground truth.
+    """
     import small_gicp
 
     poses, found, prepared_s, aligned_s = dataset.survey_poses(), list[float](), list[float](), list[float]()
@@ -132,5 +152,5 @@ def _direction(angle: float) -> np.ndarray:
 
 
 def _upright(R_map_level: np.ndarray) -> np.ndarray:
-    """The heading alone: how a camera leans against the map is not told beforehand."""
+    """Keep the heading only: a query does not reveal the camera's tilt against the map."""
     return rotation_z(float(np.arctan2(R_map_level[1, 0], R_map_level[0, 0])))

@@ -1,8 +1,10 @@
-"""Retrieval on real stereo frames, by the protocol of the data folder's README.
+"""Retrieval on real stereo frames by the protocol of the data folder's README.
 
-Gallery: every heading of the fan of 14 single frames and 10 full scans, and all of them mirrored as further places. Queries:
-7 stereo frames with SGBM depth, straight on and turned by +-6 degrees, each also mirrored: 42, of which 7 are independent.
-Right: its own place (mirrored or not) comes first. All sides are cut to the elevations below +2.5 degrees.
+Gallery: all headings of 14 single frames and 10 full scans, and the mirror image of each as a further place. Queries: 7
+stereo frames
+with SGBM depth, straight and turned by +-6 degrees, each also mirrored. These are 42 queries, of which 7 are
+independent. A query is
+correct if its own place (mirrored or not) comes first. All sides use only elevations below +2.5 degrees.
 """
 
 from dataclasses import dataclass
@@ -27,14 +29,26 @@ HEADINGS = 24
 
 @dataclass(frozen=True)
 class Views:
-    """Planes (n, 5, rows, columns) and the place that each shows; mirrored places have numbers of their own."""
+    """Views and their places.
+
+    Attributes:
+        planes: planes (n, 5, rows, columns).
+        place: number of the place of each view (n,); mirrored places have their own numbers.
+    """
 
     planes: NDArray[np.float32]
     place: NDArray[np.int64]
 
 
 def retrieve(encoder: Encoder, kitti: Path, drive: Path, work: Path) -> dict[str, float]:
-    """R@1, R@5 of the encoder and R@1 of the raw range image's settings over the 42 queries."""
+    """Return R@1 and R@5 of the encoder, and R@1 of the raw range image by setting, over the 42 queries.
+
+    Args:
+        encoder: encoder to measure.
+        kitti: folder of the single stereo frames.
+        drive: folder of the raw traversal with full scans.
+        work: folder for the imported dataset.
+    """
     folder = work / "kitti_sgbm"
     if not folder.exists():
         import_kitti_object(kitti, folder, depth="sgbm")
@@ -70,7 +84,7 @@ def _gallery(dataset: Dataset, drive: Path, grid: ViewGrid, rows: NDArray[np.boo
     full = sorted(drive.glob("*/*/velodyne_points/data/*.bin")) or sorted(drive.glob("**/velodyne_points/data/*.bin"))
     if not full:
         raise FileNotFoundError(f"{drive} holds no velodyne scans")
-    scans += list(levelled_scans(_Scans(full), np.arange(len(full)), settings))  # type: ignore[arg-type]  # only scan() is called
+    scans += list(levelled_scans(_Scans(full), np.arange(len(full)), settings))  # type: ignore[arg-type]  # it only calls scan()
     planes, place = [], []
     for number, scan in enumerate(scans):
         panorama = panorama_from_points(scan.points, grid)
@@ -86,7 +100,7 @@ def _gallery(dataset: Dataset, drive: Path, grid: ViewGrid, rows: NDArray[np.boo
 
 
 class _Scans:
-    """KITTI scans by number, as a dataset gives them."""
+    """KITTI scans by number, with the interface of a dataset."""
 
     def __init__(self, paths: list[Path]) -> None:
         self._paths = paths

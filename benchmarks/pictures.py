@@ -1,4 +1,7 @@
-"""The pictures of README and docs: a simulated street, the map coloured by error, the demo. ``make pictures`` writes ``docs/pictures``."""
+"""``make pictures``: make the images of README and docs -> docs/pictures.
+
+They show a simulated street, the map coloured by error, and the demo.
+"""
 
 import argparse
 import os
@@ -27,10 +30,10 @@ import matplotlib.pyplot as plt
 
 OUT = ROOT / "docs" / "pictures"
 _STREETFIX = (sys.executable, "-P", "-c", "from service.cli.main import main; main()")
-#: As in ``page.css``, by class of error.
+#: Colours by class of error, as in ``page.css``.
 _COLOURS = {"e0": "#1b7f5c", "e1": "#5b9bd5", "e2": "#c77700", "e3": "#c22f2f"}
 _FRAME = 9
-#: What is made first, and the command that makes it.
+#: Prerequisites, and the command that makes each.
 STEPS = {
     "data/small": "simulate --city paper --streets 1,5 --spacing 1.5 --queries 25 --depth precise --depth stereo --out data/small",
     "data/hard": "simulate --city paper --streets 1,5 --spacing 12 --queries 30 --depth precise --depth stereo "
@@ -43,7 +46,7 @@ DEMO = "demo --once --streets 3 --queries 8 --port 0 --out demo"
 
 
 def main() -> None:
-    """Make what is missing in the work folder, then draw."""
+    """Make missing prerequisites in the work folder, then draw."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "pictures")
     work: Path = parser.parse_args().work
@@ -60,7 +63,7 @@ def main() -> None:
     )
     answers, _, _ = _streetfix(DEMO, work).partition(
         "serve this map again"
-    )  # what follows names folders of this machine
+    )  # the text after this mark names folders of this machine
     draw_terminal("make demo", answers, OUT / "demo.png")
 
 
@@ -73,7 +76,13 @@ def _streetfix(command: str, work: Path) -> str:
 
 
 def draw_street(dataset: Dataset, path: Path, *, width: int = 330) -> None:
-    """Colour, depth and the 2.5D picture of one query, side by side."""
+    """Draw colour, depth and the 2.5D image of one query side by side.
+
+    Args:
+        dataset: dataset of the query.
+        path: file to write.
+        width: width of each part, pixels.
+    """
     frame = list(dataset.queries("drive1_precise"))[_FRAME]
     rgb, depth_m = frame.rgb(), frame.depth_m()
     fused = cv2.cvtColor(picture_of(fuse(rgb, depth_m), ViewGrid().max_range_m), cv2.COLOR_RGB2BGR)
@@ -85,7 +94,16 @@ def draw_street(dataset: Dataset, path: Path, *, width: int = 330) -> None:
 
 
 def draw_map(bundle: MapBundle, runs: list[SavedRun], path: Path) -> None:
-    """Walls from above and every query of the runs by how far off its answer is; crosses are farther off than 5 m."""
+    """Draw walls from above, and every query coloured by its error; a cross means more than 5 m.
+
+    Args:
+        bundle: the map.
+        runs: saved evaluations.
+        path: file to write.
+
+    Raises:
+        ValueError: the map has no cloud.
+    """
     p = joined([answers for run in runs for answers in run.predictions.values()])
     errors, xy = position_errors(p), p.T_true[:, :2, 3]
     if bundle.cloud is None:
@@ -93,7 +111,7 @@ def draw_map(bundle: MapBundle, runs: list[SavedRun], path: Path) -> None:
     surfels = bundle.cloud.surfels
     walls = (surfels["xyz"][:, :2] + bundle.cloud.origin_m[:2])[np.abs(surfels["normal"][:, 2]) < 0.5]
     low, high = xy.min(axis=0) - 22, xy.max(axis=0) + 22
-    # North to the left: the street is long, the page is wide.
+    # North points left: the street is long and the page is wide.
     figure = plt.figure(figsize=(10, 10 * (high - low)[0] / (high - low)[1]), dpi=110)
     axes = figure.add_axes((0, 0, 1, 1))
     axes.scatter(-walls[:, 1], walls[:, 0], s=0.12, color="#888888", linewidths=0, rasterized=True)
@@ -116,7 +134,13 @@ def draw_map(bundle: MapBundle, runs: list[SavedRun], path: Path) -> None:
 
 
 def draw_terminal(command: str, printed: str, path: Path) -> None:
-    """What a command prints, as a terminal shows it."""
+    """Draw the output of a command as a terminal shows it.
+
+    Args:
+        command: the command line.
+        printed: its output.
+        path: file to write.
+    """
     lines = [f"$ {command}", *(line.rstrip().replace("\t", " ") for line in printed.strip("\n").splitlines())]
     columns = max(len(line) for line in lines)
     figure = plt.figure(figsize=(columns * 0.077 + 0.4, len(lines) * 0.1435 + 0.4), dpi=110, facecolor="#15191d")
@@ -127,7 +151,7 @@ def draw_terminal(command: str, printed: str, path: Path) -> None:
 
 
 def _few_colours(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Four bits a channel: a drawing needs no more, and its PNG is half as large."""
+    """Reduce an image to four bits per channel: enough for a drawing, and its PNG is half as large."""
     return (picture & 0xF0) | (picture >> 4)
 
 

@@ -1,4 +1,4 @@
-"""What the accuracy report simulates: cities, drives and conditions by seeds that no training and no calibration uses."""
+"""Simulation plans of the accuracy report: cities, traversals and conditions with seeds that no training or calibration uses."""
 
 from model_training.simulation.hard import HARD, hard_query
 from model_training.simulation.plan import QueryPlan, SimulationPlan
@@ -7,18 +7,22 @@ from model_training.training.recipe import EVALUATION_SEEDS
 BOTH = ("precise", "stereo")
 HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
 LARGE_M = (600.0, 400.0)
-REPEATING_DRIVES = 4  # of 120 sequences each, a sixth of which pass a landmark
+REPEATING_DRIVES = 4  # of 120 sequences each; a sixth of them pass a landmark
 
 
 def paper_plan() -> SimulationPlan:
-    """The paper's city: five other drives with Table I's counts, and frames of the survey's own drive."""
+    """Plan the paper's city: five other traversals with Table I's counts, and frames of the survey traversal."""
     drives = tuple(QueryPlan(name=f"drive{k}", traversal=k, per_class=True, depths=BOTH) for k in range(1, 6))
     own = QueryPlan(name="survey_drive", traversal=0, count=500, on_track=True, depths=("precise",))
     return SimulationPlan(name="paper-city", city="paper", seed=0, queries=(*drives, own))
 
 
 def unseen_plan(index: int) -> SimulationPlan:
-    """One of three cities that no encoder was trained on: 1,000 queries together, and as many blocked ones."""
+    """Plan one of three cities that no encoder was trained on: 1,000 queries together, and as many blocked ones.
+
+    Args:
+        index: number of the city, 0 to 2.
+    """
     count = (334, 333, 333)[index]
     queries = (
         QueryPlan(name="drive1", traversal=1, count=count, depths=BOTH),
@@ -28,20 +32,28 @@ def unseen_plan(index: int) -> SimulationPlan:
 
 
 def large_plan(index: int) -> SimulationPlan:
-    """The same queries in cities twice as large, of the same seeds: what the size of a map costs."""
+    """Plan the same queries in a city of twice the size with the same seed, to measure the effect of map size.
+
+    Args:
+        index: number of the city, 0 to 2.
+    """
     plan = unseen_plan(index)
     return plan.model_copy(update={"name": f"large-{index + 1}", "size_m": LARGE_M})
 
 
 def more_plan(index: int) -> SimulationPlan:
-    """2,000 further queries of the three unseen cities together, for registration; their maps are ``unseen_plan``'s."""
+    """Plan 2,000 further queries of the three unseen cities for registration; their maps are those of ``unseen_plan``.
+
+    Args:
+        index: number of the city, 0 to 2.
+    """
     count = (666, 667, 667)[index]
     queries = (QueryPlan(name="drive3", traversal=3, count=count, depths=BOTH),)
     return SimulationPlan(name=f"unseen-{index + 1}-more", seed=EVALUATION_SEEDS[index + 1], queries=queries)
 
 
 def hard_plan() -> SimulationPlan:
-    """The first unseen city under every hard condition, a clear day's drive beside them."""
+    """Plan the first unseen city under every hard condition, and on a clear day."""
     queries = [QueryPlan(name="clear", traversal=10, count=HARD_COUNT)]
     queries += [hard_query(name, traversal=11 + k, count=HARD_COUNT) for k, name in enumerate(HARD)]
     queries.append(
@@ -53,13 +65,13 @@ def hard_plan() -> SimulationPlan:
 
 
 def lidar_16_plan() -> SimulationPlan:
-    """The same city and clear day's drive, surveyed with 16 beams."""
+    """Plan the same city and clear day, with a survey of 16 beams."""
     queries = (QueryPlan(name="clear", traversal=10, count=HARD_COUNT),)
     return SimulationPlan(name="hard-lidar-16", seed=EVALUATION_SEEDS[1], lidar="vlp_16", queries=queries)
 
 
 def repeating_plan() -> SimulationPlan:
-    """A street of blocks that are all alike but for a landmark every few of them; sequences all along it."""
+    """Plan a street of identical blocks with a landmark every few blocks, and sequences along it."""
     queries = tuple(
         QueryPlan(name=f"drive{k}", traversal=k, count=120, sequence=SEQUENCE, step_m=3.0, aside_m=1.5)
         for k in range(1, REPEATING_DRIVES + 1)

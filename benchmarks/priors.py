@@ -1,4 +1,4 @@
-"""What a prior brings where it is right, and what it costs where it is wrong."""
+"""Gain from a correct prior, and loss from a wrong one."""
 
 import numpy as np
 
@@ -15,26 +15,46 @@ STD_M = 5.0
 
 
 def right(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
-    """As far off as it says."""
+    """Make a prior whose error matches its standard deviation.
+
+    Args:
+        T_map_camera: ground-truth pose (4, 4).
+        rng: source of randomness.
+    """
     return Prior(position_m=T_map_camera[:2, 3] + rng.normal(0, STD_M, 2), position_std_m=STD_M)
 
 
 def aside(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
-    """Wrong by 10 to 25 m, two to five times what it says: within the same street, mostly."""
+    """Make a prior wrong by 10 to 25 m, two to five times its standard deviation; mostly within the same street.
+
+    Args:
+        T_map_camera: ground-truth pose (4, 4).
+        rng: source of randomness.
+    """
     towards = rng.uniform(0, 2 * np.pi)
     away = rng.uniform(10, 25) * np.array([np.cos(towards), np.sin(towards)])
     return Prior(position_m=T_map_camera[:2, 3] + away, position_std_m=STD_M)
 
 
 def elsewhere(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
-    """Wrong by 60 to 120 m: of another street."""
+    """Make a prior wrong by 60 to 120 m: in another street.
+
+    Args:
+        T_map_camera: ground-truth pose (4, 4).
+        rng: source of randomness.
+    """
     towards = rng.uniform(0, 2 * np.pi)
     away = rng.uniform(60, 120) * np.array([np.cos(towards), np.sin(towards)])
     return Prior(position_m=T_map_camera[:2, 3] + away, position_std_m=STD_M)
 
 
 def next_block(T_map_camera: Transform, _rng: np.random.Generator) -> Prior:
-    """In the street of repeating blocks the same spot of the next one: nothing but the prior tells them apart."""
+    """Make a prior at the same spot of the next identical block; only the prior distinguishes the blocks.
+
+    Args:
+        T_map_camera: ground-truth pose (4, 4).
+        _rng: unused.
+    """
     return Prior(position_m=T_map_camera[:2, 3] + [BLOCK_M, 0.0], position_std_m=STD_M)
 
 
@@ -42,7 +62,12 @@ PRIORS: dict[str, PriorOf] = {"right": right, "aside": aside, "elsewhere": elsew
 
 
 def prior_rows(report: Report, runs: Runs) -> None:
-    """Accepted and right, accepted and wrong: without a prior, with a right one, with wrong ones."""
+    """Add the shares of correct accepted and of wrong accepted answers: no prior, correct prior, wrong priors.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     dataset = runs.dataset(unseen_plan(0))
     bundle = runs.bundle(dataset)
     for preset in BOTH:

@@ -1,4 +1,4 @@
-"""Where a figure comes from: the run that measured it, and whether the code that it measures has changed since."""
+"""Provenance of a figure: the run that measured it, and whether the measured code has changed since."""
 
 import os
 import platform
@@ -16,16 +16,16 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """What a reader needs to judge a figure, or to measure it again. None: not kept at the time.
+    """Information to interpret a figure or to measure it again. None means that it was not kept.
 
     Attributes:
-        commit: of the code as it was loaded.
+        commit: commit of the loaded code.
         dirty: whether the code differed from that commit.
-        date: when the run began, UTC.
-        before: where ``date`` was not kept, a moment at which the row was already there.
-        machine: processor, cores, Python.
-        command: that makes the row.
-        minutes: how long the whole run took, up to the last time that it wrote.
+        date: start of the run, UTC.
+        before: without ``date``, a time at which the row already existed.
+        machine: processor, cores and Python version.
+        command: command that makes the row.
+        minutes: duration of the run until its last write, minutes.
     """
 
     commit: str
@@ -38,17 +38,22 @@ class Run:
 
     @property
     def key(self) -> str:
-        """Name of the run in a report file; the same however often the run writes."""
+        """Name of the run in a report file, the same for every write of the run."""
         moment = self.date or (f"before {self.before}" if self.before else "undated")
         return f"{moment.removesuffix('+00:00')} {self.commit[:8]}"
 
     def as_json(self) -> dict[str, Any]:
-        """All fields but ``before``, which is there where ``date`` is not."""
+        """Return all fields; ``before`` only if it is set."""
         return {name: value for name, value in asdict(self).items() if name != "before" or value is not None}
 
 
 def add_run(runs: dict[str, dict[str, Any]], run: Run) -> str:
-    """Put a run among others, and give its name there; a later state of the same run replaces the earlier one."""
+    """Add a run to others and return its name; a later state of the same run replaces the earlier one.
+
+    Args:
+        runs: runs by name; changed in place.
+        run: run to add.
+    """
     told, key = run.as_json(), run.key
     same = {name: told[name] for name in ("dirty", "machine", "command")}
     number = 1
@@ -65,13 +70,13 @@ _CORE = (
     "service/maps",
     "service/registration",
     "service/localization",
-    "native",  # how the C code of these is compiled
+    "native",  # build of the C code
     "model_training/stock",
 )
 _DATA = ("model_training/simulation", "model_training/datasets", "model_training/mapping", "model_training/evaluation")
 _ALL = ("streetfix", "service", "model_training", "native")
-#: What rows of each report measure, by the beginning of their ids: the longest that fits counts, "" is for all others. Programs that
-#: measure are left out: a row is as old as what it measures.
+#: Paths that the rows of each report measure, by the beginning of their ids. The longest match counts; "" matches all
+#: other rows. The benchmark programs are left out: a row is as old as the code that it measures.
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {
         "": (*_CORE, *_DATA),
@@ -99,17 +104,28 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def measured_paths(report: str, row_id: str) -> tuple[str, ...]:
-    """The files and folders that a row measures; all code where nothing is said of the report."""
+    """Return the files and folders that a row measures; all code for an unknown report.
+
+    Args:
+        report: name of the report.
+        row_id: id of the row.
+    """
     by_beginning = MEASURED.get(report, {"": _ALL})
     fitting = [beginning for beginning in by_beginning if row_id.startswith(beginning)]
     return by_beginning[max(fitting, key=len)]
 
 
 def mark_stale(report: str, rows: Iterable[dict[str, Any]], runs: Mapping[str, Mapping[str, Any]], head: str) -> None:
-    """Say of each row whether the code that it measures differs between its commit and ``head``.
+    """Mark each row whose measured code differs between its commit and ``head``.
 
-    ``stale`` is true, or "unknown" where Git cannot tell: there is no repository, or it lacks the commit. Rows that are up to date
+    ``stale`` is true, or "unknown" if Git cannot tell: there is no repository, or it lacks the commit. Current rows
     have no such field.
+
+    Args:
+        report: name of the report.
+        rows: rows of the report; changed in place.
+        runs: runs by name.
+        head: commit to compare with.
     """
     for row in rows:
         changed = _changed_files(runs[row["run"]]["commit"], head)
@@ -126,13 +142,17 @@ def _touches(changed: frozenset[str], paths: tuple[str, ...]) -> bool:
 
 @cache
 def _changed_files(commit: str, head: str) -> frozenset[str] | None:
-    """Files that differ between two commits; None where Git cannot tell. Code that was changed and changed back is the same."""
+    """Return files that differ between two commits, None if Git cannot tell; a change that was undone does not count."""
     told = git("diff", "--name-only", "--no-renames", "-z", commit, head) if commit and head else None
     return None if told is None else frozenset(told.split("\0"))
 
 
 def git(*arguments: str) -> str | None:
-    """What Git answers in this repository; None where there is no Git, or it refuses."""
+    """Return Git's output in this repository; None without Git or after an error.
+
+    Args:
+        *arguments: arguments of Git.
+    """
     try:
         done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
     except OSError:
@@ -141,24 +161,24 @@ def git(*arguments: str) -> str | None:
 
 
 def head_commit() -> str:
-    """The commit that is checked out; empty without Git."""
+    """Return the checked-out commit; empty without Git."""
     return git("rev-parse", "HEAD") or ""
 
 
 @cache
 def loaded_commit() -> str:
-    """The commit that was checked out when this was first asked in this process: that of the code that runs, if asked early."""
+    """Return the commit at the first call in this process, which is that of the running code if called early."""
     return head_commit()
 
 
 def is_dirty() -> bool | None:
-    """Whether the code differs from the commit that is checked out; None without Git."""
+    """Return whether the code differs from the checked-out commit; None without Git."""
     told = git("status", "--porcelain", "--", "streetfix", "service", "model_training", "benchmarks", "native")
     return None if told is None else bool(told)
 
 
 def machine() -> str:
-    """Processor, cores, Python: what a reader needs to judge a time."""
+    """Return processor, cores and Python version, which a reader needs to interpret a time."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -175,7 +195,11 @@ def machine() -> str:
 
 @cache
 def this_process(command: str) -> Run:
-    """The run that this process is, as it was when this was first asked: the code as it was loaded, if asked early."""
+    """Return the run of this process at its first call; the code is the loaded one if called early.
+
+    Args:
+        command: command that makes the rows.
+    """
     return Run(
         commit=loaded_commit(), dirty=is_dirty(), date=datetime.now(UTC).isoformat(timespec="seconds"), machine=machine(), command=command
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The raw range image, which learns nothing, in the same cities, drives and conditions: what a figure of ours is worth."""
+"""The raw range image, a method without learning, in the same cities, traversals and conditions, as a reference."""
 
 from collections.abc import Callable, Iterable
 
@@ -10,20 +10,34 @@ from model_training.baselines.raw_range import STRAIGHT
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.simulation.plan import SimulationPlan
 
-#: Query sets of the unseen cities: how their rows are called.
+#: Query sets of the unseen cities: the label of their rows.
 UNSEEN = {"drive1_precise": "precise", "drive1_stereo": "stereo", "blocked25_precise": "precise_blocked_25"}
-TOO_EASY = 0.40  # a city that it solves says nothing
+#: Recall above which a city is too easy to be a useful test.
+TOO_EASY = 0.40
 
 
 def raw_unseen_rows(report: Report, runs: Runs) -> None:
-    """In the unseen cities."""
+    """Add the rows of the unseen cities.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     raw_rows(report, runs, "unseen", unseen_plan, TOO_EASY)
 
 
 def raw_rows(
     report: Report, runs: Runs, cities: str, plan_of: Callable[[int], SimulationPlan], bar: float | None = None
 ) -> None:
-    """In three cities, and of queries seen straight on alone, as a single picture is; the bar is of the precise preset."""
+    """Add the rows of three cities, also for queries without turns, as of a single image.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+        cities: name of the cities in row ids.
+        plan_of: plan of a city by its number.
+        bar: largest recall with the precise preset; None for no bar.
+    """
     for name, label in UNSEEN.items():
         parts = []
         for index in range(3):
@@ -35,7 +49,12 @@ def raw_rows(
 
 
 def raw_paper_rows(report: Report, runs: Runs) -> None:
-    """In the paper's city, another drive and the survey's own."""
+    """Add the rows of the paper's city: another traversal and the survey's own.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     paper = runs.dataset(paper_plan())
     sets = {preset: f"drive1_{preset}" for preset in BOTH} | {"same_drive": "survey_drive_precise"}
     for label, name in sets.items():
@@ -43,13 +62,18 @@ def raw_paper_rows(report: Report, runs: Runs) -> None:
 
 
 def raw_condition_rows(report: Report, runs: Runs) -> None:
-    """Under every hard condition."""
+    """Add the rows of every hard condition.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     for condition, bundle, dataset, name in asked_of(runs):
         _row(report, f"raw.condition.{condition}.recall_at_1_5m", [runs.raw(bundle, dataset, name)])
 
 
 def _row(report: Report, row_id: str, parts: Iterable[dict[str, tuple[int, int]]], bar: float | None = None) -> None:
-    """Its recall at its best setting over all parts."""
+    """Add the recall of the best setting over all parts."""
     each = list(parts)
     totals = {setting: tuple(sum(part[setting][k] for part in each) for k in (0, 1)) for setting in each[0]}
     best = max(totals, key=lambda setting: totals[setting][0])

@@ -1,4 +1,4 @@
-"""``make reports``: every ``reports/*.json`` as one Markdown page with a plot each, and the figures that documents take from them."""
+"""``make reports``: write a Markdown page and plots of every ``reports/*.json``, and update figures in documents."""
 
 import json
 from collections import Counter
@@ -14,7 +14,7 @@ from benchmarks.report import REPORTS, ROOT, write_report
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-#: How the page begins.
+#: Introduction of the page.
 HEAD = """# Reports
 
 `make reports` writes this page from the JSON files beside it. The figures in the tables come from runs; the column *run* names the run
@@ -25,7 +25,7 @@ row's commit; any change of these files counts, a comment too. *Age unknown* mea
 
 
 def main() -> None:
-    """Bring figures in documents up to date; write ``reports/README.md``, ``reports/NAME.png`` and the index of the decisions."""
+    """Update figures in documents; write ``reports/README.md``, ``reports/NAME.png`` and the index of decisions."""
     lines = [HEAD]
     for path in sorted(REPORTS.glob("*.json")):
         write_report(path, json.loads(path.read_text()))
@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def _section(name: str, report: dict[str, Any]) -> list[str]:
-    """One report: its runs, its rows, reasons and pictures."""
+    """Return one report: its runs, rows, reasons and images."""
     rows, notes = report["rows"], report.get("notes", {})
     numbers = {key: number for number, key in enumerate(report["runs"], 1)}
     stale, unknown = (sum(row.get("stale") is state for row in rows) for state in (True, "unknown"))
@@ -86,7 +86,7 @@ def _run_line(number: int, run: dict[str, Any], rows: list[dict[str, Any]]) -> s
 
 
 def _remarks(row: dict[str, Any]) -> list[str]:
-    """What the run says of a row, and why it misses its bar; that only of the value that it was written for."""
+    """Return the run's remark on a row, and the reason for a missed bar if it was written for this value."""
     told = [row["why"]] if "why" in row else []
     reason = row.get("reason")
     if reason is not None and reason.get("outdated"):
@@ -98,7 +98,7 @@ def _remarks(row: dict[str, Any]) -> list[str]:
 
 
 def _conditions(values: dict[str, float | None]) -> list[str]:
-    """Hard conditions as a table, the clear day's figure beside each, and which stage loses most of what is lost."""
+    """Return a table of hard conditions: each figure beside the clear day's, and the stage with the largest loss."""
     head, tail = "full.condition.", ".within_1_m"
     clear = values.get(f"{head}clear{tail}")
     names = [row.removeprefix(head).removesuffix(tail) for row in values if row.startswith(head) and row.endswith(tail)]
@@ -134,7 +134,7 @@ def _told(value: float | None) -> str:
 
 
 def _reliability(name: str, points: list[dict[str, float]]) -> Path:
-    """How often answers of a confidence are right; on the line it is what it says."""
+    """Draw the share of correct answers over confidence; a calibrated confidence lies on the diagonal."""
     figure, axes = plt.subplots(figsize=(4.5, 4.5))
     axes.plot([0, 1], [0, 1], color="#5b6b7b", lw=1, ls="--")
     axes.plot([p["confidence"] for p in points], [p["right"] for p in points], "o", color="#2a7f62", ms=5)
@@ -165,7 +165,7 @@ def _bar(row: dict[str, Any]) -> str:
 
 
 def _accepts(name: str, curves: dict[str, list[list[float]]]) -> Path:
-    """What accepting more costs: strangers of each kind that are accepted, against queries accepted and right."""
+    """Draw out-of-map queries accepted against queries accepted and correct, by kind."""
     presets = sorted({kind.rpartition(".")[2] for kind in curves})
     figure, panels = plt.subplots(1, len(presets), figsize=(4.6 * len(presets), 3.8), sharey=True, squeeze=False)
     for axes, preset in zip(panels[0], presets, strict=True):
@@ -190,7 +190,7 @@ def _accepts(name: str, curves: dict[str, list[list[float]]]) -> Path:
 
 
 def _plot(name: str, rows: list[dict[str, Any]]) -> Path | None:
-    """Shares that have a bar, with their intervals; reports without such get no picture."""
+    """Draw the shares that have a bar, with their intervals; return None without any."""
     shares = [row for row in rows if row["unit"] == "share" and row["value"] is not None and "bar" in row]
     if not shares:
         return None

@@ -22,14 +22,16 @@ REPORTS = ROOT / "reports"
 
 @dataclass
 class Report:
-    """Collects rows; ``write`` replaces the file in one go.
+    """Collects rows; ``write`` replaces the file atomically.
 
     The file holds ``runs`` by name, ``rows`` that each name their ``run``, and ``notes``.
 
     Args:
-        name: of the file.
-        command: that makes it, for people who want to run it again.
-        folder: where it lies.
+        name: name of the file, without suffix.
+        command: command that makes the report again.
+        rows: rows so far.
+        notes: notes by name.
+        folder: folder of the file.
     """
 
     name: str
@@ -39,20 +41,30 @@ class Report:
     folder: Path = field(default_factory=lambda: REPORTS)
     _keep: bool = False
     _began: float = field(default_factory=time.monotonic)
-    # What is measured is the code as it was loaded, not as it is when the report is written.
+    # The commit of the loaded code counts, not that at the time of writing.
     _commit: str = field(default_factory=head_commit)
     _dirty: bool | None = field(default_factory=is_dirty)
     _date: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
-    _made_by: Run | None = None  # rows that are added now; None: this run
-    _runs: dict[str, Run | None] = field(default_factory=dict)  # by row, as ``_made_by`` was
+    _made_by: Run | None = None  # run of rows that are added now; None is this run
+    _runs: dict[str, Run | None] = field(default_factory=dict)  # value of ``_made_by`` by row
 
     def row(
         self, row_id: str, value: float | None, unit: str, *, bar: float | tuple[float, float] | None = None,
         better: Literal["higher", "lower"] = "higher", n: int | None = None, ci95: list[float] | None = None, why: str | None = None,
     ) -> None:  # fmt: skip
-        """Add a row; ``holds`` follows from value and bar; a bar of two numbers is a range.
+        """Add a row; ``holds`` follows from value and bar.
 
-        ``why`` is what the run itself knows of the value; ``benchmarks/why_missed.py`` has what people found out.
+        ``benchmarks/why_missed.py`` holds the reasons that people found later.
+
+        Args:
+            row_id: id of the row.
+            value: the figure; None if absent.
+            unit: unit of the figure.
+            bar: limit of the figure; two numbers are a range; None for no bar.
+            better: whether higher or lower values are better.
+            n: number of samples.
+            ci95: 95 % interval, lower and upper end.
+            why: remark of the run itself.
         """
         entry: dict[str, Any] = {"id": row_id, "value": value, "unit": unit}
         if n is not None:
@@ -75,7 +87,14 @@ class Report:
     def share(
         self, row_id: str, right: NDArray[np.bool_], *, bar: float | None = None, better: Literal["higher", "lower"] = "higher"
     ) -> None:  # fmt: skip
-        """Add a row of a share with its Wilson interval."""
+        """Add a row of a share with its Wilson interval.
+
+        Args:
+            row_id: id of the row.
+            right: outcome of each query (N,).
+            bar: limit of the share; None for no bar.
+            better: whether higher or lower values are better.
+        """
         if not len(right):
             self.row(row_id, None, "share", bar=bar, better=better, why="no query of this kind")
             return
@@ -84,7 +103,11 @@ class Report:
 
     @contextmanager
     def made_by(self, run: Run) -> Iterator[None]:
-        """Rows that are added inside were measured by another run, whose results were kept."""
+        """Attribute the rows added inside to another run, whose results were kept.
+
+        Args:
+            run: the run that measured the rows.
+        """
         self._made_by = run
         try:
             yield
@@ -92,15 +115,15 @@ class Report:
             self._made_by = None
 
     def keep_others(self) -> None:
-        """Keep the rows of earlier runs, each with the run that measured it; this run's replace them.
+        """Keep the rows and runs of an existing file; this run's rows replace rows of the same id.
 
-        What is kept is read when the report is written, so that two parts may be measured at once. Notes are kept as well; one
-        that is None here is dropped.
+        ``write`` reads the file late, so that two parts can be measured at the same time. Notes are kept as well; a
+        note that is None is dropped.
         """
         self._keep = True
 
     def write(self) -> Path:
-        """Write the file and say where."""
+        """Write the file and return its path."""
         path = self.folder / f"{self.name}.json"
         last = json.loads(path.read_text()) if self._keep and path.exists() else {"runs": {}, "rows": []}
         this = Run(
@@ -118,13 +141,18 @@ class Report:
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> Path:
-    """Write a report whole or not at all: with its reasons and with what is stale as they are now, without runs that no row names."""
+    """Write a report atomically with current reasons and stale marks, without unused runs.
+
+    Args:
+        path: file to write.
+        report: ``runs``, ``rows`` and ``notes``; the rows are changed in place.
+    """
     rows, runs, head = report["rows"], report["runs"], head_commit()
     explain(rows)
     mark_stale(path.stem, rows, runs, head)
     named = {row["run"] for row in rows}
     kept = {key: runs[key] for key in sorted(runs) if key in named}
-    # The newest run once more, for programs that ask a report for one commit; each row's own run is what counts.
+    # Repeat the newest run for programs that expect one commit per report. The run of each row is what counts.
     dated = [run for run in kept.values() if run.get("date")]
     made = max(dated, key=lambda run: run["date"]) if dated else None
     told = {"made": made, "stale_as_of": head or None, "runs": kept, "rows": rows}

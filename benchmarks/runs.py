@@ -1,7 +1,8 @@
-"""What benchmarks share: datasets and maps made once under one folder, and rows of shares.
+"""Shared work of benchmarks: datasets, maps and answers, made once under one folder, and rows of shares.
 
-Everything kept is named after what it was made from - the plan, the encoder, and the code that simulates, builds and
-answers - so that a change of any of them is measured anew instead of read from an old run.
+The name of each kept result includes its inputs: the plan, the encoder, and the code that simulates, builds and
+answers. A change of any
+of them therefore causes a new measurement.
 """
 
 import hashlib
@@ -28,12 +29,17 @@ from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
-RAW_EVERY = 3  # each third query of a set is asked of the raw image too: it is slow, and so many tell 0.3 from 0.4
+#: Only each third query of a set is given to the raw image. It is slow, and so many queries distinguish 0.3 from 0.4.
+RAW_EVERY = 3
 
 
 @cache
 def code_hash(*names: str) -> str:
-    """Short hash of files of the repository, and of the Python and C files of folders."""
+    """Return a short hash of repository files, and of the Python and C files of folders.
+
+    Args:
+        *names: paths relative to the repository.
+    """
     digest = hashlib.sha256()
     for name in names:
         inside = [ROOT / name] if (ROOT / name).is_file() else (ROOT / name).rglob("*")
@@ -44,7 +50,8 @@ def code_hash(*names: str) -> str:
 
 SIMULATION = ("model_training/simulation", "service/geometry/camera.py", "service/geometry/rigid.py")
 ANSWERING = ("service/imaging", "service/geometry", "service/maps", "service/registration", "service/localization")
-MAPPING = ("model_training/mapping", "model_training/datasets", *ANSWERING)  # it asks its own map to check confidence
+# includes the answering code: mapping queries its own map to check confidence
+MAPPING = ("model_training/mapping", "model_training/datasets", *ANSWERING)
 
 
 def _calibration_hash() -> str:
@@ -52,20 +59,34 @@ def _calibration_hash() -> str:
 
 
 class Runs:
-    """Datasets, maps and figures under one folder, made once."""
+    """Datasets, maps and figures under one folder, made once.
+
+    Args:
+        work: folder of the results.
+        encoder: ONNX file of the encoder.
+    """
 
     def __init__(self, work: Path, encoder: Path) -> None:
         self.work, self.encoder = work, encoder
 
     def dataset(self, plan: SimulationPlan) -> Dataset:
-        """Simulate a plan, or take it as it is."""
+        """Simulate a plan, or reuse the dataset.
+
+        Args:
+            plan: simulation plan.
+        """
         folder = self.work / f"{plan.name}-{code_hash(*SIMULATION)}"
         with bars() as report:
             simulate(plan, folder, report=report)
         return Dataset(folder)
 
     def bundle(self, dataset: Dataset, settings: BuildSettings | None = None) -> MapBundle:
-        """Build a map, or take the one that this encoder and this code made of this dataset."""
+        """Build a map, or reuse the one of the same encoder, code and dataset.
+
+        Args:
+            dataset: dataset to map.
+            settings: settings of the map; None takes the defaults.
+        """
         settings = settings or BuildSettings(name=dataset.name)
         made_of = (
             f"{dataset.folder.name.rsplit('-', 1)[-1]}-{Encoder.open(self.encoder).sha256[:12]}-{code_hash(*MAPPING)}"
@@ -79,7 +100,14 @@ class Runs:
         return MapBundle.open(folder)
 
     def figures(self, bundle: MapBundle, dataset: Dataset, names: list[str], *, refine: bool = False) -> dict[str, Any]:
-        """Evaluate query sets, by retrieval alone or with registration; the answers lie beside for later measures."""
+        """Evaluate query sets by retrieval alone or with registration; the result also holds the answers.
+
+        Args:
+            bundle: the map.
+            dataset: dataset of the queries.
+            names: names of the query sets.
+            refine: whether to register.
+        """
         found = {name: self.predictions(bundle, dataset, name, refine=refine) for name in names}
         classes = [] if bundle.streets is None else [street.name for street in bundle.streets.features]
         return measure(joined(list(found.values())), classes) | {"predictions": found}
@@ -88,7 +116,16 @@ class Runs:
         self, bundle: MapBundle, dataset: Dataset, name: str, *, refine: bool = True, frames_each: int = 1,
         prior: tuple[str, PriorOf] | None = None,
     ) -> Predictions:  # fmt: skip
-        """Answers to a query set, or to its sequences of so many frames; with a prior, which bears a name that says what it is."""
+        """Answer a query set or its sequences, or reuse the answers.
+
+        Args:
+            bundle: the map.
+            dataset: dataset of the queries.
+            name: name of the query set.
+            refine: whether to register.
+            frames_each: frames per sequence; 1 for single queries.
+            prior: name of a kind of prior, and its function; None for no prior.
+        """
         mode = ("full" if refine else "retrieval") + (f"-{frames_each}" if frames_each > 1 else "")
         mode += "" if prior is None else f"-{prior[0]}"
         folder = self.work / "predictions" / f"{mode}-{code_hash(*ANSWERING)}" / bundle.path.name / dataset.folder.name
@@ -110,11 +147,22 @@ class Runs:
 
     @staticmethod
     def forced_within(predictions: Predictions, reach_m: float) -> float:
-        """Share within a distance, whatever the status."""
+        """Return the share of answers within a distance, whatever their status.
+
+        Args:
+            predictions: answers with ground truth.
+            reach_m: distance, metres.
+        """
         return float(within(predictions, reach_m).mean())
 
     def raw(self, bundle: MapBundle, dataset: Dataset, name: str) -> dict[str, tuple[int, int]]:
-        """The raw range image: right ones and number of queries by setting, over each third query of a set."""
+        """Return correct answers and number of queries of the raw range image by setting, over each third query.
+
+        Args:
+            bundle: the map.
+            dataset: dataset of the queries.
+            name: name of the query set.
+        """
         code = code_hash(*MAPPING, "model_training/baselines")
         kept = self.work / "raw" / f"{dataset.folder.name}-{code}-{name}-every{RAW_EVERY}.json"
         if not kept.exists():
@@ -132,18 +180,33 @@ class Runs:
 
 
 def within(predictions: Predictions, reach_m: float) -> NDArray[np.bool_]:
-    """(n) whether the answer lies within a distance, whatever its status."""
+    """Return whether each answer (n,) lies within a distance, whatever its status.
+
+    Args:
+        predictions: answers with ground truth.
+        reach_m: distance, metres.
+    """
     away = np.linalg.norm(predictions.T_answer[:, :2, 3] - predictions.T_true[:, :2, 3], axis=1)
     return np.asarray(np.nan_to_num(away, nan=np.inf) <= reach_m)
 
 
 def accepted_within(predictions: Predictions, reach_m: float) -> NDArray[np.bool_]:
-    """(n) whether the answer was accepted and lies within a distance."""
+    """Return whether each answer (n,) was accepted and lies within a distance.
+
+    Args:
+        predictions: answers with ground truth.
+        reach_m: distance, metres.
+    """
     return predictions.localized & within(predictions, reach_m)
 
 
 def pooled(parts: list[dict[str, Any]], key: str) -> tuple[float, int, list[float]]:
-    """A share over several cities: value, count, Wilson interval."""
+    """Pool a share over several cities: return value, count and Wilson interval.
+
+    Args:
+        parts: figures of each city.
+        key: name of the share.
+    """
     of = "street_queries" if key == "street_accuracy" else "queries"
     count = sum(part[of] for part in parts)
     right = round(sum(part[key] * part[of] for part in parts))
@@ -153,6 +216,14 @@ def pooled(parts: list[dict[str, Any]], key: str) -> tuple[float, int, list[floa
 def share(
     report: Report, row_id: str, figures: dict[str, Any] | list[dict[str, Any]], key: str, bar: float | None = None
 ) -> None:
-    """A row of one share, over one or several evaluations."""
+    """Add the row of one share, over one or several evaluations.
+
+    Args:
+        report: collects the rows.
+        row_id: id of the row.
+        figures: figures of one evaluation, or of several.
+        key: name of the share.
+        bar: limit of the share; None for no bar.
+    """
     value, count, interval = pooled(figures if isinstance(figures, list) else [figures], key)
     report.row(row_id, value, "share", bar=bar, n=count, ci95=interval)

@@ -1,4 +1,4 @@
-"""Several frames as one question: a street of repeating blocks."""
+"""Several frames as one query, in a street of repeating blocks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,25 +9,40 @@ from benchmarks.runs import Runs, accepted_within
 from model_training.evaluation.predict import Predictions, PriorOf, joined
 from model_training.simulation.repeating import landmarks_m
 
-PASSED_M, FAR_M = 18.0, 58.0  # a landmark's middle this near is passed; so far away it cannot be seen
+#: A sequence within the first distance of a landmark's middle passes it. Beyond the second distance it cannot see it.
+PASSED_M, FAR_M = 18.0, 58.0
 
 
 def between_landmarks(found: Predictions) -> NDArray[np.bool_]:
-    """Sequences that see no landmark and not the street's ends, which tell where they are."""
+    """Return which sequences (N,) see neither a landmark nor the street's ends.
+
+    Args:
+        found: answers with ground truth.
+    """
     x = found.T_true[:, 0, 3]
     away = np.abs(x[:, None] - landmarks_m()).min(axis=1)
     return np.asarray((away >= FAR_M) & (np.abs(x) < landmarks_m().max() + PASSED_M))
 
 
 def repeating_answers(runs: Runs, prior: tuple[str, PriorOf] | None = None) -> Predictions:
-    """To all sequences of the street that repeats."""
+    """Answer all sequences of the repeating street.
+
+    Args:
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+        prior: name of a kind of prior, and its function; None for no prior.
+    """
     dataset = runs.dataset(repeating_plan())
     bundle, names = runs.bundle(dataset), dataset.query_sets(with_truth=True)
     return joined([runs.predictions(bundle, dataset, name, frames_each=SEQUENCE, prior=prior) for name in names])
 
 
 def sequence_rows(report: Report, runs: Runs) -> None:
-    """Sequences that pass a landmark are told apart, those that pass none are said to be ambiguous."""
+    """Add rows: sequences that pass a landmark must be right, those that see none must be AMBIGUOUS.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     found = repeating_answers(runs)
     x = found.T_true[:, 0, 3]
     away = np.abs(x[:, None] - landmarks_m()).min(axis=1)

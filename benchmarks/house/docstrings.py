@@ -1,4 +1,4 @@
-"""Which public functions of the library say what a caller must know."""
+"""Find public functions of the library whose docstrings are incomplete."""
 
 import ast
 import re
@@ -8,17 +8,17 @@ from pathlib import Path
 
 from benchmarks.report import ROOT
 
-#: What other code may call: the core and the client.
+#: Packages that other code may call: the core and the client.
 PACKAGES = ("client", "geometry", "imaging", "localization", "maps", "registration")
 _ARRAY = re.compile(r"NDArray|Float\d|Int\d|Bool\[")
-#: A shape: "(N, 3)", "(rows, columns)"; jaxtyping says it in the annotation.
+#: A shape such as "(N, 3)" or "(rows, columns)". With jaxtyping, the annotation gives the shape.
 _SHAPE = re.compile(r"\([A-Za-z0-9_ ]+,[A-Za-z0-9_, ]*\)")
 _JAXTYPING = re.compile(r"(?:Float|Int|UInt|Bool|Shaped|Num)\d*\[")
 
 
 @dataclass(frozen=True, slots=True)
 class Lacking:
-    """A public function and what its docstring leaves out.
+    """A public function and the part that its docstring lacks.
 
     Attributes:
         name: ``path:line name``.
@@ -30,7 +30,13 @@ class Lacking:
 
 
 def public_functions(package: str) -> Iterator[tuple[Path, ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
-    """Public functions and methods of public classes of a package of ``service``: file, function, whether it is a method."""
+    """Yield public functions, and methods of public classes, of a package of ``service``.
+
+    Each item is the file, the function, and whether it is a method.
+
+    Args:
+        package: name of the package.
+    """
     for path in sorted((ROOT / "service" / package).rglob("*.py")):
         if path.name.startswith("_") and path.name != "__init__.py":
             continue
@@ -44,11 +50,11 @@ def public_functions(package: str) -> Iterator[tuple[Path, ast.FunctionDef | ast
 
 
 def lacking(function: ast.FunctionDef | ast.AsyncFunctionDef, *, is_method: bool) -> str | None:
-    """What the docstring of a function leaves out: the first of its docstring, an argument, an error, a shape; or None.
+    """Return the first part that a docstring lacks: itself, an argument, an error or a shape; None if complete.
 
     Args:
-        function: public.
-        is_method: its first argument is the instance.
+        function: a public function.
+        is_method: whether its first argument is the instance.
     """
     text = ast.get_docstring(function)
     if text is None:
@@ -71,7 +77,7 @@ def lacking(function: ast.FunctionDef | ast.AsyncFunctionDef, *, is_method: bool
 
 
 def all_lacking() -> tuple[list[Lacking], int]:
-    """Public functions whose docstrings leave something out, and how many public functions there are."""
+    """Return the public functions with incomplete docstrings, and the number of all public functions."""
     found, count = [], 0
     for package in PACKAGES:
         for path, function, is_method in public_functions(package):
@@ -83,10 +89,10 @@ def all_lacking() -> tuple[list[Lacking], int]:
 
 
 def code_lines(path: Path) -> int:
-    """Lines of a module with code: no docstrings, no comments, no blank lines.
+    """Count the lines of a module with code: no docstrings, no comments, no blank lines.
 
     Args:
-        path: of the module.
+        path: file of the module.
     """
     text = path.read_text()
     of_docstrings: set[int] = set()
@@ -105,7 +111,7 @@ def _is_static(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
 
 
 def _own_nodes(function: ast.AST) -> Iterator[ast.AST]:
-    """Nodes of a function without those of functions inside."""
+    """Yield the nodes of a function without those of inner functions."""
     for node in ast.iter_child_nodes(function):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
             continue

@@ -7,39 +7,39 @@ from pathlib import Path
 
 from benchmarks.report import ROOT
 
-#: Packages whose docstrings are read.
+#: Packages whose docstrings count.
 PACKAGES = ("streetfix", "service", "model_training")
 _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")
 _CODE = re.compile(r"`+[^`]*`+")
-#: Words with letters and no digits or signs inside: names of the code and figures are no prose.
+#: Words of letters without digits or signs inside. Names of code and figures are not prose.
 _WORD = re.compile(r"[A-Za-z][A-Za-z'-]*[A-Za-z]|[A-Za-z]")
 
 
 def pages() -> list[Path]:
-    """README and all pages of ``docs``, the decision log included."""
+    """Return README and all pages of ``docs``, including the decision log."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def prose_of_markdown(text: str) -> str:
-    """Paragraphs and list items; without code, tables, headings, pictures' addresses and comments.
+    """Return paragraphs and list items, without code, tables, headings, addresses of images and comments.
 
     Args:
-        text: of a page.
+        text: content of a page.
     """
     text = _COMMENT.sub("", _FENCE.sub("", text))
     kept = [line for line in text.splitlines() if not line.lstrip().startswith(("|", "#"))]
-    # A list item is a sentence, with or without a full stop.
+    # A list item counts as a sentence, with or without a full stop.
     items = [re.sub(r"^\s*(?:[-*]|\d+\.)\s+", "\n\n", line) for line in kept]
     return _plain("\n".join(items))
 
 
 def prose_of_docstrings(source: str) -> str:
-    """Docstrings of a module, a paragraph each; without doctests and names in backquotes.
+    """Return the docstrings of a module, one paragraph each, without doctests and names in backquotes.
 
     Args:
-        source: of the module.
+        source: source code of the module.
     """
     nodes = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     found = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(source)) if isinstance(node, nodes)]
@@ -52,7 +52,7 @@ def prose_of_docstrings(source: str) -> str:
 
 
 def docstrings() -> Iterator[str]:
-    """The prose of each module of ``PACKAGES`` that was not generated."""
+    """Yield the prose of each module of ``PACKAGES``, except generated ones."""
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             if "generated" not in path.parts:
@@ -60,13 +60,13 @@ def docstrings() -> Iterator[str]:
 
 
 def reading_ease(text: str) -> float:
-    """Flesch reading ease: 206.835 - 1.015 words per sentence - 84.6 syllables per word (Flesch, 1948).
+    """Compute the Flesch reading ease: 206.835 - 1.015 words per sentence - 84.6 syllables per word (Flesch, 1948).
 
     Args:
         text: prose whose paragraphs end with a full stop.
 
     Raises:
-        ValueError: there is no word.
+        ValueError: the text has no word.
     """
     import textstat  # only this report needs it
 
@@ -76,11 +76,11 @@ def reading_ease(text: str) -> float:
 
 
 def _plain(text: str) -> str:
-    """Words and sentence ends alone."""
+    """Keep words and sentence ends only."""
     text = _LINK.sub(r"\1", text)
     text = _CODE.sub("", text)
     paragraphs = (" ".join(part.split()).strip(" *_>") for part in re.split(r"\n\s*\n", text))
     ended = [part if part[-1] in ".!?:" else f"{part}." for part in paragraphs if _WORD.search(part)]
-    # A colon or a semicolon ends a clause that stands by itself, but Flesch counts sentences; only full stops count here.
+    # A colon or a semicolon ends a clause, but Flesch counts sentences. Only full stops count here.
     words = [" ".join(re.findall(rf"{_WORD.pattern}|[.!?](?=\s|$)", part)) for part in ended]
     return "\n".join(re.sub(r"\s+([.!?])", r"\1", part) for part in words)

@@ -1,4 +1,4 @@
-"""Which files of the service one real request passes through."""
+"""Record the files of the service that one real request passes through."""
 
 import asyncio
 import sys
@@ -23,8 +23,8 @@ class Trace:
     """Files of ``service`` whose functions were called, in the order of their first calls.
 
     Attributes:
-        before_engine: until the engine was called.
-        in_core: from that call to its return.
+        before_engine: files called before the engine.
+        in_core: files called between the engine's call and its return.
     """
 
     before_engine: list[str] = field(default_factory=list)
@@ -34,7 +34,13 @@ class Trace:
     _asked: bool = False
 
     def profile(self, frame: FrameType, event: str, _: Any) -> None:
-        """For ``sys.setprofile``: note the file of every call."""
+        """Record the file of every call; a callback for ``sys.setprofile``.
+
+        Args:
+            frame: frame of the event.
+            event: name of the event.
+            _: unused argument of the event.
+        """
         if not self._is_on or not frame.f_code.co_filename.startswith(_SERVICE):
             return
         is_engine = frame.f_code in _ENGINE
@@ -54,7 +60,7 @@ _ENGINE: frozenset[CodeType] = frozenset({Engine.localize.__code__, Engine.local
 
 
 def trace_of_request(bundle: Path, parts: dict[str, tuple[str, bytes, str]]) -> Trace:
-    """Ask a service in this process once to warm up, then once more, traced.
+    """Send two requests to a service in this process, one to warm up and one traced.
 
     Args:
         bundle: map to serve.

@@ -1,7 +1,9 @@
-"""``make bench-kitti ROOT=...`` -> reports/kitti.json: place recognition on KITTI by the published protocol and by an honest one.
+"""``make bench-kitti ROOT=...``: measure place recognition on KITTI by two protocols -> reports/kitti.json.
 
-Published (R@1 within 10 m): every scan of a sequence is a place, and only the scan of the query's own moment is left out, so that scans a
-metre away stay in. Honest: the same street on another day, and loops that close more than a minute later.
+Published protocol (R@1 within 10 m): every scan of a sequence is a place. The map leaves out only the scan of the
+query's own moment, so
+scans a metre away remain. Held-out protocol: the same street on another day, and loops that close more than a minute
+later.
 """
 
 import argparse
@@ -32,8 +34,9 @@ from service.errors import StreetfixError
 from service.maps.reader import MapBundle
 
 QUERIES = "recorded"
-EVERY_SCAN_M = 0.05  # every scan is a place unless the vehicle stands still
-#: RangeBEV's table (arXiv 2502.11742), R@1 within 10 m in percent, trained on KITTI's other sequences: for the report's notes.
+EVERY_SCAN_M = 0.05  # small, so that every scan is a place unless the vehicle stands still
+#: Table of RangeBEV (arXiv 2502.11742): R@1 within 10 m in percent, trained on KITTI's other sequences. The report
+#: keeps it as a note.
 PUBLISHED_R1 = {
     "(LC)2": (31, 23, 40, 40, 53, 38), "VXP": (24, 18, 33, 30, 44, 24), "I2P-Rec": (45, 28, 48, 44, 63, 46),
     "ModaLink": (90, 70, 90, 86, 97, 87), "CMVM": (93, 77, 91, 89, 98, 91), "RangeBEV": (99, 95, 99, 97, 100, 98),
@@ -41,7 +44,7 @@ PUBLISHED_R1 = {
 
 
 def main() -> None:
-    """Find drives, measure each, write the report."""
+    """Find the traversals, measure each and write the report."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kitti", description=__doc__)
     parser.add_argument(
         "--root", type=Path, default=ROOT.parent / "shared" / "data", help="folder above KITTI's drives"
@@ -77,7 +80,7 @@ def main() -> None:
 
 
 def _mapped(drive: Drive, root: Path, work: Path) -> tuple[Dataset, MapBundle]:
-    """Imported with SGBM's depth and mapped with every scan as a place, or what an earlier run kept."""
+    """Import a traversal with SGBM depth and map every scan as a place, or reuse an earlier result."""
     folder, bundle = work / f"{drive.name}_data", work / f"{drive.name}_map"
     if not (folder / "dataset.json").exists():
         source = drive.folder
@@ -105,13 +108,13 @@ def _told(stage: str, done: int, of: int) -> None:
 
 
 def _when_and_where(dataset: Dataset, bundle: MapBundle) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Queries' positions and times, places' positions and times; a place has the time of the scan that it was made of."""
+    """Return positions and times of queries and of places; a place has the time of its scan."""
     frames = [frame for frame in dataset.queries(QUERIES) if frame.T_map_camera is not None]
     query_xy = np.array([frame.T_map_camera[:2, 3] for frame in frames])
     query_s = np.array([frame.stamp_s for frame in frames], np.float64)
     stamps, poses = dataset.survey_trajectory()
     place_xy = np.array(bundle.T_map_place[:, :2, 3])
-    # The survey's poses may have been brought into agreement by centimetres: the nearest scan is the place's own.
+    # The map may have moved the survey's poses by centimetres. The nearest scan is the place's own.
     own = np.array([np.hypot(*(poses[:, :2, 3] - xy).T).argmin() for xy in place_xy])
     return query_xy, query_s, place_xy, stamps[own]
 
@@ -130,7 +133,7 @@ def _same_drive(report: Report, name: str, dataset: Dataset, bundle: MapBundle) 
 def _other_day(
     report: Report, mapped: str, asked: str, shared: str, maps: dict[str, tuple[Dataset, MapBundle]]
 ) -> None:
-    """Queries of one day on the map of another; those count that have a place of it within 10 m."""
+    """Add R@1 of one day's queries on another day's map; only queries with a place within 10 m count."""
     (own, bundle), (other, _) = maps[mapped], maps[asked]
     similarity = place_similarities(bundle, other, QUERIES)
     xyz = np.array([f.T_map_camera[:3, 3] for f in other.queries(QUERIES) if f.T_map_camera is not None])

@@ -1,4 +1,4 @@
-"""Place recognition by the published protocol, and by one whose map does not hold the query's own moment."""
+"""Place recognition by the published protocol, and by one whose map lacks the query's own moment."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -13,14 +13,20 @@ from service.localization.retrieval import turns_on
 from service.maps.reader import MapBundle
 
 RIGHT_M = 10.0
-#: The published protocol leaves out the scan of the query's own moment: half of KITTI's ten scans a second.
+#: Time around a query whose scan the published protocol leaves out: half of the period of KITTI's ten scans per second.
 OWN_SCAN_S = 0.05
-#: A loop is closed where the vehicle comes back after so long.
+#: Time after which a return of the vehicle counts as a loop.
 LOOP_S = 60.0
 
 
 def place_similarities(bundle: MapBundle, dataset: Dataset, query_set: str) -> Float32[NDArray[np.float32], "Q P"]:
-    """How alike each query and each place are: the best of the place's views and of the query's turns; -1 without any depth."""
+    """Compute the similarity of queries and places: the best of all views and turns; -1 without depth.
+
+    Args:
+        bundle: the map.
+        dataset: the dataset of the queries.
+        query_set: name of the query set.
+    """
     encoder = Encoder.open(bundle.encoder_bytes())
     place, count = np.array(bundle.view_place), bundle.manifest.counts.places
     vectors = bundle.view_index.vectors(np.arange(len(place)))
@@ -44,18 +50,18 @@ def found_within(
     place_xy: Float64[NDArray[np.float64], "P 2"], *, query_s: Float64[NDArray[np.float64], " Q"],
     place_s: Float64[NDArray[np.float64], " P"], left_out_s: float,
 ) -> tuple[Bool[NDArray[np.bool_], " Q"], Bool[NDArray[np.bool_], " Q"]]:  # fmt: skip
-    """Whether the most similar place is within 10 m, where places near in time do not count.
+    """Check whether the most similar place is within 10 m; places near in time are excluded.
 
     Args:
-        similarity: of queries and places.
-        query_xy: where they were taken, metres.
-        place_xy: where the places are, in the same frame.
-        query_s: when;
-        place_s: and when the places were scanned.
-        left_out_s: a place that was scanned within so many seconds of a query is not there for it. Negative: all count.
+        similarity: similarities of queries and places (Q, P).
+        query_xy: positions of the queries (Q, 2), metres.
+        place_xy: positions of the places (P, 2), metres, same frame.
+        query_s: times of the queries (Q,), seconds.
+        place_s: times of the places' scans (P,), seconds.
+        left_out_s: a place scanned within this time of a query is excluded, seconds. A negative value excludes none.
 
     Returns:
-        (Q) right, and (Q) asked: there is a place within 10 m that counts.
+        (Q,) correct, and (Q,) counted: an included place lies within 10 m.
     """
     counts = np.abs(query_s[:, None] - place_s[None]) > left_out_s
     near = np.hypot(*(query_xy[:, None] - place_xy[None]).transpose(2, 0, 1)) <= RIGHT_M
@@ -68,7 +74,12 @@ def found_within(
 def in_the_frame_of(
     mapped: Dataset, asked: Dataset, xyz: Float64[NDArray[np.float64], "n 3"]
 ) -> Float64[NDArray[np.float64], "n 3"]:
-    """Positions of one georeferenced dataset in the frame of another, metres.
+    """Transform positions of one georeferenced dataset into the frame of another.
+
+    Args:
+        mapped: dataset of the target frame.
+        asked: dataset of the positions.
+        xyz: positions (n, 3), metres, map frame of ``asked``.
 
     Raises:
         ValueError: one of them is not georeferenced.

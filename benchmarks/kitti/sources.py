@@ -1,4 +1,4 @@
-"""Which KITTI drives lie below a folder, and which of the published and the honest protocol are missing."""
+"""Find KITTI traversals below a folder, and list those that the protocols lack."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 PUBLISHED = ("00", "02", "05", "06", "07", "08")
-#: Sequences that come back to where they were: more than a minute later.
+#: Sequences that return to earlier places more than a minute later.
 LOOPS = ("00", "05", "06")
-#: The same street on another day: the map's drive, the queries' drive, and what they share.
+#: The same street on another day: the map's traversal, the queries' traversal, and their overlap.
 OTHER_DAY = (
     ("2011_09_30_drive_0027", "2011_10_03_drive_0027", "196 m, same direction"),
     ("2011_09_30_drive_0028", "2011_10_03_drive_0027", "152 m, same direction"),
@@ -17,13 +17,13 @@ OTHER_DAY = (
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A recorded drive.
+    """A recorded traversal.
 
     Attributes:
-        name: of an odometry sequence two digits, of a raw drive and of KITTI-360's its date and number.
+        name: two digits for an odometry sequence; date and number for a raw traversal and for KITTI-360.
         kind: importer that reads it.
-        folder: what the importer takes.
-        packed: it must be unpacked first (``unpack.py`` beside it).
+        folder: folder for the importer.
+        packed: whether it must be unpacked first (``unpack.py`` beside it).
     """
 
     name: str
@@ -33,7 +33,11 @@ class Drive:
 
 
 def drives_below(root: Path) -> list[Drive]:
-    """Odometry sequences (``sequences/NN``), raw drives (``*_sync``) and KITTI-360's, by name; a drive that is there twice, once."""
+    """Find odometry sequences (``sequences/NN``), raw traversals (``*_sync``) and KITTI-360, by name and without duplicates.
+
+    Args:
+        root: folder to search.
+    """
     found = dict[str, Drive]()
     for folder in sorted(root.rglob("sequences/[0-9][0-9]")):
         if (folder / "velodyne").is_dir() and (folder / "image_3").is_dir():
@@ -51,7 +55,7 @@ def drives_below(root: Path) -> list[Drive]:
         packed = any(scans.glob("*.xz"))
         name = folder.name.removesuffix("_sync")
         if packed:
-            # unpack.py takes the folder that holds the day's
+            # unpack.py takes the folder above the day's folder
             found.setdefault(name, Drive(name, "kitti-raw", folder.parent.parent, packed=True))
         else:
             found.setdefault(name, Drive(name, "kitti-raw", folder))
@@ -59,7 +63,11 @@ def drives_below(root: Path) -> list[Drive]:
 
 
 def missing(drives: Sequence[Drive]) -> list[str]:
-    """What the protocols want and is not there, in words."""
+    """Describe the recordings that the protocols need and that are absent.
+
+    Args:
+        drives: traversals that were found.
+    """
     names = {drive.name for drive in drives}
     lines = [
         f"odometry sequence {name} (velodyne, image_2, image_3, calib.txt, poses)"

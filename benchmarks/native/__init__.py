@@ -1,1 +1,1 @@
-"""Checks of the compiled code: which instructions it has, whether all compilers' builds answer alike, what sanitizers say."""
+"""Checks of the compiled code: its instructions, equal answers of all compilers' builds, and sanitizer reports."""

@@ -1,4 +1,6 @@
-"""Answers of a map to a dataset's queries, every number bit by bit; run by ``python_in`` out of an unpacked wheel.
+"""Print a map's answers to a dataset's queries, with every number bit by bit.
+
+``python_in`` runs this module in an unpacked wheel.
 
 Example: python -m benchmarks.native.answers --map maps/city --dataset data/city --queries drive1_stereo --count 200
 """
@@ -20,7 +22,11 @@ from service.maps.reader import MapBundle
 
 
 def told(value: object) -> Iterator[str]:
-    """All that an answer says but how long it took; numbers in hexadecimal, so that no digit is lost."""
+    """Yield all of an answer except its timings; numbers are hexadecimal, so no digit is lost.
+
+    Args:
+        value: the answer, or a part of it.
+    """
     if isinstance(value, Timings):
         return
     if is_dataclass(value):
@@ -40,7 +46,7 @@ def told(value: object) -> Iterator[str]:
 
 
 def main() -> None:
-    """Print one line an answer."""
+    """Print one line per answer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--map", type=Path, required=True)
     parser.add_argument("--dataset", type=Path, required=True)

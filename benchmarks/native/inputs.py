@@ -1,7 +1,8 @@
-"""Random inputs, ordinary and extreme, for every C function; prints a hash of what each returned.
+"""Call every C function with random inputs, ordinary and extreme, and print a hash of each result.
 
-Run by ``python_in`` out of an unpacked wheel. Under sanitizers a bad access ends in a report; between the builds of two compilers the
-printed lines must be equal. Outputs that hold NaN are compared as NaN: which of its many bit patterns it is, no standard says.
+``python_in`` runs this module in an unpacked wheel. Under sanitizers a bad access ends in a report. The lines of two
+compilers' builds
+must be equal. All NaN values compare equal, because no standard fixes their bit pattern.
 
 Example: python -m benchmarks.native.inputs --rounds 40
 """
@@ -41,21 +42,32 @@ from service.registration.visibility import SurfelRaycaster
 
 Floats = NDArray[np.float64]
 
-#: Height and width of pictures: one pixel, one row, one column, flat, small ones that no block size divides, and a usual one.
+#: Height and width of images, pixels: one pixel, one row, one column, flat, two sizes that no block size divides, and a
+#: usual one.
 SIZES = ((1, 1), (1, 7), (7, 1), (16, 2560), (48, 64), (61, 33), (240, 320))
 
 
 def camera_of(rng: np.random.Generator, height: int, width: int) -> PinholeCamera:
-    """Of a field of view from very narrow to very wide; its centre may lie outside the picture."""
+    """Make a camera with a field of view from very narrow to very wide; its centre may lie outside the image.
+
+    Args:
+        rng: source of randomness.
+        height, width: size of the image, pixels.
+    """
     focal = width * float(np.exp(rng.uniform(-2.5, 2.5)))
     at = rng.uniform(-0.5, 1.5, 2) if rng.random() < 0.2 else rng.uniform(0.4, 0.6, 2)
     return PinholeCamera(width, height, focal, focal * rng.uniform(0.8, 1.25), at[0] * width, at[1] * height)
 
 
 def depth_of(rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
-    """Ranges of a street, some without measurement; at times of no number, infinite, negative, huge or tiny."""
+    """Make a depth image (height, width) in metres with gaps, and at times with NaN, infinite, negative, huge or tiny values.
+
+    Args:
+        rng: source of randomness.
+        height, width: size of the image, pixels.
+    """
     depth = rng.uniform(0.3, 45.0, (height, width)).astype(np.float32)
-    if rng.random() < 0.5:  # smooth, as surfaces are
+    if rng.random() < 0.5:  # smooth, like surfaces
         depth = np.linspace(1, rng.uniform(2, 40), width, dtype=np.float32)[None] + 0.01 * depth
         depth = np.array(np.broadcast_to(depth, (height, width)))
     depth[rng.random((height, width)) < rng.choice([0.0, 0.3, 1.0], p=[0.5, 0.4, 0.1])] = 0
@@ -66,13 +78,21 @@ def depth_of(rng: np.random.Generator, height: int, width: int) -> NDArray[np.fl
 
 
 def rotation_of(rng: np.random.Generator) -> Floats:
-    """Any rotation."""
+    """Make an arbitrary rotation (3, 3).
+
+    Args:
+        rng: source of randomness.
+    """
     a, b, c = rng.uniform(-np.pi, np.pi, 3)
     return np.asarray(rotation_z(a) @ rotation_y(b) @ rotation_x(c))
 
 
 def street(rng: np.random.Generator) -> SurfelMap:
-    """A ground, two house fronts and a wall across, of a few thousand surfels; now and then of one."""
+    """Make a map of a ground, two house fronts and a wall across, with a few thousand surfels; sometimes with one.
+
+    Args:
+        rng: source of randomness.
+    """
     x, y, z = np.arange(-30, 30, 0.5), np.arange(-6, 6, 0.5), np.arange(0, 8, 0.5)
     parts = [
         (np.stack([g.ravel() for g in np.meshgrid(x, y, [0.0])], 1), (0, 0, 1)),
@@ -99,7 +119,11 @@ def street(rng: np.random.Generator) -> SurfelMap:
 
 
 def points_for(rng: np.random.Generator) -> QueryPoints:
-    """Any number of points, none among them; some of no number, infinite, or far away."""
+    """Make any number of query points, including none; some are NaN, infinite or far away.
+
+    Args:
+        rng: source of randomness.
+    """
     count = int(rng.choice([0, 1, 31, 32, 33, 500]))
     xyz = rng.uniform(-25, 25, (count, 3)).astype(np.float32)
     if rng.random() < 0.4 and count:
@@ -111,7 +135,11 @@ def points_for(rng: np.random.Generator) -> QueryPoints:
 
 
 def states_for(rng: np.random.Generator) -> NDArray[Any]:
-    """Starts near and far; some that are no pose."""
+    """Make solver states (n,) near and far; some are invalid poses.
+
+    Args:
+        rng: source of randomness.
+    """
     states = np.zeros(int(rng.integers(0, 4)), STATE)
     for state in states:
         state["R"], state["t"] = rotation_z(rng.uniform(-np.pi, np.pi)), rng.uniform(-20, 20, 3)
@@ -127,7 +155,8 @@ OPTIONS = SolverOptions(iterations=6, reach=1.0, robust_first=1.0, robust_last=0
 BEAM = BeamModel(
     hit=0.7, new=0.1, gone=0.1, any=0.1, rough_m=0.1, span_m=40.0, certain=2.0, margin_m=0.3, nothing_m=60.0
 )  # fmt: skip
-LARGE = 400  # bytes of random data for the codecs
+#: Largest size of random data for the codecs, bytes.
+LARGE = 400
 
 
 def _gather(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
@@ -213,7 +242,7 @@ def _rays(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -
 
 
 def _codecs(rng: np.random.Generator, height: int, width: int) -> list[NDArray[Any]]:
-    """Rows of random filters and data; the codec's own bounds are all that guards it."""
+    """Decode rows of random filters and data; only the codec's own bounds protect it."""
     height, width = min(height, 64), min(width, 64)
     rows = rng.integers(0, 256, (height, 1 + 2 * width), np.uint8)
     rows[:, 0] = rng.integers(0, 6 if rng.random() < 0.3 else 5, height)
@@ -221,7 +250,7 @@ def _codecs(rng: np.random.Generator, height: int, width: int) -> list[NDArray[A
     buffer = (ctypes.c_char * len(raw)).from_buffer_copy(raw)
     done = depth16.library().streetfix_unfilter(buffer, height, width, out.ctypes.data)
     packed = rng.integers(0, 256, int(rng.integers(0, LARGE)), np.uint8)
-    if rng.random() < 0.7:  # short numbers, so that more than a few pixels are read
+    if rng.random() < 0.7:  # small numbers, so that the codec reads more than a few pixels
         packed &= 0x77
     data, pixels = packed.tobytes(), np.zeros((height, width), np.uint16)
     given = (ctypes.c_char * len(data)).from_buffer_copy(data) if data else None
@@ -230,7 +259,11 @@ def _codecs(rng: np.random.Generator, height: int, width: int) -> list[NDArray[A
 
 
 def digest(arrays: list[NDArray[Any]]) -> str:
-    """Of shapes, types and bits; any NaN as the same."""
+    """Hash shapes, types and bits of arrays; every NaN counts as the same.
+
+    Args:
+        arrays: arrays of any shape.
+    """
     told = hashlib.sha256()
     for array in arrays:
         array = np.ascontiguousarray(array)
@@ -241,8 +274,13 @@ def digest(arrays: list[NDArray[Any]]) -> str:
 
 
 def rounds(seed: int, count: int) -> None:
-    """Ask every function so many times with each size of picture, and print what came back."""
-    np.seterr(all="ignore")  # what is asked makes no sense at times
+    """Call every function in each round with one image size, and print the hash of each result.
+
+    Args:
+        seed: seed of the inputs.
+        count: number of rounds.
+    """
+    np.seterr(all="ignore")  # some inputs are meaningless on purpose
     rng = np.random.default_rng(seed)
     for number in range(count):
         cloud = street(rng)
@@ -259,13 +297,13 @@ def rounds(seed: int, count: int) -> None:
         for name, case in cases.items():
             try:
                 told = digest(case())
-            except (StreetfixError, np.linalg.LinAlgError) as error:  # refused, or too little to solve for
+            except (StreetfixError, np.linalg.LinAlgError) as error:  # the inputs were refused, or too few to solve
                 told = f"refused: {type(error).__name__} {error}"
             print(number, name, f"{height}x{width}", told, flush=True)
 
 
 def main() -> None:
-    """Parse and ask."""
+    """Parse the arguments and run the rounds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)

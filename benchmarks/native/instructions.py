@@ -1,7 +1,10 @@
-"""Instructions of x86-64 libraries that not every x86-64 processor has.
+"""Find instructions of x86-64 libraries that not every x86-64 processor has.
 
-An instruction counts as one of the baseline if the disassembler puts it in a group of the baseline, or in none and it is one of the
-general ones listed here. All else counts as beyond, so an instruction that the disassembler does not know well is found too.
+An instruction belongs to the baseline if the disassembler puts it in a baseline group. An instruction without a group
+belongs to the
+baseline if it is in the list below. Every other instruction counts as beyond, so the check also finds instructions that
+the disassembler
+does not know well.
 """
 
 from collections import Counter
@@ -13,7 +16,7 @@ from capstone import x86
 from elftools.elf.elffile import ELFFile
 from elftools.elf.sections import SymbolTableSection
 
-#: x86-64 as first sold has x87, CMOV, MMX, SSE and SSE2. The rest of these groups are no extensions.
+#: The first x86-64 processors have x87, CMOV, MMX, SSE and SSE2. The other groups here are no extensions.
 _BASELINE_GROUPS = {
     x86.X86_GRP_JUMP, x86.X86_GRP_CALL, x86.X86_GRP_RET, x86.X86_GRP_INT, x86.X86_GRP_BRANCH_RELATIVE, x86.X86_GRP_MODE64,
     x86.X86_GRP_CMOV, x86.X86_GRP_MMX, x86.X86_GRP_SSE1, x86.X86_GRP_SSE2, x86.X86_GRP_FPU,
@@ -24,11 +27,11 @@ _BASELINE = frozenset(
     or pextrw pinsrw pop popfq push pushfq rcl rcr rol ror sar sbb scasb shl shld shr shrd std stosb stosd stosq stosw sub test
     ud2 xadd xchg xor""".split()  # noqa: SIM905  # as a list it would fill a page
 )
-#: Read by the code that chooses between clones, after it has asked whether it may.
+#: The code that chooses between clones reads this register, after it has checked that it may.
 _OF_CHOOSING = frozenset({"xgetbv"})
-#: SSE3, though in the group of the x87.
+#: SSE3, although the disassembler puts it in the group of the x87.
 _BEYOND = frozenset({"fisttp"})
-#: Opcodes 0F 38 and 0F 3A came with SSSE3; pextrw has one of them and one of SSE2.
+#: Opcodes 0F 38 and 0F 3A came with SSSE3. One form of pextrw has such an opcode, another belongs to SSE2.
 _LATER_OPCODES = ([0x0F, 0x38], [0x0F, 0x3A])
 _SETS = tuple(
     f"set{condition}"
@@ -37,11 +40,11 @@ _SETS = tuple(
 
 
 def beyond_baseline(library: Path, *, without_clones: bool = False) -> Counter[str]:
-    """How often each instruction beyond the baseline occurs.
+    """Count each instruction beyond the baseline.
 
     Args:
         library: an ELF file for x86-64, not stripped.
-        without_clones: leave out functions that run only after the processor was asked (gcc's ``target_clones``).
+        without_clones: leave out functions that run only after a check of the processor (gcc's ``target_clones``).
 
     Raises:
         ValueError: the file is not for x86-64, or holds bytes that are no instructions.
@@ -70,7 +73,7 @@ def _instructions(library: Path) -> Iterator[capstone.CsInsn]:
         if elf.get_machine_arch() != "x64":
             raise ValueError(f"{library.name} is for {elf.get_machine_arch()}, not for x86-64")
         for section in elf.iter_sections():
-            if not section["sh_flags"] & 4 or section["sh_type"] == "SHT_NOBITS":  # SHF_EXECINSTR
+            if not section["sh_flags"] & 4 or section["sh_type"] == "SHT_NOBITS":  # flag 4 is SHF_EXECINSTR
                 continue
             code, begin = section.data(), section["sh_addr"]
             end = begin

@@ -1,8 +1,10 @@
-"""``make sanitize``: all C code under AddressSanitizer and UndefinedBehaviorSanitizer.
+"""``make sanitize``: run all C code under AddressSanitizer and UndefinedBehaviorSanitizer.
 
-Builds the package with both, then runs the unit tests of the modules that call C, and random inputs of extreme shapes and values.
-Leaves with 0 if there was no report, 1 if there was one or something failed, and 1 where there is no compiler with sanitizers while
-``CI`` is set; elsewhere that is said and skipped.
+The command builds the package with both. It runs the unit tests of the modules that call C, then random inputs of
+extreme shapes and
+values. It exits with 0 without a report, and with 1 after a report or a failure. Without a compiler with sanitizers it
+prints a message
+and skips the check; if ``CI`` is set, it then exits with 1.
 """
 
 import os
@@ -18,13 +20,13 @@ from pathlib import Path
 
 from benchmarks.native.wheels import ROOT, build_wheel, python_in
 
-#: Of every module that calls C.
+#: Unit tests of every module that calls C.
 TESTS = (
     *(f"tests/unit/imaging/test_{name}.py" for name in ("decode_depth", "gather", "level", "png16", "ros_depth")),
     *(f"tests/unit/registration/test_{name}.py" for name in ("align", "nearest_grid", "points", "pulls", "rays", "render", "sight")),
 )  # fmt: skip
 ROUNDS = 70
-#: The first line of a report of AddressSanitizer, and each of UndefinedBehaviorSanitizer.
+#: Marks of a report: the first line of AddressSanitizer, and each line of UndefinedBehaviorSanitizer.
 _REPORT = re.compile(r"ERROR: AddressSanitizer|: runtime error: ")
 _PROBE = "int main(void) { return 0; }\n"
 
@@ -34,14 +36,14 @@ class SanitizersMissingError(Exception):
 
 
 class RunFailedError(Exception):
-    """What ran under the sanitizers failed for another reason than a report."""
+    """A run under the sanitizers failed for another reason than a report."""
 
 
 def runtime() -> str:
-    """What a process must load first: the runtime of gcc's AddressSanitizer, and that of C++, whose exceptions it intercepts.
+    """Return the libraries to preload: the runtime of gcc's AddressSanitizer, and that of C++, whose exceptions it intercepts.
 
     Raises:
-        SanitizersMissingError: there is no gcc, or it lacks them.
+        SanitizersMissingError: there is no gcc, or it lacks the sanitizers.
     """
     if shutil.which("gcc") is None:
         raise SanitizersMissingError("there is no gcc")
@@ -63,8 +65,12 @@ def runtime() -> str:
 def reports_of(unpacked: Path, arguments: list[str]) -> list[str]:
     """Run Python in an unpacked wheel built with sanitizers.
 
+    Args:
+        unpacked: folder of the unpacked wheel.
+        arguments: arguments of Python.
+
     Returns:
-        The reports, each with what stands below it.
+        The reports, each with the text below it.
 
     Raises:
         RunFailedError: the process failed without a report.
@@ -73,11 +79,11 @@ def reports_of(unpacked: Path, arguments: list[str]) -> list[str]:
         log = f"{folder}/report"
         done = python_in(
             unpacked, arguments, LD_PRELOAD=runtime(), PYTHONMALLOC="malloc",
-            # Python itself keeps memory until it ends, so leaks are not looked for.
+            # Python itself keeps memory until it ends, so leak detection is off.
             ASAN_OPTIONS=f"detect_leaks=0:log_path={log}", UBSAN_OPTIONS=f"print_stacktrace=1:log_path={log}",
         )  # fmt: skip
         told = "\n".join(path.read_text(errors="replace") for path in sorted(Path(folder).iterdir()))
-    # UndefinedBehaviorSanitizer inside AddressSanitizer's runtime may write to the one or the other.
+    # UndefinedBehaviorSanitizer inside AddressSanitizer's runtime writes to the log or to stderr.
     found = list(_split(told + "\n" + done.stderr))
     if done.returncode != 0 and not found:
         raise RunFailedError(f"{' '.join(arguments)}\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
@@ -92,28 +98,31 @@ def _split(told: str) -> Iterator[str]:
 
 @contextmanager
 def sanitized() -> Iterator[Path]:
-    """An unpacked wheel whose libraries are built with sanitizers."""
+    """Build a wheel with sanitizers; yield its unpacked folder."""
     runtime()
     with tempfile.TemporaryDirectory() as folder:
         yield build_wheel(Path(folder) / "wheel", "gcc", {"cmake.define.STREETFIX_SANITIZE": "ON"})
 
 
 def sanitize(rounds: int = ROUNDS) -> list[str]:
-    """The reports of tests and random inputs.
+    """Return the reports of tests and random inputs.
+
+    Args:
+        rounds: rounds of random inputs.
 
     Raises:
         SanitizersMissingError: no compiler has them.
         RunFailedError: a test failed, or the random inputs ended early.
     """
     with sanitized() as unpacked:
-        # The tests' own configuration and folders; the package is the wheel's.
+        # Use the tests' own configuration and folders, but the package of the wheel.
         tests = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", f"{ROOT}/pyproject.toml", f"--rootdir={ROOT}"]
         found = reports_of(unpacked, [*tests, *(str(ROOT / each) for each in TESTS)])
         return found + reports_of(unpacked, ["-W", "ignore", "-m", "benchmarks.native.inputs", "--rounds", str(rounds)])
 
 
 def main() -> None:
-    """Run, print the reports, and leave with what the module's text says."""
+    """Run, print the reports, and exit with the status that the module's docstring gives."""
     try:
         found = sanitize()
     except SanitizersMissingError as error:

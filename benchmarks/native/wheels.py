@@ -1,4 +1,4 @@
-"""Wheels of this working tree, built by a chosen compiler, and Python processes that run out of them."""
+"""Build wheels of this working tree with a chosen compiler, and run Python in them."""
 
 import os
 import shutil
@@ -20,15 +20,15 @@ def build_wheel(folder: Path, compiler: Compiler, settings: dict[str, str] | Non
     """Build a wheel by the project's own backend, and unpack it.
 
     Args:
-        folder: that is made; the wheel lies in it.
-        compiler: ``zig``: as on a machine that has no compiler.
-        settings: of scikit-build-core.
+        folder: folder to create for the wheel.
+        compiler: ``gcc``, or ``zig`` as on a machine without a compiler.
+        settings: settings of scikit-build-core.
 
     Returns:
         The folder of the unpacked wheel.
 
     Raises:
-        subprocess.CalledProcessError: the build failed; its output says why.
+        subprocess.CalledProcessError: the build failed; its output is on stderr.
     """
     folder.mkdir(parents=True)
     environment = {
@@ -51,14 +51,23 @@ def build_wheel(folder: Path, compiler: Compiler, settings: dict[str, str] | Non
 
 
 def libraries(unpacked: Path) -> list[Path]:
-    """The compiled libraries of an unpacked wheel."""
+    """Return the compiled libraries of an unpacked wheel.
+
+    Args:
+        unpacked: folder of the unpacked wheel.
+    """
     return sorted(unpacked.rglob("_*.so"))
 
 
 def python_in(unpacked: Path, arguments: list[str], **environment: str) -> "subprocess.CompletedProcess[str]":
-    """Run Python with the packages of an unpacked wheel in the place of the working tree's.
+    """Run Python with the packages of an unpacked wheel instead of the working tree's.
 
-    ``-S`` leaves out the .pth file of an editable install, which would put the working tree first.
+    ``-S`` skips the .pth file of an editable install, which would put the working tree first.
+
+    Args:
+        unpacked: folder of the unpacked wheel.
+        arguments: arguments of Python.
+        **environment: further environment variables.
     """
     places = [str(unpacked), sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), str(ROOT)]
     return subprocess.run(
@@ -68,5 +77,5 @@ def python_in(unpacked: Path, arguments: list[str], **environment: str) -> "subp
 
 
 def has_gcc() -> bool:
-    """Whether gcc is installed."""
+    """Return whether gcc is installed."""
     return shutil.which("gcc") is not None

@@ -1,1 +1,1 @@
-"""``make paper``: the paper's method, its baseline and others beside ours, on the same data."""
+"""``make paper``: the paper's method, its baseline, other methods and ours on the same data."""

@@ -1,8 +1,10 @@
-"""``make paper``: the paper's method, its baseline and others beside ours, on the same data -> reports/paper.json, paper.md, figures.
+"""``make paper``: compare the paper's method, its baseline, others and ours on the same data -> reports/paper.json, paper.md, figures.
 
-The full size takes some hours on two cores. Whatever is finished is kept under ``--work``: data by blocks, trainings by
-checkpoints; the same command goes on after a stop. What each method answered is kept beside the report, so that ``--only`` runs some
-methods, ``--tables`` none, and the report is written from all that were ever run.
+The full size takes some hours on two cores. The command keeps finished work under ``--work``: data by blocks, trainings
+by checkpoints.
+It continues after a stop. It also keeps the answers of each method beside the report. So ``--only`` runs some methods,
+``--tables``
+runs none, and the report covers all methods that ever ran.
 """
 
 import argparse
@@ -20,12 +22,17 @@ from benchmarks.provenance import this_process
 from benchmarks.report import REPORTS, ROOT, Report
 from model_training.cli.progress import bars
 
-PACE = "pace"  # beside the methods: what each takes for the same number of images
+#: Part beside the methods: the training time of each method for the same number of images.
+PACE = "pace"
 REDUCED, REDUCED_MINUTES = Size(frames=640, pairs=320, test_images=24), 0.1
 
 
 def kept_results(bench: Bench) -> dict[str, MethodResult]:
-    """Every method that was run, and under the paper's two names the variant that was best on the pairs kept aside."""
+    """Load the results of all methods; each of the paper's two names gets its best variant on the pairs kept aside.
+
+    Args:
+        bench: data and folder of the results.
+    """
     names = [path.stem for path in sorted(bench.kept.glob("*.json"))]
     found = {name: result for name in names if (result := MethodResult.load(bench.kept, name)) is not None}
     for method in ("cnn_knn", "cnn_softmax"):
@@ -36,7 +43,7 @@ def kept_results(bench: Bench) -> dict[str, MethodResult]:
 
 
 def main() -> None:
-    """Parse, run, write."""
+    """Parse the arguments, run the methods and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, help="where data and runs are kept: data/paper")
     parser.add_argument("--out", type=Path, help="folder of the report: reports")

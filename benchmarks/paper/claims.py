@@ -1,4 +1,4 @@
-"""What becomes of the paper's figures and claims: 97.52 %, 0.804 m, K-NN and PCA in every way its method can be meant."""
+"""Check the paper's figures and claims: 97.52 %, 0.804 m, K-NN and PCA, under every reading of its method."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,7 +11,12 @@ from model_training.evaluation.error_measures import wilson_interval
 
 
 def claims(results: Mapping[str, MethodResult], figures: Figures) -> list[str]:
-    """The paper's two headline figures, on both drives, and where the first can have come from."""
+    """Return Markdown on the paper's two headline figures, on both traversals, and a possible origin of the first.
+
+    Args:
+        results: results by method.
+        figures: figures by method and split.
+    """
     lines = [
         "## 97.52 % and 0.804 m",
         "",
@@ -51,7 +56,11 @@ SETS = {
 
 
 def variants(results: Mapping[str, MethodResult]) -> list[str]:
-    """A row a variant of the paper's method, a column a kind of query."""
+    """Return a Markdown table: a row per variant of the paper's method, a column per kind of query.
+
+    Args:
+        results: results by method.
+    """
     known = {name: results[f"cnn_knn_{name}"] for name in WHAT if f"cnn_knn_{name}" in results}
     if not known:
         return []
@@ -77,9 +86,12 @@ def variants(results: Mapping[str, MethodResult]) -> list[str]:
 
 
 def verdicts(known: Mapping[str, MethodResult]) -> list[str]:
-    """What becomes of the paper's two claims: K-NN beats the network's own classifier, and PCA earns its place.
+    """Return Markdown on two claims: K-NN beats the network's own classifier, and PCA helps.
 
-    One share beats another where their 95 % intervals lie apart.
+    One share beats another if their 95 % intervals do not overlap.
+
+    Args:
+        known: results by variant.
     """
     lines = []
     for key, what in SETS.items():
@@ -100,7 +112,13 @@ def verdicts(known: Mapping[str, MethodResult]) -> list[str]:
 
 
 def beats(one: float, other: float, n: int) -> bool:
-    """Whether a share of ``n`` is larger than another by more than chance: 95 % intervals that do not meet."""
+    """Return whether a share of ``n`` is significantly larger than another: their 95 % intervals do not overlap.
+
+    Args:
+        one: the first share.
+        other: the second share.
+        n: number of queries of each.
+    """
     return wilson_interval(round(one * n), n)[0] > wilson_interval(round(other * n), n)[1]
 
 
@@ -109,7 +127,11 @@ def _named(names: Sequence[str]) -> str:
 
 
 def by_k(results: Mapping[str, MethodResult]) -> list[str]:
-    """Softmax and K-NN for every k."""
+    """Return a Markdown table of softmax and K-NN for every k.
+
+    Args:
+        results: results by method.
+    """
     known = {name: results[f"cnn_knn_{name}"] for name in WHAT if f"cnn_knn_{name}" in results}
     if not known:
         return []

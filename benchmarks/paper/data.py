@@ -1,4 +1,4 @@
-"""The data that all methods share, made once under the work folder."""
+"""Data that all methods share, made once under the work folder."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,12 +21,12 @@ LIDAR_ABOVE_CAMERA_M = 0.3
 
 @dataclass(frozen=True)
 class Size:
-    """How much there is: the paper's, or less where it is only to be shown that everything runs.
+    """Amount of data: the paper's, or less for a quick check that everything runs.
 
     Attributes:
-        frames: of LiDAR.
-        pairs: of RGB and depth to learn from.
-        test_images: a split; None for Table I's 626.
+        frames: number of LiDAR frames.
+        pairs: number of RGB-D training pairs.
+        test_images: test images per split; None for Table I's 626.
     """
 
     frames: int = PAPER_FRAMES
@@ -35,32 +35,41 @@ class Size:
 
 
 def made_minutes(folder: Path) -> float:
-    """Minutes of wall time between the first and the last of a folder's files: what it took to make, pauses included."""
+    """Return the wall time between a folder's first and last file in minutes, pauses included.
+
+    Args:
+        folder: folder to look at.
+    """
     times = [path.stat().st_mtime for path in folder.rglob("*") if path.is_file()]
     return (max(times) - min(times)) / 60 if times else 0.0
 
 
 class PaperData:
-    """Frames, pairs and tests of one size, made when first asked for; what is finished is reused."""
+    """Frames, pairs and tests of one size, made on first use and reused.
+
+    Args:
+        work: folder of the data.
+        size: amount of data.
+    """
 
     def __init__(self, work: Path, size: Size) -> None:
         self.work, self.size = work, size
 
     def made_minutes(self) -> dict[str, float]:
-        """Minutes of wall time that making each part took."""
+        """Return the wall time of making each part, minutes."""
         frames, dataset = self.work / f"frames-{self.size.frames}", self.dataset.folder
         return {"LiDAR frames": made_minutes(frames), "RGB-D pairs, tests and survey": made_minutes(dataset),
                 "small pictures of the pairs": made_minutes(self.work / f"pairs-{self.size.pairs}")}  # fmt: skip
 
     @cached_property
     def frames(self) -> Frames:
-        """LiDAR frames of the survey's drive."""
+        """LiDAR frames of the survey traversal."""
         with bars() as report:
             return make_frames(self.work / f"frames-{self.size.frames}", self.size.frames, report=report)
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The dataset that pairs and tests come from, and whose survey makes our map."""
+        """Dataset of pairs and tests; its survey makes our map."""
         tests = self.size.test_images
         plan = pairs_plan(self.size.pairs, test_images=tests)
         folder = self.work / (f"dataset-{self.size.pairs}" + ("" if tests is None else f"-{tests}"))
@@ -70,13 +79,13 @@ class PaperData:
 
     @cached_property
     def pairs(self) -> Pairs:
-        """Pairs to learn from: the first half on the survey's drive, the second on another."""
+        """Training pairs: the first half from the survey traversal, the second half from another."""
         with bars() as report:
             return make_pairs(self.dataset, TRAINING_SETS, self.work / f"pairs-{self.size.pairs}", report=report)
 
     @cached_property
     def tests(self) -> dict[str, Pairs]:
-        """Queries by split."""
+        """Test queries by split."""
         count, found = self.size.test_images or 626, {}
         for split in SPLITS:
             with bars() as report:
@@ -87,7 +96,7 @@ class PaperData:
 
     @cached_property
     def other_lidar(self) -> Frames:
-        """What a LiDAR above the camera would have seen at the other drive's queries."""
+        """Scans of a LiDAR above the camera at the other traversal's queries."""
         test = self.tests["other_drive"]
         with bars() as report:
             return make_frames_at(
@@ -97,12 +106,20 @@ class PaperData:
 
 
 def test_set(split: str) -> str:
-    """Name of a split's query set in the dataset."""
+    """Return the name of a split's query set in the dataset.
+
+    Args:
+        split: name of the split.
+    """
     return f"{split}_precise"
 
 
 def lidar_above(T_map_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T_map_lidar (n, 4, 4) of a LiDAR 0.3 m above each camera (n, 4, 4), looking where it looks."""
+    """Return T_map_lidar (n, 4, 4) of a LiDAR 0.3 m above each camera, with the camera's heading.
+
+    Args:
+        T_map_camera: camera poses (n, 4, 4), optical frame.
+    """
     T_camera_lidar = np.eye(4)
     T_camera_lidar[:3, :3] = R_BODY_OPTICAL.T
     T_camera_lidar[:3, 3] = [0.0, -LIDAR_ABOVE_CAMERA_M, 0.0]  # optical axes: y down

@@ -1,4 +1,4 @@
-"""Counterparts of the paper's figures, and how the methods' errors spread."""
+"""Counterparts of the paper's figures, and the distribution of the methods' errors."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -33,7 +33,15 @@ MAX_DEPTH_M = 40.0
 def draw_figures(
     folder: Path, data: PaperData, results: Mapping[str, MethodResult], figures: Figures, pace: Pace | None = None
 ) -> dict[str, str]:
-    """Draw all that can be drawn; titles and paths relative to the page beside ``folder``."""
+    """Draw all figures that the results allow; return titles and paths relative to the page beside ``folder``.
+
+    Args:
+        folder: folder of the images.
+        data: shared data.
+        results: results by method.
+        figures: figures by method and split.
+        pace: measured training pace; None if absent.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, str] = {}
 
@@ -198,7 +206,7 @@ def _city(dataset: Dataset) -> Figure:
     return figure
 
 
-#: What a curve shows, by how its name begins.
+#: Quantity of a training curve, by the beginning of the method's name.
 WATCHED = (
     ("cnn_knn_one_space_both", "street accuracy, pairs"), ("cnn_", "street accuracy, LiDAR"),
     ("streetfix", "own view first of its batch"), ("googlenet", "median error (m)"), ("PointNetLK", "median error (m)"),

@@ -1,4 +1,4 @@
-"""What each method answered, kept as JSON so that tables and figures can be made again without running it again."""
+"""Answers of each method, kept as JSON so that tables and figures need no new run."""
 
 import json
 from collections.abc import Mapping
@@ -19,18 +19,19 @@ SPLITS = ("same_drive", "other_drive")
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """One method: answers by split, and what its training took.
+    """One method: its answers by split and its training.
 
     Attributes:
-        method: as in row ids.
-        answers: by split.
-        training_s: processor seconds of training; 0 where nothing is learnt, None where it was before all this.
-        images: shown in training.
-        training_set: different images that it learnt from.
-        ended: why its training ended.
-        curve: of its training.
-        extra: plain values that tables need.
-        run: that gave the answers.
+        method: name in row ids.
+        answers: answers by split.
+        training_s: processor seconds of training; 0 for a method without learning, None if it was trained before the
+            comparison.
+        images: number of images shown in training.
+        training_set: number of different training images.
+        ended: why the training ended.
+        curve: training curve.
+        extra: plain values for tables.
+        run: the run that gave the answers.
     """
 
     method: str
@@ -45,12 +46,16 @@ class MethodResult:
 
     @property
     def aside(self) -> float:
-        """Street accuracy on the pairs kept aside, by which variants of one method are chosen."""
+        """Street accuracy on the pairs kept aside; it selects among variants of a method."""
         told = self.extra.get("aside")
         return float(self.extra["asked"]["aside"]["knn"]["5"][0]) if told is None else float(told)
 
     def save(self, folder: Path) -> None:
-        """Write ``METHOD.json``, whole or not at all."""
+        """Write ``METHOD.json`` atomically.
+
+        Args:
+            folder: folder of the results.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         told = {
             "method": self.method, "run": self.run.as_json(), "training_s": self.training_s, "images": self.images,
@@ -64,7 +69,12 @@ class MethodResult:
 
     @staticmethod
     def load(folder: Path, method: str) -> "MethodResult | None":
-        """What was kept, or None."""
+        """Load a result; return None if it does not exist.
+
+        Args:
+            folder: folder of the results.
+            method: name of the method.
+        """
         path = folder / f"{method}.json"
         if not path.exists():
             return None
@@ -80,5 +90,5 @@ class MethodResult:
 
 
 def _plain(xy: NDArray[np.float64]) -> list[list[float | None]]:
-    """Rows of x and y to the millimetre; null where nothing was answered, since JSON has no NaN."""
+    """Return rows of x and y rounded to the millimetre; null for no answer, since JSON has no NaN."""
     return [[round(float(v), 3) if np.isfinite(v) else None for v in row] for row in xy]

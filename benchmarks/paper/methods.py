@@ -1,4 +1,4 @@
-"""Every method of the comparison, run on the shared data; what each answers is kept, so a stop costs one method."""
+"""Run every method of the comparison on the shared data; each keeps its answers, so a stop costs one method at most."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -28,7 +28,13 @@ from model_training.stock import ENCODER
 
 @dataclass(frozen=True)
 class Bench:
-    """The data, the budget of each learned method (processor seconds) and the folder where answers are kept."""
+    """Shared settings of all methods.
+
+    Attributes:
+        data: shared data.
+        budget_s: training budget of each learned method, processor seconds.
+        kept: folder of the results.
+    """
 
     data: PaperData
     budget_s: float
@@ -36,7 +42,12 @@ class Bench:
 
 
 def paper_variant(bench: Bench, name: str) -> list[MethodResult]:
-    """One variant of the paper's method: K-NN and softmax."""
+    """Run one variant of the paper's method; return the results of K-NN and of softmax.
+
+    Args:
+        bench: shared settings.
+        name: name of the variant.
+    """
     data = bench.data
     with bars() as report:
         variant = run_variant(
@@ -63,7 +74,11 @@ def _aside(variant: Variant) -> float:
 
 
 def told_of(asked: Asked) -> dict[str, Any]:
-    """Street accuracy and mean distance of softmax and of K-NN by k."""
+    """Return street accuracy and mean distance (m) of softmax, and of K-NN by k.
+
+    Args:
+        asked: answers of a variant with ground truth.
+    """
 
     def both(answers: PlaceAnswers) -> list[float]:
         return [street_accuracy(answers, asked), float(distance_errors(answers.xy, asked.truth_xy).mean())]
@@ -75,7 +90,11 @@ def told_of(asked: Asked) -> dict[str, Any]:
 
 
 def raw_range(bench: Bench) -> list[MethodResult]:
-    """The raw range image at its best setting, which is chosen on pairs of the training drive."""
+    """Run the raw range image at its best setting, chosen on pairs of the training traversal.
+
+    Args:
+        bench: shared settings.
+    """
     data = bench.data
     bundle, answers = bundle_of(data, ENCODER), {}
     street = np.asarray(bundle.place_street, np.int64)
@@ -96,7 +115,11 @@ def raw_range(bench: Bench) -> list[MethodResult]:
 
 
 def scan_context(bench: Bench) -> list[MethodResult]:
-    """Scan Context; its settings come from another city."""
+    """Run Scan Context; its settings come from another city.
+
+    Args:
+        bench: shared settings.
+    """
     answers = {}
     for split, test in bench.data.tests.items():
         with bars() as report:
@@ -105,7 +128,12 @@ def scan_context(bench: Bench) -> list[MethodResult]:
 
 
 def dual_encoder(bench: Bench, kind: Kind) -> list[MethodResult]:
-    """Two towers, without view alignment (``dual``) or behind the camera's field of view (``fov``)."""
+    """Run a dual encoder, without view alignment (``dual``) or with the camera's field of view (``fov``).
+
+    Args:
+        bench: shared settings.
+        kind: kind of the encoder.
+    """
     data, folder = bench.data, bench.data.work / "runs" / kind
     with bars() as report:
         found = dual.run(data.frames, data.pairs, data.tests, folder, kind=kind, budget_s=bench.budget_s, report=report)
@@ -115,7 +143,11 @@ def dual_encoder(bench: Bench, kind: Kind) -> list[MethodResult]:
 
 
 def regression(bench: Bench) -> list[MethodResult]:
-    """The paper's baseline, after each of its three stages; both of its networks count as its training."""
+    """Run the paper's baseline; return results after each of its three stages. Both networks count as training.
+
+    Args:
+        bench: shared settings.
+    """
     data, folder = bench.data, bench.data.work / "runs" / "regression"
     with bars() as report:
         found = run_regression(
@@ -137,7 +169,7 @@ def regression(bench: Bench) -> list[MethodResult]:
 
 
 Method = Callable[[Bench], list[MethodResult]]
-#: By name, in the order in which they are run: those that take least first.
+#: Methods by name, in the order of running: the quickest first.
 RUNS: dict[str, Method] = {
     "streetfix": lambda bench: [streetfix(bench.data, bench.budget_s)],
     "streetfix_as_paper": lambda bench: [streetfix(bench.data, None)],

@@ -1,8 +1,10 @@
-"""Our method in the comparison: an encoder trained from nothing on the same data, and the one that is shipped.
+"""Our method in the comparison: an encoder trained from scratch on the same data, and the stock encoder.
 
-The encoder of ``streetfix`` is trained for the budget that every learned method has, that of ``streetfix_as_paper`` sees as many
-images as the paper's 84 iterations show its CNN; both of the same frames and pairs. The one of ``streetfix_stock`` has never
-seen this city. Every map is built as any user builds one; every answer counts, accepted or not.
+The encoder of ``streetfix`` has the training budget of every learned method. The encoder of ``streetfix_as_paper`` sees
+as many images
+as the paper's 84 iterations show its CNN. Both use the same frames and pairs. The encoder of ``streetfix_stock`` has
+never seen this
+city. Every map is built by the normal command. Every answer counts, accepted or not.
 """
 
 import tempfile
@@ -31,18 +33,26 @@ from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
 PAPER_IMAGES_SHARE = 4 * 0.7  # four epochs over 70 % of the frames
-#: Half the stock encoder's columns and narrower: one city asks less of it than any city, and it learns from more images a minute.
+#: Half the stock encoder's columns, and narrower. One city needs less capacity, and a smaller network sees more images
+#: per minute.
 SHAPE = EncoderShape(columns=64, widths=(16, 32, 96, 160))
 
 PILOT_STEPS, PILOT_LEFT_OUT = 24, 8  # the first steps read the pack from disk
-MOST_STEPS = 4600  # after 4,521 the loss was 0.03 and 0.99 of the pairs were first in their batch (decision log): nothing is left to gain
-SPARED = 0.07  # of a budget: checkpoints, and a machine that is slower later than during the pilot
+#: Largest number of steps. After 4,521 steps the loss was 0.03, and 0.99 of the pairs were first in their batch
+#: (decision log). More steps gain nothing.
+MOST_STEPS = 4600
+#: Share of a budget kept for checkpoints, and for a machine that is slower later than during the pilot.
+SPARED = 0.07
 
 
 def config_as_paper(size: Size) -> TrainingConfig:
-    """As many optimiser steps as show the images that the paper's iterations show its CNN; small sizes have small batches.
+    """Return settings that show as many images as the paper's iterations show its CNN; small sizes get small batches.
 
-    Without a memory of descriptors: of one city alone it made the loss rise until nothing was left (decision log).
+    The training uses no memory of descriptors. For one city alone the memory made the loss rise until the training
+    collapsed (decision log).
+
+    Args:
+        size: amount of data.
     """
     together = min(TrainingConfig().pairs, size.pairs // 4)
     steps = max(1, round(PAPER_IMAGES_SHARE * size.frames / (2 * together)))
@@ -50,7 +60,14 @@ def config_as_paper(size: Size) -> TrainingConfig:
 
 
 def config_within(budget_s: float, pack: Path, config: TrainingConfig, run: Path) -> TrainingConfig:
-    """As many steps as a budget of processor time buys, told by a pilot, but no more than help; a run that began keeps its number."""
+    """Return settings with as many steps as a pilot fits into the budget, up to ``MOST_STEPS``; a run keeps its number.
+
+    Args:
+        budget_s: budget, processor seconds.
+        pack: folder of the training pack.
+        config: settings to change.
+        run: folder of the training.
+    """
     if (run / "config.json").exists():
         return TrainingConfig.model_validate_json((run / "config.json").read_bytes())
     bought = int((1 - SPARED) * budget_s / seconds_a_step(pack, config))
@@ -58,7 +75,12 @@ def config_within(budget_s: float, pack: Path, config: TrainingConfig, run: Path
 
 
 def seconds_a_step(pack: Path, config: TrainingConfig) -> float:
-    """Processor time of a step of training, by the first ones of a run that is thrown away."""
+    """Measure the processor time of a training step in seconds, by the first steps of a discarded run.
+
+    Args:
+        pack: folder of the training pack.
+        config: settings of the training.
+    """
     pilot, seen = config.model_copy(update={"steps": PILOT_STEPS}), list[float]()
     with tempfile.TemporaryDirectory() as folder, one_thread():
         train([pack], Path(folder), pilot, device="cpu", report=lambda _: seen.append(time.process_time()))
@@ -66,10 +88,15 @@ def seconds_a_step(pack: Path, config: TrainingConfig) -> float:
 
 
 def pack_of(data: PaperData, shape: EncoderShape) -> Path:
-    """The comparison's frames and pairs as a training pack with the columns of an encoder: all of the shared data's, or every second one.
+    """Write frames and pairs as a training pack with an encoder's columns: all columns, or every second one.
 
-    Every second column of a query lies a quarter of a column to the left of where a grid of half the columns has its own: less
-    than the turns that training draws.
+    Every second column of a query lies a quarter of a column to the left of the column of a coarser grid. This offset
+    is smaller than the
+    turns that training draws.
+
+    Args:
+        data: shared data.
+        shape: shape of the encoder.
     """
     folder = data.work / f"pack2-paper-0-{data.size.frames}x{data.size.pairs}-{shape.columns}"
     if folder.exists():
@@ -90,7 +117,12 @@ def pack_of(data: PaperData, shape: EncoderShape) -> Path:
 
 
 def streetfix(data: PaperData, budget_s: float | None) -> MethodResult:
-    """Train on the comparison's data within a budget, None: on the paper's number of images; build the map, answer both tests."""
+    """Train on the comparison's data, build the map and answer both tests.
+
+    Args:
+        data: shared data.
+        budget_s: budget, processor seconds; None shows the paper's number of images.
+    """
     method = "streetfix_as_paper" if budget_s is None else "streetfix"
     run, config = data.work / "runs" / method, config_as_paper(data.size)
     pack = pack_of(data, config.encoder)
@@ -101,7 +133,13 @@ def streetfix(data: PaperData, budget_s: float | None) -> MethodResult:
     before, began = (curve[-1].processor_s if curve else 0.0), time.process_time()
 
     def note(progress: Progress) -> None:
-        """A point of the curve; what was noted after the checkpoint that a run goes on from is left out, its time is not."""
+        """Add a point to the curve.
+
+        A resumed run drops the points after its checkpoint, but keeps their time.
+
+        Args:
+            progress: state of the training.
+        """
         if progress.step % 10 == 0 or progress.step == progress.steps:
             images, spent = progress.step * 2 * config.pairs, before + time.process_time() - began
             curve[:] = [point for point in curve if point.images < images]
@@ -128,7 +166,11 @@ def streetfix(data: PaperData, budget_s: float | None) -> MethodResult:
 
 
 def streetfix_stock(data: PaperData) -> MethodResult:
-    """The shipped encoder, which knows other cities alone."""
+    """Answer both tests by the stock encoder, which has seen only other cities.
+
+    Args:
+        data: shared data.
+    """
     return MethodResult(
         "streetfix_stock", _answers(data, ENCODER), None, ended="trained beforehand, on 26 other cities"
     )
@@ -145,7 +187,12 @@ def _answers(data: PaperData, encoder: Path) -> dict[str, PlaceAnswers]:
 
 
 def bundle_of(data: PaperData, encoder: Path) -> MapBundle:
-    """The map of the comparison's survey at 1 m, built once for each encoder and code."""
+    """Build the map of the comparison's survey at 1 m, once for each encoder and version of the code.
+
+    Args:
+        data: shared data.
+        encoder: ONNX file of the encoder.
+    """
     name = f"{data.dataset.folder.name}-{Encoder.open(encoder).sha256[:12]}-{code_hash(*MAPPING)}"
     folder = data.work / "maps" / name
     if not folder.exists():

@@ -1,7 +1,8 @@
-"""How long each learned method trains for the same number of images: steps of all of them in turn, within one run.
+"""Training time of each learned method for the same number of images, measured by steps of all methods in turn in one run.
 
-Methods are trained when there is time for each, on whatever machine that is, beside whatever else runs; what they took then
-cannot be compared. So the comparison of training times is a run of its own: some steps of every method, round after round.
+The trainings themselves run on different machines beside other work. Their times cannot be compared. So this comparison
+is a run of its
+own: some steps of every method, round after round.
 """
 
 import json
@@ -31,16 +32,21 @@ from model_training.baselines.regression.train_pose import PoseLearner, PoseSett
 from model_training.training.encoder_net import EncoderShape
 from service.imaging.view_grid import ViewGrid
 
-ROUNDS, LEAST_S = 3, 3.0  # of processor time of each method in a round, at least
-WARM_UP = 3  # steps that do not count: caches are cold, buffers are not there yet
+#: Number of rounds, and the least processor time of each method in a round, seconds.
+ROUNDS, LEAST_S = 3, 3.0
+#: Steps that do not count: caches are cold and buffers are not allocated yet.
+WARM_UP = 3
 Measure = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Processor seconds an image by method, a value a round, and the run that measured them.
+    """Processor time per image of each method, and the run that measured it.
 
-    ``load``: processes that wanted a core, on average over a minute, before and after (1 is this one alone).
+    Attributes:
+        seconds_an_image: processor seconds per image by method, one value per round.
+        load: processes that wanted a core, averaged over a minute, before and after (1 is this process alone).
+        run: the run that measured.
     """
 
     seconds_an_image: Mapping[str, list[float]]
@@ -48,12 +54,21 @@ class Pace:
     run: Run = field(default_factory=lambda: this_process(COMMAND))
 
     def minutes(self, method: str, images: int) -> float | None:
-        """Processor minutes for so many images, by the median round; None for a method that was not measured."""
+        """Return processor minutes for a number of images, by the median round; None for an unmeasured method.
+
+        Args:
+            method: name of the method.
+            images: number of images.
+        """
         rounds = self.seconds_an_image.get(method)
         return None if rounds is None else float(np.median(rounds)) * images / 60
 
     def save(self, path: Path) -> None:
-        """Write JSON, whole or not at all."""
+        """Write JSON atomically.
+
+        Args:
+            path: file to write.
+        """
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part")
         part.write_text(json.dumps(asdict(self) | {"run": self.run.as_json()}, indent=1) + "\n")
@@ -61,14 +76,18 @@ class Pace:
 
     @staticmethod
     def read(path: Path) -> "Pace | None":
-        """What was kept, or None."""
+        """Load a measurement; return None if it does not exist.
+
+        Args:
+            path: file to read.
+        """
         if not path.exists():
             return None
         told = json.loads(path.read_text())
         return Pace(**told | {"load": tuple(told["load"]), "run": Run(**told["run"])})
 
     def to_the_quickest(self) -> list[float]:
-        """Ours against the quickest of all other methods, round by round: under 1 it is the quicker."""
+        """Return the ratio of our time to the quickest other method's, per round; below 1 ours is quicker."""
         others = [times for name, times in self.seconds_an_image.items() if not name.startswith("streetfix")]
         return [
             ours / min(of)
@@ -79,9 +98,13 @@ class Pace:
 def measure_pace(data: PaperData, report: Callable[[str, int, int], None]) -> Pace:
     """Measure all learned methods in turn, each with one thread.
 
-    Of the paper's baseline its first network counts alone: an image is a picture that GoogLeNet learns from, and what PointNetLK
-    takes besides is left out, in the baseline's favour. Of data that are not of the paper's size a single step is measured, to show
-    that all runs.
+    Of the paper's baseline only the first network counts: an image is one that GoogLeNet learns from. The time of
+    PointNetLK is left out, in
+    the baseline's favour. Data of another size than the paper's get a single step, as a check that everything runs.
+
+    Args:
+        data: shared data.
+        report: receives a label, the number done and the total.
     """
     rounds, least_s = (ROUNDS, LEAST_S) if data.size == Size() else (1, 0.0)
     before = os.getloadavg()[0]
@@ -118,7 +141,7 @@ def _methods(data: PaperData, folder: Path, least_s: float) -> dict[str, Measure
 
 
 def _timed(step: Callable[[], int], least_s: float) -> float:
-    """Seconds an image of steps that give their number of images."""
+    """Return the processor seconds per image of steps that return their number of images."""
     began, images = time.process_time(), 0
     while images == 0 or time.process_time() - began < least_s:
         images += step()

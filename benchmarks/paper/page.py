@@ -1,4 +1,4 @@
-"""``reports/paper.md``: all of the comparison on one page."""
+"""Write ``reports/paper.md``: the whole comparison on one page."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,8 @@ from model_training.baselines.paper.cnn import layer_table
 from model_training.baselines.paper.train import PATIENCE, CnnPlan
 from model_training.baselines.regression.train_pose import PoseSettings
 
-Rows = Sequence[Mapping[str, Any]]  # of the report
+#: Rows of the report.
+Rows = Sequence[Mapping[str, Any]]
 
 
 def write_page(
@@ -28,7 +29,18 @@ def write_page(
     budget_minutes: float,
     pace: Pace | None = None,
 ) -> Path:
-    """Write the page and say where it is."""
+    """Write the page and return its path.
+
+    Args:
+        path: file to write.
+        data: shared data.
+        results: results by method.
+        figures: figures by method and split.
+        pictures: paths of the images by title.
+        rows: rows of the report.
+        budget_minutes: training budget of each learned method, processor minutes.
+        pace: measured training pace; None if absent.
+    """
     parts = [
         _head(data),
         _bars(rows),
@@ -63,7 +75,7 @@ def _head(data: PaperData) -> list[str]:
 
 
 def _bars(rows: Rows) -> list[str]:
-    """What ours must reach, as the report says it."""
+    """Return the bars of our method from the report."""
     lines = [
         "## What ours must do", "",
         "Lead every method on another drive, lie within the interval of the best on the survey's own, and train in fewer minutes for",
@@ -107,10 +119,10 @@ def _how(budget_minutes: float) -> list[str]:
 
 
 def _runs(results: Mapping[str, MethodResult], pace: Pace | None) -> list[str]:
-    """Where each method's figures come from, and what the run in turn measured."""
+    """Return the runs of the methods, and the result of the training pace."""
     lines = ["## Runs", "", "| method | commit | machine | training ended by |", "|---|---|---|---|"]
     for name, result in results.items():
-        if name not in ("cnn_knn", "cnn_softmax"):  # stand for one of their variants
+        if name not in ("cnn_knn", "cnn_softmax"):  # these stand for one of their variants
             lines.append(
                 f"| `{name}` | `{result.run.commit[:10]}` | {result.run.machine or 'not kept'} | {result.ended} |"
             )

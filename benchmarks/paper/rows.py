@@ -1,4 +1,4 @@
-"""Rows of the comparison, and what ours must beat."""
+"""Rows of the comparison, and the bars of our method."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -20,26 +20,37 @@ from model_training.evaluation.error_measures import (
     wilson_interval,
 )
 
-#: Images that the paper's 84 iterations show: four times 70 % of its frames.
+#: Number of images that the paper's 84 iterations show: four times 70 % of its frames.
 PAPER_IMAGES = round(4 * 0.7 * 46_741)
 METHODS = (
     "streetfix", "cnn_knn", "cnn_softmax", "icp_pointnetlk_googlenet", "scan_context", "raw_range", "dual_encoder", "fov_encoder",
 )  # fmt: skip
-TRAINED_BY_US = ("streetfix", "streetfix_as_paper")  # on the comparison's data: what must lead
-#: Methods that train what another name stands for in ``Pace``.
+#: Our methods that are trained on the comparison's data. They must lead.
+TRAINED_BY_US = ("streetfix", "streetfix_as_paper")
+#: Methods whose training has another name in ``Pace``.
 PACED_AS = {"streetfix_as_paper": "streetfix"} | dict.fromkeys(STAGES, "googlenet")
 METRICS = (("street_accuracy", "share"), ("mean_distance_error_m", "m"), ("mse_m2", "m2"), ("training_minutes", "min"))
 
 
 def errors_of(answers: PlaceAnswers, test: Pairs) -> NDArray[np.float64]:
-    """Distances (n), metres; a query without an answer counts as if the middle of all places had been answered."""
+    """Return position errors (n,), metres; a query without an answer gets the mean position of all queries.
+
+    Args:
+        answers: answers of a method.
+        test: test queries with ground truth.
+    """
     truth = np.asarray(test.T_map_camera)[:, :2, 3]
     xy = np.where(np.isfinite(answers.xy), answers.xy, truth.mean(axis=0))
     return distance_errors(xy, truth)
 
 
 def figures_of(answers: PlaceAnswers, test: Pairs) -> dict[str, float]:
-    """The comparison's figures of one method on one split."""
+    """Return the comparison's figures of one method on one split.
+
+    Args:
+        answers: answers of the method.
+        test: test queries with ground truth.
+    """
     errors = errors_of(answers, test)
     return {
         "street_accuracy": float((answers.street == np.asarray(test.street)).mean()),
@@ -51,9 +62,14 @@ def figures_of(answers: PlaceAnswers, test: Pairs) -> dict[str, float]:
 
 
 def minutes_for_paper_images(method: str, result: MethodResult, pace: Pace | None) -> float | None:
-    """Processor minutes of training at the number of images that the paper's iterations show; None where nothing is learnt.
+    """Return processor minutes of training for the number of images of the paper's iterations; None without learning.
 
-    By what all methods took in turn in one run, where that was measured; else by what this method's training took.
+    The measured pace has priority. Otherwise the time is scaled from the method's own training.
+
+    Args:
+        method: name of the method.
+        result: result of the method.
+        pace: measured training pace; None if absent.
     """
     if not result.images or result.training_s is None:
         return None
@@ -62,14 +78,14 @@ def minutes_for_paper_images(method: str, result: MethodResult, pace: Pace | Non
 
 
 def _paced_minutes(method: str, result: MethodResult, pace: Pace | None) -> float | None:
-    """The same in turn with the other methods; a variant of the paper's network by its own pace."""
+    """Return the minutes by measured pace; a variant of the paper's network has its own pace."""
     variant = result.method.removeprefix("cnn_knn_").removeprefix("cnn_softmax_")
     paced = PACED_AS.get(method, method) if variant == result.method else f"cnn_{variant}"
     return None if pace is None else pace.minutes(paced, PAPER_IMAGES)
 
 
 def _quickest_other(results: Mapping[str, MethodResult], pace: Pace | None) -> float | None:
-    """Minutes of the quickest learned method but ours: of all that were measured in turn, or of those that have run."""
+    """Return the minutes of the quickest learned method other than ours, by measured pace or else by own training."""
     if pace is None:
         found = [
             minutes_for_paper_images(name, result, None)
@@ -88,7 +104,15 @@ def all_rows(
     missing: Mapping[str, str],
     pace: Pace | None = None,
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Write every method's rows, ours against the best of the others; returns the figures by method and split."""
+    """Add every method's rows, ours with bars from the best other method; return figures by method and split.
+
+    Args:
+        report: collects the rows.
+        results: results by method.
+        tests: test queries by split.
+        missing: reason for an absent method, by name.
+        pace: measured training pace; None if absent.
+    """
     found = {
         method: {split: figures_of(result.answers[split], tests[split]) for split in SPLITS}
         for method, result in results.items()
@@ -118,7 +142,7 @@ def all_rows(
 
 
 def _rows_of_other_pictures(report: Report, variant: str, result: MethodResult) -> None:
-    """What a variant reaches where its queries are not RGB-D: LiDAR frames, the paper's split among them, and depth alone."""
+    """Add a variant's figures for queries other than RGB-D: LiDAR frames (also by the paper's split) and depth alone."""
     for key in ("lidar.same_drive", "lidar.other_drive", "depth.same_drive", "depth.other_drive"):
         asked = result.extra["asked"][key]
         for method, (accuracy, mean_m) in (("cnn_knn", asked["knn"][str(PAPER_K)]), ("cnn_softmax", asked["softmax"])):

@@ -16,11 +16,16 @@ from model_training.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PR
 
 INK, OURS, THEIRS, PRINTED = "#22303c", "#2a7f62", "#b5532a", "#9aa5ad"
 BASELINE_M, PAPER_MIN = 30.3, 138.0  # as Table III prints
-LEAST_M = 0.01  # what a logarithmic axis begins with
+#: Lower end of a logarithmic axis, metres.
+LEAST_M = 0.01
 
 
 def clean(axes: Axes) -> None:
-    """Without what frames a plot, with a faint grid."""
+    """Remove the upper and right frame of a plot, and add a faint grid.
+
+    Args:
+        axes: plot to change.
+    """
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     axes.grid(alpha=0.3)
@@ -28,7 +33,11 @@ def clean(axes: Axes) -> None:
 
 
 def table_one(data: PaperData) -> Figure:
-    """Frames and test images of each class, the paper's beside ours."""
+    """Draw the frames and test images of each class, the paper's beside ours.
+
+    Args:
+        data: shared data.
+    """
     figure, panels = plt.subplots(1, 2, figsize=(11, 4.6), sharey=True, layout="tight")
     here = np.bincount(np.asarray(data.frames.street), minlength=len(CLASS_NAMES))
     asked = np.bincount(np.asarray(data.tests["other_drive"].street), minlength=len(CLASS_NAMES))
@@ -48,7 +57,12 @@ def table_one(data: PaperData) -> Figure:
 
 
 def table_two(data: PaperData, results: Mapping[str, MethodResult]) -> Figure:
-    """Errors of the five cases' images on another drive: all of them as dots, their median as a line."""
+    """Draw the errors of the five cases on another traversal: images as dots, their median as a line.
+
+    Args:
+        data: shared data.
+        results: results by method.
+    """
     shown = [name for name in ("cnn_knn", "streetfix") if name in results]
     test = data.tests["other_drive"]
     street, rng = np.asarray(test.street), np.random.default_rng(0)
@@ -71,7 +85,13 @@ def table_two(data: PaperData, results: Mapping[str, MethodResult]) -> Figure:
 
 
 def table_three(results: Mapping[str, MethodResult], figures: Figures, pace: Pace | None) -> Figure:
-    """Mean error and street accuracy on another drive, and minutes of training for the paper's images, by method."""
+    """Draw mean error and street accuracy on another traversal, and training minutes for the paper's images, by method.
+
+    Args:
+        results: results by method.
+        figures: figures by method and split.
+        pace: measured training pace; None if absent.
+    """
     shown = [name for name in TITLES if name in figures]
     names = ["paper: CNN + K-NN", "paper: its baseline", *shown]
     colours = [PRINTED, PRINTED, *(OURS if name.startswith("streetfix") else THEIRS for name in shown)]
@@ -93,7 +113,7 @@ def table_three(results: Mapping[str, MethodResult], figures: Figures, pace: Pac
 
 
 def _bars(axes: Axes, values: Sequence[float | None], colours: Sequence[str], title: str, *, log: bool = False) -> None:
-    """A bar a value, its figure beside it; None leaves a gap."""
+    """Draw a bar with its figure for each value; None leaves a gap."""
     known = [value for value in values if value is not None]
     if log:
         axes.set_xscale("log")

@@ -1,4 +1,4 @@
-"""The paper's tables with its figures beside ours, as Markdown."""
+"""The paper's tables beside our figures, as Markdown."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ from benchmarks.paper.rows import errors_of, minutes_for_paper_images
 from model_training.baselines.paper.variants import WHAT
 from model_training.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PRINTED, PAPER_FRAMES, TEST_IMAGES
 
-#: Table II as printed: class, and what it calls MSE.
+#: Table II as printed: the class, and the value that the paper calls MSE.
 TABLE_II = (("Beginning of street 1", 0.09224), ("Beginning of street 9", 0.0326), ("End of street 5", 0.0598),
             ("Between", 0.0489), ("Street 6", 0.0543))  # fmt: skip
 PAPER_MEDIAN, PAPER_MSE, PAPER_MED_M, PAPER_ACCURACY = 0.0489, 0.057568, 0.804, 0.9752
@@ -34,7 +34,12 @@ Figures = Mapping[str, Mapping[str, Mapping[str, float]]]
 
 
 def title(method: str, results: Mapping[str, MethodResult]) -> str:
-    """A method's title; of the paper's, which variant it is, of how many that have run."""
+    """Return a method's title; for the paper's method also the variant, and the number of variants that ran.
+
+    Args:
+        method: name of the method.
+        results: results by method.
+    """
     title, variant = TITLES[method], results[method].method.removeprefix(f"{method}_")
     if variant == results[method].method:
         return title
@@ -47,7 +52,11 @@ def title(method: str, results: Mapping[str, MethodResult]) -> str:
 
 
 def table_one(data: PaperData) -> list[str]:
-    """Frames and test images of each class."""
+    """Return Table I: frames and test images of each class.
+
+    Args:
+        data: shared data.
+    """
     frames = np.bincount(np.asarray(data.frames.street), minlength=16)
     tests = {split: np.bincount(np.asarray(data.tests[split].street), minlength=16) for split in SPLITS}
     lines = [
@@ -67,7 +76,12 @@ def table_one(data: PaperData) -> list[str]:
 
 
 def table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]:
-    """The five cases, one image and all images, and what is wrong with the printed column."""
+    """Return Table II: the five cases by one image and by all images, and the errors of the printed column.
+
+    Args:
+        data: shared data.
+        results: results by method.
+    """
     shown = [name for name in ("cnn_knn", "streetfix") if name in results]
     lines = [
         "## Table II: five cases", "",
@@ -80,7 +94,7 @@ def table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]
     street = np.asarray(test.street)
     errors = {name: errors_of(results[name].answers["other_drive"], test) for name in shown}
     rng = np.random.default_rng(0)
-    told: list[list[float]] = []  # a row a case
+    told: list[list[float]] = []  # one row per case
     for name, printed in TABLE_II:
         rows = np.flatnonzero(street == CLASS_NAMES.index(name))
         if not len(rows):
@@ -113,7 +127,13 @@ def table_two(data: PaperData, results: Mapping[str, MethodResult]) -> list[str]
 
 
 def table_three(results: Mapping[str, MethodResult], figures: Figures, pace: Pace | None) -> list[str]:
-    """Errors, streets and training of every method."""
+    """Return Table III: errors, street accuracy and training of every method.
+
+    Args:
+        results: results by method.
+        figures: figures by method and split.
+        pace: measured training pace; None if absent.
+    """
     lines = [
         "## Table III: methods", "",
         ("Queries are RGB-D pairs. Training time is processor time of all cores; making the data is not in it, drawing batches is. "

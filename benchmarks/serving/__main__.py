@@ -1,7 +1,9 @@
-"""``make bench-serving``: the service against the bare pipeline, under overload, swaps, signals and hostile clients.
+"""``make bench-serving``: measure the service against the bare pipeline, under overload, swaps, signals and hostile clients.
 
-The paper's city, its survey thinned at a metre, the stock encoder; server on one core, load generator on the other. Everything
-that is simulated or built is kept under ``--work``, where ``make evaluate`` keeps it too. Run it on an idle machine.
+The default map is the paper's city, its survey thinned to one metre, with the stock encoder. The server has one core,
+the load generator
+another. The command keeps everything that it simulates or builds under ``--work``, as ``make evaluate`` does. Use an
+idle machine.
 """
 
 import argparse
@@ -31,7 +33,11 @@ WITHOUT_A_MAP = {"native", "sanitizers"}
 
 
 def site_from(arguments: argparse.Namespace) -> Site:
-    """What is served: as told, else the paper's city."""
+    """Return the map and the queries of the arguments, or else of the paper's city.
+
+    Args:
+        arguments: parsed command line.
+    """
     if arguments.map is not None:
         return Site(arguments.map.resolve(), arguments.dataset.resolve(), arguments.queries, PAIRS)
     runs = Runs(arguments.work, ENCODER)
@@ -40,7 +46,7 @@ def site_from(arguments: argparse.Namespace) -> Site:
 
 
 def main() -> None:
-    """Parse, measure, write the report."""
+    """Parse the arguments, measure and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate")
     parser.add_argument("--map", type=Path, help="another bundle than the paper's city, with --dataset")

@@ -1,4 +1,4 @@
-"""Do all workers answer from the same version of a map? Finds answers that contradict each other, whatever the order in which they came."""
+"""Find answers that contradict each other about the serving version of a map, in whatever order they came."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Switch:
-    """The version that serves was changed once. Switches follow each other: one begins after the one before it was done.
+    """One change of the serving version. Switches do not overlap: each begins after the previous one is done.
 
     Attributes:
-        version: that serves afterwards.
-        begun: when whoever caused it began to, in seconds of the monotonic clock.
-        done: when it was known to hold.
+        version: version that serves afterwards.
+        begun: start of the change, seconds of the monotonic clock.
+        done: time at which the change was known to hold, seconds of the monotonic clock.
     """
 
     version: str
@@ -25,9 +25,9 @@ class Named:
     """An answer.
 
     Attributes:
-        version: that it names.
-        asked: when its request was sent, in seconds of the monotonic clock.
-        answered: when the answer was there.
+        version: version that it names.
+        asked: time of the request, seconds of the monotonic clock.
+        answered: time of the answer, seconds of the monotonic clock.
     """
 
     version: str
@@ -36,15 +36,16 @@ class Named:
 
 
 def disagreements(first: str, switches: Sequence[Switch], answers: Sequence[Named]) -> list[str]:
-    """Answers that no order of events explains.
+    """Find answers that no order of events explains.
 
-    An answer may name any version that served at a moment between its request and itself. Once an answer has named the version of a
-    switch, the switch has happened for everybody: no request that is sent later may be answered from the version before.
+    An answer may name any version that served at a moment between its request and itself. Once an answer names the
+    version of a switch, the
+    switch holds for all workers. No later request may get an answer from the version before.
 
     Args:
         first: the version that served before all switches.
-        switches: in their order.
-        answers: of all clients, in any order.
+        switches: switches in their order.
+        answers: answers of all clients, in any order.
 
     Returns:
         A line for each such answer.
@@ -53,7 +54,12 @@ def disagreements(first: str, switches: Sequence[Switch], answers: Sequence[Name
     begun, done = [each.begun for each in switches], [each.done for each in switches]
 
     def states(answer: Named, known: Sequence[float]) -> range:
-        """Numbers of the switches that may have been the last one when the version was looked up."""
+        """Return the numbers of the switches that may have been the last one when the version was looked up.
+
+        Args:
+            answer: the answer.
+            known: times at which each switch was known to hold.
+        """
         return range(bisect_right(known, answer.asked), bisect_left(begun, answer.answered) + 1)
 
     known = list(done)
@@ -61,7 +67,7 @@ def disagreements(first: str, switches: Sequence[Switch], answers: Sequence[Name
         fitting = [state for state in states(answer, done) if versions[state] == answer.version]
         if len(fitting) == 1 and fitting[0] > 0:
             known[fitting[0] - 1] = min(known[fitting[0] - 1], answer.answered)
-    for number in range(len(known) - 2, -1, -1):  # a switch was before the next one
+    for number in range(len(known) - 2, -1, -1):  # a switch happened before the next one
         known[number] = min(known[number], known[number + 1])
     return [
         f"asked at {each.asked:.6f}, answered at {each.answered:.6f} from {each.version!r} instead of "

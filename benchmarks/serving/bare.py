@@ -1,7 +1,9 @@
-"""The bare pipeline: decode, fuse, encode, search, register in a loop, with nothing round it. What a service is compared with.
+"""The bare pipeline as a reference for services: decode, fuse, encode, search and register in a loop.
 
-``python -m benchmarks.serving.bare BUNDLE DATASET QUERIES PAIRS`` opens everything, then does what each line on its input says -
-``full SECONDS`` or ``retrieval SECONDS``, with ``fast`` for the cheapest depth encoding - and answers with a line of JSON.
+``python -m benchmarks.serving.bare BUNDLE DATASET QUERIES PAIRS`` opens everything. Then it runs the command of each
+input line and
+answers with a line of JSON. A command is ``full SECONDS`` or ``retrieval SECONDS``; ``fast`` selects the cheapest depth
+encoding.
 """
 
 import json
@@ -28,7 +30,7 @@ from service.maps.reader import MapBundle  # noqa: E402
 
 
 def main() -> None:
-    """Open, then obey."""
+    """Open the map and the queries, then run the commands of the input."""
     bundle, folder, queries, pairs = sys.argv[1:]
     limit_pools()
     opened = MapBundle.open(Path(bundle))
@@ -54,7 +56,15 @@ def main() -> None:
 
 
 def ask(localizer: Localizer, frame: QueryFrame, rgb: bytes, depth: bytes, *, refine: bool) -> None:
-    """One request's work."""
+    """Do the work of one request.
+
+    Args:
+        localizer: localizer of the map.
+        frame: query frame with its camera.
+        rgb: encoded RGB image.
+        depth: encoded depth image.
+        refine: whether to register.
+    """
     camera, spec = frame.camera.pinhole(), frame.camera.depth
     localizer.localize(
         Query(

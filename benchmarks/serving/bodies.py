@@ -5,7 +5,11 @@ from collections.abc import Mapping
 
 
 def multipart(parts: Mapping[str, bytes]) -> tuple[bytes, str]:
-    """Body and content type of a multipart/form-data request."""
+    """Return body and content type of a multipart/form-data request.
+
+    Args:
+        parts: content by name.
+    """
     boundary = uuid.uuid4().hex
     body = b"".join(
         f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"; filename="{name}"\r\n\r\n'.encode()

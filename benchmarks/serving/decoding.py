@@ -1,4 +1,4 @@
-"""What each way of sending a picture costs: processor time to decode it, and bytes on the wire, of the pictures that are asked."""
+"""Cost of each encoding of the query images: processor time to decode, and bytes to send."""
 
 import time
 from collections.abc import Callable
@@ -21,11 +21,18 @@ from service.imaging.view_grid import ViewGrid
 from service.runtime.threads import limit_pools
 
 Data = list[bytes]
-_TWICE = 2  # the larger camera's pixels are so many times as many along either side
+#: Factor of the larger camera's pixels along either side.
+_TWICE = 2
 
 
 def decoding_rows(report: Report, site: Site, *, rounds: int) -> None:
-    """Rows ``decode.WHAT.{cpu_ms,kib}``, the ways interleaved; colour at 640x480 and at twice the size."""
+    """Add rows ``decode.WHAT.{cpu_ms,kib}``, the encodings interleaved; colour at 640x480 and at twice the size.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        rounds: number of measured rounds.
+    """
     limit_pools()
     frames = list(Dataset(site.dataset).queries(site.queries))
     chosen = frames[:: max(1, len(frames) // site.pairs)][: site.pairs]
@@ -33,7 +40,7 @@ def decoding_rows(report: Report, site: Site, *, rounds: int) -> None:
     ways = _depth_ways([frame.depth_path.read_bytes() for frame in chosen], camera)
     ways |= _colour_ways([frame.rgb_path.read_bytes() for frame in chosen], camera)
     spent: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(rounds + 1):  # the first warms up
+    for _ in range(rounds + 1):  # the first round warms up
         for name, (data, decode) in ways.items():
             began = time.process_time()
             for each in data:

@@ -1,4 +1,4 @@
-"""Overload, swaps and the end of the service while others ask."""
+"""Overload, map swaps and shutdown while clients send requests."""
 
 import itertools
 import shutil
@@ -27,12 +27,20 @@ SWAPS = 50
 
 
 def overload_rows(report: Report, site: Site, *, seconds: float, rounds: int, core: int | None) -> None:
-    """Full requests at five times the rate that saturates: what is answered, how fast the rest is refused, and health meanwhile."""
+    """Add rows of full requests at five times the saturating rate: goodput, speed of refusals, and health checks.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        seconds: duration of each round.
+        rounds: number of rounds.
+        core: core of the server; None for all.
+    """
     sent = site.payloads(refine=True)
     threads = {} if core is None else {"threads": 1}
     peaks, founds, health_ms = [], [], []
     with Server(site.bundle, core=core, **threads) as server:
-        for _ in range(rounds):  # each against a peak of its own: a machine's speed drifts
+        for _ in range(rounds):  # each round has its own peak: a machine's speed drifts
             peak, _ = load(server, "rest", sent, closed(10, MANY))
             with _health(server.url) as waited_ms:
                 found, _ = load(server, "rest", sent, opened(seconds, 5 * peak.answered_per_s))
@@ -55,7 +63,7 @@ def overload_rows(report: Report, site: Site, *, seconds: float, rounds: int, co
 
 @contextmanager
 def _health(url: str) -> Iterator[list[float]]:
-    """Both health endpoints, twenty times a second, on connections of their own; a failure counts as 10 s."""
+    """Poll both health endpoints twenty times a second on separate connections; a failure counts as 10 s."""
     waited_ms: list[float] = []
     over = threading.Event()
 
@@ -82,7 +90,13 @@ def _health(url: str) -> Iterator[list[float]]:
 
 
 def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
-    """Fifty new versions of the map, one after the other, each mounted on SIGHUP while four clients ask."""
+    """Add rows of fifty map versions, one after the other, each mounted on SIGHUP while four clients send.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        core: core of the server; None for all.
+    """
     sent = site.payloads(refine=True)
     with tempfile.TemporaryDirectory(dir=site.bundle.parent) as name:
         folder = Path(name)
@@ -101,13 +115,13 @@ def swap_rows(report: Report, site: Site, *, core: int | None) -> None:
 
 
 def _version_of(bundle: Path, folder: Path, number: int) -> tuple[Path, str]:
-    """The same map as another version; files are linked, the manifest is its own."""
+    """Write the same map as another version by hard links with its own manifest."""
     part, out = folder / f".part-{number}", folder / f"v{number}"
     shutil.copytree(bundle, part, copy_function=lambda a, b: Path(b).hardlink_to(a))
     manifest = (
         read_manifest(part).model_copy(update={"made_at": datetime.now(UTC), "licence": f"bench {number}"}).stamped()
     )
-    (part / MANIFEST_FILE).unlink()  # a link: the map's own must stay
+    (part / MANIFEST_FILE).unlink()  # the file is a link: keep the original
     (part / MANIFEST_FILE).write_bytes(manifest.to_bytes())
     part.rename(out)
     return out, manifest.version
@@ -123,7 +137,12 @@ def _until_served(url: str, version: str) -> None:
 
 @contextmanager
 def asking(url: str, sent: list[Payload]) -> Iterator[tuple[list[str], list[str]]]:
-    """A client for each request, which sends it again and again inside; versions that answered, and what failed."""
+    """Run one client per request that sends it repeatedly; yield the versions that answered, and the failures.
+
+    Args:
+        url: address of the service.
+        sent: requests, one per client.
+    """
     answers, failed, stop = list[str](), list[str](), threading.Event()
 
     def ask(payload: Payload) -> None:
@@ -151,7 +170,13 @@ def asking(url: str, sent: list[Payload]) -> Iterator[tuple[list[str], list[str]
 
 
 def sigterm_rows(report: Report, site: Site, *, core: int | None) -> None:
-    """Clients that stop asking when readiness goes, as a balancer's do; every request before that is answered."""
+    """Add rows of a shutdown: clients stop when readiness ends, as behind a load balancer; every earlier request must succeed.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        core: core of the server; None for all.
+    """
     with Server(site.bundle, core=core, drain_s=3) as server:
         with asking(server.url, site.payloads(refine=True)[:4]) as (answers, failed):
             time.sleep(3)

@@ -1,4 +1,4 @@
-"""What a service of production has around it: a certificate, API keys, and a collector of traces."""
+"""The surroundings of a production service: a certificate, API keys and a collector of traces."""
 
 import ssl
 import tempfile
@@ -23,10 +23,10 @@ class Guard:
     """A certificate for this machine's loopback names, and two keys.
 
     Attributes:
-        settings: of the service, for ``Server``.
-        authority: PEM, for clients.
-        key: of a caller who may ask.
-        operator_key: of one who may change what serves.
+        settings: settings of the service, for ``Server``.
+        authority: certificate of the authority for clients, PEM.
+        key: API key of a normal caller.
+        operator_key: API key of a caller who may change the serving version.
     """
 
     settings: dict[str, object]
@@ -36,13 +36,13 @@ class Guard:
 
     @property
     def trusted(self) -> ssl.SSLContext:
-        """For clients by HTTP."""
+        """TLS context for HTTP clients."""
         return ssl.create_default_context(cadata=self.authority.decode())
 
 
 @contextmanager
 def guard() -> Iterator[Guard]:
-    """Certificate and keys in a folder that lasts as long as the context."""
+    """Provide certificate and keys in a folder that lasts as long as the context."""
     with tempfile.TemporaryDirectory(prefix="streetfix-guard-") as name:
         folder = Path(name)
         authority = trustme.CA()
@@ -60,7 +60,7 @@ def guard() -> Iterator[Guard]:
 
 
 class Collector:
-    """Takes spans by OTLP over HTTP, counts them and drops them; within the running event loop."""
+    """Receives spans by OTLP over HTTP, counts them and drops them, in the running event loop."""
 
     def __init__(self) -> None:
         self.spans = 0
@@ -70,7 +70,7 @@ class Collector:
         self.endpoint = ""
 
     async def __aenter__(self) -> Self:
-        """Listen on a port of the system's choice."""
+        """Listen on a free port."""
         await self._runner.setup()
         await web.TCPSite(self._runner, "127.0.0.1", 0).start()
         host, port = self._runner.addresses[0][:2]
@@ -78,7 +78,7 @@ class Collector:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Stop."""
+        """Stop listening."""
         await self._runner.cleanup()
 
     async def _take(self, request: web.Request) -> web.Response:

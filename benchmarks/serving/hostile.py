@@ -1,4 +1,4 @@
-"""Twenty kinds of hostile request at once: what they cost, and whether others are still answered."""
+"""Twenty-one kinds of hostile request at once: their cost, and whether other clients are still served."""
 
 import json
 import socket
@@ -24,7 +24,13 @@ _REQUEST = json.dumps({"camera": _CAMERA}).encode()
 
 
 def hostile_rows(report: Report, site: Site, *, core: int | None) -> None:
-    """Memory over what it was, requests of others that failed, and how each kind was answered."""
+    """Add rows of memory growth and of failed requests of other clients; note the response to each kind.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        core: core of the server; None for all.
+    """
     sent = site.payloads(refine=True)
     good = {"rgb": part_of(sent[0].body, b"rgb"), "depth": part_of(sent[0].body, b"depth"), "request": _REQUEST}
     kinds = hostile_kinds(good)
@@ -62,7 +68,11 @@ def hostile_rows(report: Report, site: Site, *, core: int | None) -> None:
 
 
 def hostile_kinds(good: dict[str, bytes]) -> dict[str, Callable[[str], str]]:
-    """Each sends its request once and says what came back."""
+    """Return the kinds by name; each is a function that sends its request once and returns the response in words.
+
+    Args:
+        good: parts of a valid request by name.
+    """
 
     def parts(**changed: bytes) -> Callable[[str], str]:
         return lambda url: _post(url, good | changed)
@@ -138,7 +148,7 @@ def _announce(url: str, length: int, *, wait_s: float = 0.0) -> str:
 
 
 def _slow(url: str) -> str:
-    """A byte a second until the service has had enough."""
+    """Send a byte per second until the service refuses."""
     with _connected(url) as connection:
         connection.sendall(
             b"POST /v1/localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
@@ -172,7 +182,12 @@ def _endless_headers(url: str) -> str:
 
 
 def part_of(body: bytes, name: bytes) -> bytes:
-    """Content of a part of a body that we made."""
+    """Return the content of a part of a body that we made.
+
+    Args:
+        body: multipart body.
+        name: name of the part.
+    """
     start = body.index(b"\r\n\r\n", body.index(b'name="' + name + b'"')) + 4
     boundary = body[: body.index(b"\r\n")]
     return body[start : body.index(b"\r\n" + boundary, start)]

@@ -1,4 +1,4 @@
-"""One gRPC call by hand, in HTTP/2 frames of bytes that are shared: a hundred callers with large messages need no memory of their own."""
+"""One gRPC call in raw HTTP/2 frames of shared bytes, so that a hundred callers with large messages need little memory."""
 
 import socket
 import struct
@@ -14,12 +14,13 @@ def call(address: str, path: str, message: memoryview, *, timeout_s: float) -> s
 
     Args:
         address: ``host:port``.
-        path: of the call, ``/package.Service/Method``.
-        message: as protobuf; it need not be any.
-        timeout_s: for everything.
+        path: path of the call, ``/package.Service/Method``.
+        message: bytes of the message; they need not be valid protobuf.
+        timeout_s: limit of the whole call, seconds.
 
     Returns:
-        How it ended: ``answered`` (with whatever status), ``reset``, ``closed`` or ``late``, and the bytes that were taken.
+        How it ended: ``answered`` (with whatever status), ``reset``, ``closed`` or ``late``, and the MiB that were
+            sent.
     """
     host, _, port = address.rpartition(":")
     sent = 0
@@ -61,7 +62,7 @@ def call(address: str, path: str, message: memoryview, *, timeout_s: float) -> s
 
 
 def _read(connection: socket.socket, windows: dict[int, int]) -> str:
-    """One frame; how the call ended, or nothing."""
+    """Read one frame; return how the call ended, or nothing."""
     length, kind, flags, stream = struct.unpack(">IBBI", b"\x00" + _exactly(connection, 9))
     payload = _exactly(connection, length)
     if kind == _WINDOW and stream in windows:
@@ -69,7 +70,7 @@ def _read(connection: socket.socket, windows: dict[int, int]) -> str:
     elif kind == _SETTINGS and not flags & _ACK:
         for at in range(0, length, 6):
             name, value = struct.unpack_from(">HI", payload, at)
-            if name == 4:  # of streams that are there already, too
+            if name == 4:  # applies to existing streams too
                 windows[1] += value - 65_535
         connection.sendall(_frame(_SETTINGS, _ACK, 0, b""))
     elif kind == _PING and not flags & _ACK:
@@ -102,7 +103,7 @@ def _exactly(connection: socket.socket, count: int) -> bytes:
 
 
 def _literal(name: bytes, value: bytes) -> bytes:
-    """HPACK: a header that no table has."""
+    """Encode a header as an HPACK literal that no table holds."""
     return b"\x00" + bytes([len(name)]) + name + bytes([len(value)]) + value
 
 

@@ -1,4 +1,4 @@
-"""A limit of memory round a process and its children: a control group where this machine lets us make one, else a watcher that kills."""
+"""A memory limit for a process and its children: a control group where possible, else a watcher that kills."""
 
 import os
 import signal
@@ -17,10 +17,10 @@ _EVERY_S = 0.02
 
 
 class Limited:
-    """Whoever calls ``enter`` (in a child, before it executes) may not take more memory than the limit.
+    """Memory limit for each process that calls ``enter`` (in a child, before it executes).
 
     Args:
-        limit_mib: of memory; there is no swap beside it.
+        limit_mib: limit of the memory, MiB; no swap is added.
     """
 
     def __init__(self, limit_mib: int) -> None:
@@ -36,14 +36,14 @@ class Limited:
             (1, _ROOT / "memory", "memory.limit_in_bytes"),
         ):
             folder = root / f"streetfix-bench-{os.getpid()}"
-            if not (root / "cgroup.procs").exists():  # else it is a plain folder, and so would ours be
+            if not (root / "cgroup.procs").exists():  # otherwise the root is a plain folder, and ours would be one too
                 continue
             try:
                 folder.mkdir()
                 if not (folder / name).exists():
                     raise OSError("no memory controller")
                 (folder / name).write_text(str(limit_mib * 2**20))
-            except OSError:  # no such version here, no controller, or no right
+            except OSError:  # this version, the controller or the permission is missing
                 with suppress(OSError):
                     folder.rmdir()
                 continue
@@ -54,20 +54,24 @@ class Limited:
 
     @property
     def enter(self) -> Callable[[], None] | None:
-        """For ``preexec_fn``; None where nothing has to be done in the child."""
+        """Function for ``preexec_fn``; None if the child needs none."""
         if self._folder is None:
             return None
         procs = self._folder / "cgroup.procs"
         return lambda: _join(procs)
 
     def watch(self, pid: int) -> None:
-        """Look at a process' memory from now on."""
+        """Watch the memory of a process from now on.
+
+        Args:
+            pid: the process.
+        """
         self._watcher = threading.Thread(target=self._look, args=(pid,), daemon=True)
         self._watcher.start()
 
     @property
     def killed(self) -> int:
-        """Processes that were killed for their memory."""
+        """Number of processes that were killed for their memory."""
         if self._folder is None:
             return self._watched_kills
         name = "memory.events" if self._version == 2 else "memory.oom_control"
@@ -76,17 +80,17 @@ class Limited:
 
     @property
     def peak_mib(self) -> float:
-        """Most memory at once that is no file's page, as seen every twentieth of a second or oftener."""
+        """Largest memory without file pages, MiB, sampled every 20 ms."""
         return self._peak_mib
 
     def __enter__(self) -> Self:
-        """It is made already."""
+        """Return itself: the limit exists already."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Take the group away; its processes must have ended."""
+        """Remove the group; its processes must have ended."""
         self._over.set()
         if self._watcher is not None:
             self._watcher.join()
@@ -97,7 +101,7 @@ class Limited:
         while not self._over.wait(_EVERY_S):
             try:
                 now = self._anonymous_mib(pid)
-            except (OSError, RequestError):  # it has ended
+            except (OSError, RequestError):  # already ended
                 return
             self._peak_mib = max(self._peak_mib, now)
             if self._folder is None and now > self.limit_mib:

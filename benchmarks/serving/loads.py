@@ -15,7 +15,14 @@ WARM_UP_S = 2.0
 
 
 def load(server: Server | Host, face: str, sent: list[Payload], how: Load) -> tuple[Summary, list[Shot]]:
-    """One run over ``rest`` or ``grpc``; a peer has ``rest`` alone."""
+    """Run one load; return its summary and its requests.
+
+    Args:
+        server: service under test.
+        face: ``rest`` or ``grpc``; a peer has ``rest`` only.
+        sent: requests, sent in turn.
+        how: amount of load.
+    """
     before: Usage | None = None
     after: Usage | None = None
 
@@ -35,10 +42,20 @@ def load(server: Server | Host, face: str, sent: list[Payload], how: Load) -> tu
 
 
 def closed(seconds: float, clients: int) -> Load:
-    """Clients that wait for each answer."""
+    """Return a load of clients that wait for each answer.
+
+    Args:
+        seconds: measured duration.
+        clients: number of clients.
+    """
     return Load(rate=None, concurrency=clients, warm_up_s=WARM_UP_S, duration_s=seconds)
 
 
 def opened(seconds: float, rate: float) -> Load:
-    """Arrivals at random that wait for nothing."""
+    """Return a load of random arrivals that wait for nothing.
+
+    Args:
+        seconds: measured duration.
+        rate: arrivals per second.
+    """
     return replace(closed(seconds, 1), rate=rate)

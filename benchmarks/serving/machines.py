@@ -1,4 +1,4 @@
-"""What is measured and what measures, each in a process of its own, each on a core of its own."""
+"""The processes under test and their clients, each process on its own core."""
 
 import json
 import os
@@ -22,14 +22,19 @@ from model_training.loadtest.processes import Usage, descendants, usage
 from service.errors import StreetfixError
 
 SERVED_CORE, LOADING_CORE = 0, 1
-#: A service that is not ready after this long is ended.
+#: Time after which a service that is not ready is ended, seconds.
 _READY_S = 300.0
 _CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
 _SERVE = [sys.executable, "-c", "from service.cli.main import main; main()", "serve"]
 
 
 def pin(pid: int, core: int | None) -> None:
-    """Keep a process, and what it starts, on one core; None lets it have all."""
+    """Keep a process, and the processes that it starts, on one core.
+
+    Args:
+        pid: the process; 0 for this one.
+        core: number of the core; None allows all.
+    """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(pid, _CORES if core is None else {core})
 
@@ -44,16 +49,16 @@ def launch(
     enter: Callable[[], None] | None = None,
     **settings: object,
 ) -> subprocess.Popen[str]:
-    """Start the real command; its first lines on standard output say where it listens.
+    """Start the real command; its first lines on standard output give its addresses.
 
     Args:
         maps: bundle, or folder of bundles.
-        port: of REST; 0 lets the system choose.
-        grpc_port: of gRPC; 0 lets the system choose.
-        stderr: where its log goes; None shows it.
+        port: port of REST; 0 lets the system choose.
+        grpc_port: port of gRPC; 0 lets the system choose.
+        stderr: target of its log; None shows it.
         temporary: folder of its temporary files; None leaves that to the system.
-        enter: called in its process before it begins, as to enter a control group.
-        settings: as in the environment, lower case.
+        enter: called in its process before it begins, for example to enter a control group.
+        **settings: settings as in the environment, in lower case.
     """
     environment = os.environ | {f"STREETFIX_{name.upper()}": str(value) for name, value in settings.items()}
     if temporary is not None:
@@ -62,19 +67,19 @@ def launch(
         [*_SERVE, str(maps), "--port", str(port), "--grpc-port", str(grpc_port)], cwd=ROOT, env=environment,
         stdout=subprocess.PIPE, stderr=stderr, text=True,
         process_group=0,  # Ctrl-C ends the measurement, which then ends the service
-        preexec_fn=enter,  # the load generator has not begun its threads yet
+        preexec_fn=enter,  # the load generator has not started its threads yet
     )  # fmt: skip
 
 
 class Server:
-    """The real command, until it is ready.
+    """The real command, started and ready.
 
     Args:
         maps: bundle, or folder of bundles.
-        core: it is pinned to; None for all.
-        trusted: authorities of its certificate, where it speaks TLS.
-        log: gets each line of its log; None shows them.
-        launching: as of ``launch``.
+        core: core that it is pinned to; None for all.
+        trusted: TLS context that trusts its certificate; None without TLS.
+        log: receives each line of its log; None shows them.
+        **launching: further arguments of ``launch``.
 
     Raises:
         RuntimeError: it ended before it was ready.
@@ -106,19 +111,22 @@ class Server:
         self.ready_s = time.perf_counter() - began
 
     def __enter__(self) -> Self:
-        """It runs already."""
+        """Return itself: the service runs already."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop it."""
+        """Stop the service."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         self.wait(120)
 
     def wait(self, timeout_s: float | None = None) -> int:
-        """Wait for its end and for the end of its log; its exit code.
+        """Wait for the end of the service and of its log; return its exit code.
+
+        Args:
+            timeout_s: longest time to wait, seconds; None waits without limit.
 
         Raises:
             subprocess.TimeoutExpired: it has not ended.
@@ -135,15 +143,19 @@ class Server:
 
     @property
     def used(self) -> Usage:
-        """Processor time and memory of it and its children."""
+        """Processor time and memory of the service and its children."""
         return usage(self.process.pid)
 
 
 def kill_tree(pid: int) -> None:
-    """End a process and all that came of it, at once."""
+    """Kill a process and all its descendants at once.
+
+    Args:
+        pid: the process.
+    """
     try:
         tree = descendants(pid)
-    except StreetfixError:  # it has ended
+    except StreetfixError:  # already ended
         return
     for each in tree:
         try:
@@ -158,7 +170,7 @@ def _pass_on(stream: IO[str], log: Callable[[str], None]) -> None:
 
 
 def _until(stream: IO[str] | None, *patterns: str) -> list[str]:
-    """First groups of patterns, each found in a line after the one before."""
+    """Return the first groups of patterns, each found in a line after the previous one."""
     found: list[str] = []
     for line in stream or ():
         if match := re.search(patterns[len(found)], line):
@@ -169,7 +181,15 @@ def _until(stream: IO[str] | None, *patterns: str) -> list[str]:
 
 
 class Bare:
-    """``benchmarks.serving.bare`` in a process of its own."""
+    """``benchmarks.serving.bare`` in its own process.
+
+    Args:
+        bundle: the map.
+        dataset: folder of the dataset.
+        queries: name of the query set.
+        pairs: number of queries to use.
+        core: core that it is pinned to; None for all.
+    """
 
     def __init__(
         self, bundle: Path, dataset: Path, queries: str, pairs: int, *, core: int | None = SERVED_CORE
@@ -180,17 +200,25 @@ class Bare:
         self._line()
 
     def __enter__(self) -> Self:
-        """It runs already."""
+        """Return itself: the process runs already."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop it."""
+        """Stop the process."""
         self.process.communicate(timeout=120)
 
     def run(self, what: str, seconds: float) -> dict[str, float]:
-        """``full``, ``retrieval`` or ``retrieval fast`` for some seconds: ``cpu_ms`` of each, ``per_s``, ``n``."""
+        """Run the pipeline for some seconds; return ``cpu_ms`` of each query, ``per_s`` and ``n``.
+
+        Args:
+            what: ``full``, ``retrieval`` or ``retrieval fast``.
+            seconds: duration.
+
+        Raises:
+            RuntimeError: the process takes no input.
+        """
         name, *more = what.split()
         if self.process.stdin is None:
             raise RuntimeError("the bare pipeline takes no input")
@@ -206,7 +234,14 @@ class Bare:
 
 
 def proportional_mib(pid: int) -> float:
-    """Memory of a process in MiB, pages that several share counted in parts (Pss)."""
+    """Return the memory of a process in MiB; shared pages count in parts (Pss).
+
+    Args:
+        pid: the process.
+
+    Raises:
+        RuntimeError: the system does not report Pss.
+    """
     text = (Path("/proc") / str(pid) / "smaps_rollup").read_text()
     found = re.search(r"^Pss:\s+(\d+) kB", text, re.MULTILINE)
     if found is None:
@@ -216,14 +251,15 @@ def proportional_mib(pid: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What a process and its descendants hold at a moment.
+    """Resources of a process and its descendants at a moment.
 
     Attributes:
-        anonymous_mib: pages of no file (``Pss_Anon``), shared ones counted in parts; pages of mapped maps come and go, these stay.
-        private_dirty_mib: pages that a process alone has written (``Private_Dirty``).
+        anonymous_mib: pages without a file (``Pss_Anon``), shared ones in parts. Pages of mapped maps come and go,
+            these stay.
+        private_dirty_mib: pages that only one process has written (``Private_Dirty``).
         resident_mib: all pages in memory (``Rss``).
         descriptors: open files and sockets.
-        threads: of all processes.
+        threads: threads of all processes.
     """
 
     anonymous_mib: float
@@ -234,7 +270,11 @@ class Held:
 
 
 def held(pid: int) -> Held:
-    """What a process and its descendants hold now; one that ends meanwhile is left out."""
+    """Return the resources of a process and its descendants now; a process that ends meanwhile is left out.
+
+    Args:
+        pid: the process.
+    """
     memory, descriptors, threads = {"Pss_Anon": 0.0, "Private_Dirty": 0.0, "Rss": 0.0}, 0, 0
     for each in descendants(pid):
         folder = Path("/proc") / str(each)

@@ -22,7 +22,7 @@ from service.geometry.rigid import (
 from service.geometry.uncertainty import covariance_at
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
-from service.localization.prior import Prior
+from service.localization.prior import POSITION_STD_M, Prior
 from service.localization.reasons import Reason
 from service.localization.rivals import distinct_candidates, shares_of
 from service.localization.search import Neighbour
@@ -309,7 +309,7 @@ def _prior(prior: schema.Prior) -> Prior:
             "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out", field="prior"
         )
     position = prior.position
-    std_m = next((known.std_m for known in (position, prior.wgs84) if known is not None), 20.0)
+    std_m = next((known.std_m for known in (position, prior.wgs84) if known is not None), POSITION_STD_M)
     return Prior(
         position_m=None if position is None else np.array([position.x, position.y]),
         position_std_m=std_m,

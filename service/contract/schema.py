@@ -7,7 +7,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, 
 from pydantic.config import JsonDict
 
 from service.errors import NotLocalizedError, RequestError
-from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS
+from service.localization.prior import HEADING_STD_DEG, POSITION_STD_M
+from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS, NEIGHBOURS
 
 #: Limits of a focal length, in widths or heights of the image: 175 and 0.6 degrees of view. A value outside was given in another unit
 #: than pixels.
@@ -152,7 +153,7 @@ class PriorPosition(_Strict):
 
     x: float = Field(ge=-1e7, le=1e7)
     y: float = Field(ge=-1e7, le=1e7)
-    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each coordinate, metres")
+    std_m: float = Field(POSITION_STD_M, ge=1e-3, le=1e6, description="standard deviation of each coordinate, metres")
 
 
 class PriorWgs84(_Strict):
@@ -160,7 +161,9 @@ class PriorWgs84(_Strict):
 
     latitude_deg: float = Field(ge=-90, le=90)
     longitude_deg: float = Field(ge=-180, le=180)
-    std_m: float = Field(20.0, ge=1e-3, le=1e6, description="standard deviation of each horizontal coordinate, metres")
+    std_m: float = Field(
+        POSITION_STD_M, ge=1e-3, le=1e6, description="standard deviation of each horizontal coordinate, metres"
+    )
 
 
 class Prior(_Strict):
@@ -171,14 +174,17 @@ class Prior(_Strict):
     heading_deg: float | None = Field(
         None, ge=-360, le=360, description="heading of the optical axis, counter-clockwise from map x"
     )
-    heading_std_deg: float = Field(20.0, ge=1e-3, le=360, description="standard deviation of the heading")
+    heading_std_deg: float = Field(HEADING_STD_DEG, ge=1e-3, le=360, description="standard deviation of the heading")
 
 
 class Options(_Strict):
     """Options of the localization and of its answer."""
 
     neighbours: int = Field(
-        5, ge=1, le=MOST_NEIGHBOURS, description="k: number of distinct places that vote and that the answer lists"
+        NEIGHBOURS,
+        ge=1,
+        le=MOST_NEIGHBOURS,
+        description="k: number of distinct places that vote and that the answer lists",
     )
     refine: bool = Field(
         True,

@@ -6,6 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+#: Standard deviations of a prior that gives none: of each coordinate, metres, and of the heading, degrees.
+POSITION_STD_M, HEADING_STD_DEG = 20.0, 20.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prior:
@@ -19,9 +22,9 @@ class Prior:
     """
 
     position_m: Float64[NDArray[np.float64], "2"] | None = None
-    position_std_m: float = 20.0
+    position_std_m: float = POSITION_STD_M
     heading_rad: float | None = None
-    heading_std_rad: float = float(np.deg2rad(20.0))
+    heading_std_rad: float = float(np.deg2rad(HEADING_STD_DEG))
 
     def log_weight(
         self, xy: Float64[NDArray[np.float64], "n 2"], heading_rad: Float64[NDArray[np.float64], " n"]

@@ -10,8 +10,8 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 from service.localization.prior import Prior
 
-#: Upper limit of the option ``neighbours``.
-MOST_NEIGHBOURS = 50
+#: Default and upper limit of the option ``neighbours``.
+NEIGHBOURS, MOST_NEIGHBOURS = 5, 50
 #: Default share of the out-of-map queries in calibration that may be accepted. All kinds have equal weight (decisions 0039, 0084).
 FALSE_ACCEPT_RATE = 0.02
 #: Lower limit of the option ``false_accept_rate``. No calibration could measure a lower rate.
@@ -42,7 +42,7 @@ class Query:
     camera: PinholeCamera
     down_camera: Float64[NDArray[np.float64], "3"] | None = None
     T_vehicle_camera: Transform | None = None
-    neighbours: int = 5
+    neighbours: int = NEIGHBOURS
     refine: bool = True
     ranked: int = 0
     prior: Prior | None = None

@@ -17,7 +17,7 @@ from service.localization.decoding import DepthFormat, decoded_query
 from service.localization.frames import Frame
 from service.localization.localizer import Localizer
 from service.localization.prior import Prior
-from service.localization.query import Query
+from service.localization.query import NEIGHBOURS, Query
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission
 from service.runtime.last_answers import LastAnswers
@@ -71,7 +71,7 @@ class EncodedQuery:
     max_range_m: float | None = None
     down_camera: NDArray[np.float64] | None = None
     T_vehicle_camera: NDArray[np.float64] | None = None
-    neighbours: int = 5
+    neighbours: int = NEIGHBOURS
     refine: bool = True
     prior: Prior | None = None
     prior_wgs84: tuple[float, float] | None = None
