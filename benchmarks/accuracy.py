@@ -1,10 +1,9 @@
 """``make evaluate``: measure accuracy on simulated cities and real frames -> reports/accuracy.json.
 
 The parts cover retrieval by the stock encoder, retrieval by an encoder trained on the paper's city, the raw range
-image, and registration.
-The command simulates the cities from seeds that no training uses (``model_training.training.recipe``). It keeps
-finished work under ``--work``
-and reuses it. An interrupted run therefore continues.
+image, and registration. The command simulates the cities from seeds that no training uses
+(``model_training.training.recipe``). It keeps finished work under ``--work`` and reuses it. An interrupted run
+therefore continues.
 """
 
 import argparse

@@ -1,11 +1,9 @@
 """Run the code blocks of README and docs as a reader would, page after page, in a temporary folder.
 
 The fence gives the kind of a block. ``sh`` and ``python`` run, ``json`` and ``yaml`` must parse, ``text`` is not code.
-A comment
-``<!-- not run: WHY -->`` above a fence says why the block cannot run here. A comment ``<!-- file: NAME -->`` writes the
-block to a file
-first. ``streetfix serve`` runs in the background until its block ends. A block that needs a service, but does not start
-one, gets one.
+A comment ``<!-- not run: WHY -->`` above a fence says why the block cannot run here. A comment ``<!-- file: NAME -->``
+writes the block to a file first. ``streetfix serve`` runs in the background until its block ends. A block that needs a
+service, but does not start one, gets one.
 """
 
 import json

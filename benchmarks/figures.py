@@ -6,8 +6,7 @@ A document marks such a figure by comments, which Markdown does not show::
     <!-- figure: code false_accept_rate .0% -->2 %<!-- /figure -->
 
 The first word is a report or ``code``. The second is the id of a row or a name of ``CODE``. The third is a format of
-Python; a percentage
-gets a space. ``make reports`` writes the figures again. A test fails if one is out of date.
+Python; a percentage gets a space. ``make reports`` writes the figures again. A test fails if one is out of date.
 """
 
 import json

@@ -1,10 +1,9 @@
 """Retrieval on real stereo frames by the protocol of the data folder's README.
 
 Gallery: all headings of 14 single frames and 10 full scans, and the mirror image of each as a further place. Queries: 7
-stereo frames
-with SGBM depth, straight and turned by +-6 degrees, each also mirrored. These are 42 queries, of which 7 are
-independent. A query is
-correct if its own place (mirrored or not) comes first. All sides use only elevations below +2.5 degrees.
+stereo frames with SGBM depth, straight and turned by +-6 degrees, each also mirrored. These are 42 queries, of which 7
+are independent. A query is correct if its own place (mirrored or not) comes first. All sides use only elevations below
++2.5 degrees.
 """
 
 from dataclasses import dataclass

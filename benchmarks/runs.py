@@ -1,8 +1,7 @@
 """Shared work of benchmarks: datasets, maps and answers, made once under one folder, and rows of shares.
 
 The name of each kept result includes its inputs: the plan, the encoder, and the code that simulates, builds and
-answers. A change of any
-of them therefore causes a new measurement.
+answers. A change of any of them therefore causes a new measurement.
 """
 
 import hashlib
@@ -29,7 +28,8 @@ from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
 
-#: Only each third query of a set is given to the raw image. It is slow, and so many queries distinguish 0.3 from 0.4.
+#: Only each third query of a set is given to the raw image. It is slow, and a third of the queries suffices to
+#: distinguish 0.3 from 0.4.
 RAW_EVERY = 3
 
 

@@ -1,4 +1,4 @@
-"""What registration costs: all hypotheses and their verification, on one core."""
+"""Cost of registration: all hypotheses and their verification, on one core."""
 
 import time
 from dataclasses import replace
@@ -18,14 +18,19 @@ BARS_MS = {"precise": 25.0, "stereo": 40.0}
 
 
 def speed_rows(report: Report, runs: Runs) -> None:
-    """Median processor time of the stage: of a query with registration less that of the same query without."""
+    """Add the median processor time of the stage: with registration minus without, for the same query.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     dataset = runs.dataset(unseen_plan(0))
     bundle = runs.bundle(dataset)
     localizer = Localizer(bundle, Encoder.open(bundle.encoder_bytes(), threads=1))
     for preset in BOTH:
         times = []
         frames = list(dataset.queries(f"drive1_{preset}"))[:QUERIES]
-        with threadpool_limits(1):  # as a service has them: threads that wait for work spin, and their time would count
+        with threadpool_limits(1):  # as in a service: waiting threads spin, and their time would count
             for frame in frames:
                 query = frame.query(bundle.grid)
                 times.append(_spent_ms(localizer, query) - _spent_ms(localizer, replace(query, refine=False)))

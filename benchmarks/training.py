@@ -1,6 +1,6 @@
-"""``make bench-training``: how fast training, simulation, the demo and the tests are on this machine.
+"""``make bench-training``: measure training, simulation, demo and tests on this machine -> reports/training.json.
 
-Run it on an otherwise idle machine. Speeds are of the command's own code paths, loading and writing included.
+Use an idle machine. The speeds include loading and writing, as in the commands.
 """
 
 import argparse
@@ -28,17 +28,29 @@ from model_training.training.packs import Pack, PackPlan, make_packs
 from service.imaging.view_grid import ViewGrid
 
 PAPER_FRAMES, PAPER_EPOCHS, PAPER_MINUTES = 46_741, 4, 138
-BENCH_SEED = 1900  # of training, used by no recipe
+#: Seed of training data that no recipe uses.
+BENCH_SEED = 1900
 
 
 def packs_for_bench(work: Path) -> list[Path]:
-    """Two cities, as large as those of the stock recipe."""
+    """Make two cities of the size of the stock recipe; return their packs.
+
+    Args:
+        work: folder of the packs.
+    """
     plans = [PackPlan(seed=BENCH_SEED + k) for k in range(2)]
     return make_packs(plans, work / "packs", ViewGrid())
 
 
 def own_size(report: Report, packs: list[Path], work: Path, steps: int) -> None:
-    """The training loop itself: drawing, augmenting, stepping, logging, saving."""
+    """Add the speed of the training loop: drawing, augmenting, stepping, logging and saving.
+
+    Args:
+        report: collects the rows.
+        packs: training packs.
+        work: folder of the run.
+        steps: training steps.
+    """
     seen: list[tuple[float, int]] = []
 
     def note(progress: Progress) -> None:
@@ -47,7 +59,7 @@ def own_size(report: Report, packs: list[Path], work: Path, steps: int) -> None:
     run = work / "bench-run"
     shutil.rmtree(run, ignore_errors=True)
     train(packs, run, TrainingConfig(steps=steps), device="cpu", report=note)
-    (began, first), (ended, last) = seen[4], seen[-1]  # the first steps read the packs from disk for the first time
+    (began, first), (ended, last) = seen[4], seen[-1]  # the first steps read the packs from disk
     images = (last - first) * 2 * TrainingConfig().pairs / (ended - began)
     minutes = PAPER_FRAMES * PAPER_EPOCHS / images / 60
     report.row("training.images_per_s", images, "1/s", n=last - first)
@@ -56,7 +68,13 @@ def own_size(report: Report, packs: list[Path], work: Path, steps: int) -> None:
 
 
 def paper_size(report: Report, packs: list[Path], steps: int) -> None:
-    """The same network and loss at the paper's 224 x 224: views are enlarged after augmentation."""
+    """Add the speed of the same network and loss at the paper's 224 x 224; views are enlarged after augmentation.
+
+    Args:
+        report: collects the rows.
+        packs: training packs.
+        steps: training steps.
+    """
     shape = EncoderShape(rows=224, columns=224)
     net, grid, device = EncoderNet(shape).to(memory_format=torch.channels_last), ViewGrid(), torch.device("cpu")
     rng, city = np.random.default_rng(0), City(Pack.open(packs[0]), grid, turn_deg=TrainingConfig().turn_deg)
@@ -86,7 +104,12 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
 
 
 def simulation(report: Report, work: Path) -> None:
-    """Whole frames on disk a second: 32 x 1024 scans, and 640 x 480 pairs with JPEG and PNG."""
+    """Add the rate of frames written to disk: 32 x 1024 scans, and 640 x 480 pairs with JPEG and PNG.
+
+    Args:
+        report: collects the rows.
+        work: folder of the dataset.
+    """
     times: dict[str, list[tuple[float, int]]] = {}
 
     def note(stage: str, done: int, _total: int) -> None:
@@ -107,13 +130,18 @@ def simulation(report: Report, work: Path) -> None:
     shutil.rmtree(folder)
 
 
-#: The two commands of the README: target and arguments, minutes that it may take.
+#: The two commands of the README: target and arguments, and the longest time in minutes.
 WALLS = {"demo": (("demo", "ARGS=--once"), 4), "test": (("test",), 15)}
 
 
 def walls(report: Report, names: Iterable[str] = WALLS) -> None:
-    """The two commands of the README on a fresh clone; what they install comes from the package cache, as after the downloads."""
-    # A make that called us hands its own arguments on, ours among them.
+    """Add the times of the README's two commands on a fresh clone; packages come from the cache.
+
+    Args:
+        report: collects the rows.
+        names: names of the commands, keys of ``WALLS``.
+    """
+    # A calling make passes its own arguments on, including ours.
     surroundings = {
         name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS", "ARGS"))
     }
@@ -131,7 +159,7 @@ def walls(report: Report, names: Iterable[str] = WALLS) -> None:
 
 
 def main() -> None:
-    """Parse, measure, write the report."""
+    """Parse the arguments, measure and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=ROOT / "data" / "bench")
     parser.add_argument("--steps", type=int, default=60)

@@ -1,4 +1,4 @@
-"""What PCA-based removal of weather noise does to a survey driven in snow: flakes taken out, structure lost, recall of the map."""
+"""Effect of the PCA-based weather filter on a survey in snow: flakes removed, structure lost, and recall of the map."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,13 +11,18 @@ from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import EVALUATION_SEEDS
 from service.imaging.weather import remove_weather_noise
 
-#: A return of the snowy scan is a flake's if the clear day's scan from the same pose has nothing this near, as far as beams are dense.
+#: A return of the snowy scan counts as a flake if the clear scan from the same pose has no point within the first
+#: distance. The second distance limits the test to ranges with dense beams.
 FLAKE_APART_M, JUDGED_M = 0.5, 20.0
 SCANS = 100
 
 
 def snow_plan(survey_condition: str) -> SimulationPlan:
-    """A small unseen city, surveyed in snow or on a clear day; queries are of a clear day."""
+    """Plan a small unseen city with a survey in snow or on a clear day; the queries are of a clear day.
+
+    Args:
+        survey_condition: ``snow`` or ``clear``.
+    """
     queries = (QueryPlan(name="drive1", traversal=1, count=250, depths=("precise",)),)
     return SimulationPlan(
         name=f"survey-in-{survey_condition}", seed=EVALUATION_SEEDS[10], size_m=(200.0, 260.0), survey_condition=survey_condition,
@@ -26,7 +31,12 @@ def snow_plan(survey_condition: str) -> SimulationPlan:
 
 
 def removed_and_lost(snow: Dataset, clear: Dataset) -> tuple[float, float, int]:
-    """Share of flakes that the filter takes out, share of structure that it takes with them, and number of flakes."""
+    """Return the share of flakes that the filter removes, the share of structure that it loses, and the number of flakes.
+
+    Args:
+        snow: dataset surveyed in snow.
+        clear: the same dataset surveyed on a clear day.
+    """
     flakes = removed = structure = lost = 0
     for number in np.linspace(0, len(snow.survey_poses()) - 1, SCANS).astype(int):
         points = snow.scan(int(number))[:, :3]
@@ -40,7 +50,12 @@ def removed_and_lost(snow: Dataset, clear: Dataset) -> tuple[float, float, int]:
 
 
 def weather_rows(report: Report, runs: Runs) -> None:
-    """The effect of ``build-map --remove-weather`` on a snowy survey, beside the clear day's."""
+    """Add the effect of ``build-map --remove-weather`` on a snowy survey, beside the clear day's figures.
+
+    Args:
+        report: collects the rows.
+        runs: simulates, builds and answers, or reuses what is kept on disk.
+    """
     clear, snow = (runs.dataset(snow_plan(condition)) for condition in ("clear", "snow"))
     removed, lost, flakes = removed_and_lost(snow, clear)
     report.row("weather.snow.flakes_removed", removed, "share", n=flakes)

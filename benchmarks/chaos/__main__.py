@@ -1,13 +1,10 @@
 """``make chaos``: disturb a running service at random and check its answers -> reports/serving.json.
 
 Each step does one thing to a service with several workers. It sends a signal, kills a worker, opens slow connections,
-aborts connections,
-fills the disk or changes the API keys. It also adds, removes, damages or half copies map versions, or chooses one.
-After the step, REST
-and gRPC must answer a known query correctly, from the version that should serve. Otherwise they must refuse with a
-clear error. All
-workers must agree. Other threads send requests meanwhile.
-The same seed repeats the same steps.
+aborts connections, fills the disk or changes the API keys. It also adds, removes, damages or half copies map versions,
+or chooses one. After the step, REST and gRPC must answer a known query correctly, from the version that should serve.
+Otherwise they must refuse with a clear error. All workers must agree. Other threads send requests meanwhile. The same
+seed repeats the same steps.
 
 Example: python -m benchmarks.chaos --seed 7 --steps 120
 """

@@ -24,7 +24,8 @@ Kind = Literal["answer", "refusal", "lost"]
 What = Literal["maps", "full", "retrieval", "stream"]
 Face = Literal["rest", "grpc"]
 FACES: tuple[Face, ...] = ("rest", "grpc")
-#: Generous on purpose: this check does not measure speed, and other work may share the machine.
+#: Longest wait for an answer, seconds. It is generous: this check does not measure speed, and other work may share the
+#: machine.
 TIMEOUT_S = 150.0
 _OPTIONS = (("grpc.use_local_subchannel_pool", 1), ("grpc.max_receive_message_length", -1), ("grpc.enable_retries", 0))
 

@@ -1,8 +1,8 @@
 """``make choices``: measure each design choice in a validation city -> reports/choices.json.
 
 No training and no bar uses this city. The command trains encoders for a few hundred steps, each with one change.
-Compare their figures
-with each other, not with the stock encoder's. The command keeps runs under ``--work`` and continues after a stop.
+Compare their figures with each other, not with the stock encoder's. The command keeps runs under ``--work`` and
+continues after a stop.
 """
 
 import argparse

@@ -1,8 +1,7 @@
 """``make fuzz``: fuzz every parser of untrusted input with a million inputs -> reports/serving.json.
 
 Atheris mutates the inputs, guided by coverage. Each target runs in its own process, so a crash stops only that target.
-The command keeps
-the crashing input under ``--work``. Turn each into a test.
+The command keeps the crashing input under ``--work``. Turn each such input into a test.
 """
 
 import argparse

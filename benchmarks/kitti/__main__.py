@@ -1,9 +1,8 @@
 """``make bench-kitti ROOT=...``: measure place recognition on KITTI by two protocols -> reports/kitti.json.
 
 Published protocol (R@1 within 10 m): every scan of a sequence is a place. The map leaves out only the scan of the
-query's own moment, so
-scans a metre away remain. Held-out protocol: the same street on another day, and loops that close more than a minute
-later.
+query's own moment, so scans a metre away remain. Held-out protocol: the same street on another day, and loops that
+close more than a minute later.
 """
 
 import argparse

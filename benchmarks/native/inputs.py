@@ -1,8 +1,7 @@
 """Call every C function with random inputs, ordinary and extreme, and print a hash of each result.
 
 ``python_in`` runs this module in an unpacked wheel. Under sanitizers a bad access ends in a report. The lines of two
-compilers' builds
-must be equal. All NaN values compare equal, because no standard fixes their bit pattern.
+compilers' builds must be equal. All NaN values compare equal, because no standard fixes their bit pattern.
 
 Example: python -m benchmarks.native.inputs --rounds 40
 """
@@ -52,7 +51,8 @@ def camera_of(rng: np.random.Generator, height: int, width: int) -> PinholeCamer
 
     Args:
         rng: source of randomness.
-        height, width: size of the image, pixels.
+        height: height of the image, pixels.
+        width: width of the image, pixels.
     """
     focal = width * float(np.exp(rng.uniform(-2.5, 2.5)))
     at = rng.uniform(-0.5, 1.5, 2) if rng.random() < 0.2 else rng.uniform(0.4, 0.6, 2)
@@ -64,7 +64,8 @@ def depth_of(rng: np.random.Generator, height: int, width: int) -> NDArray[np.fl
 
     Args:
         rng: source of randomness.
-        height, width: size of the image, pixels.
+        height: height of the image, pixels.
+        width: width of the image, pixels.
     """
     depth = rng.uniform(0.3, 45.0, (height, width)).astype(np.float32)
     if rng.random() < 0.5:  # smooth, like surfaces

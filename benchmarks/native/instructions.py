@@ -1,10 +1,8 @@
 """Find instructions of x86-64 libraries that not every x86-64 processor has.
 
 An instruction belongs to the baseline if the disassembler puts it in a baseline group. An instruction without a group
-belongs to the
-baseline if it is in the list below. Every other instruction counts as beyond, so the check also finds instructions that
-the disassembler
-does not know well.
+belongs to the baseline if it is in the list below. Every other instruction counts as beyond, so the check also finds
+instructions that the disassembler does not know well.
 """
 
 from collections import Counter

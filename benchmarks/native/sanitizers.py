@@ -1,10 +1,8 @@
 """``make sanitize``: run all C code under AddressSanitizer and UndefinedBehaviorSanitizer.
 
 The command builds the package with both. It runs the unit tests of the modules that call C, then random inputs of
-extreme shapes and
-values. It exits with 0 without a report, and with 1 after a report or a failure. Without a compiler with sanitizers it
-prints a message
-and skips the check; if ``CI`` is set, it then exits with 1.
+extreme shapes and values. It exits with 0 without a report, and with 1 after a report or a failure. Without a compiler
+with sanitizers it prints a message and skips the check; if ``CI`` is set, it then exits with 1.
 """
 
 import os

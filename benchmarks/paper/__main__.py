@@ -1,10 +1,8 @@
 """``make paper``: compare the paper's method, its baseline, others and ours on the same data -> reports/paper.json, paper.md, figures.
 
 The full size takes some hours on two cores. The command keeps finished work under ``--work``: data by blocks, trainings
-by checkpoints.
-It continues after a stop. It also keeps the answers of each method beside the report. So ``--only`` runs some methods,
-``--tables``
-runs none, and the report covers all methods that ever ran.
+by checkpoints. It continues after a stop. It also keeps the answers of each method beside the report. So ``--only``
+runs some methods, ``--tables`` runs none, and the report covers all methods that ever ran.
 """
 
 import argparse

@@ -1,10 +1,9 @@
 """Our method in the comparison: an encoder trained from scratch on the same data, and the stock encoder.
 
 The encoder of ``streetfix`` has the training budget of every learned method. The encoder of ``streetfix_as_paper`` sees
-as many images
-as the paper's 84 iterations show its CNN. Both use the same frames and pairs. The encoder of ``streetfix_stock`` has
-never seen this
-city. Every map is built by the normal command. Every answer counts, accepted or not.
+as many images as the paper's 84 iterations show its CNN. Both use the same frames and pairs. The encoder of
+``streetfix_stock`` has never seen this city. Every map is built by the normal command. Every answer counts, accepted or
+not.
 """
 
 import tempfile
@@ -91,8 +90,7 @@ def pack_of(data: PaperData, shape: EncoderShape) -> Path:
     """Write frames and pairs as a training pack with an encoder's columns: all columns, or every second one.
 
     Every second column of a query lies a quarter of a column to the left of the column of a coarser grid. This offset
-    is smaller than the
-    turns that training draws.
+    is smaller than the turns that training draws.
 
     Args:
         data: shared data.

@@ -1,8 +1,7 @@
 """Training time of each learned method for the same number of images, measured by steps of all methods in turn in one run.
 
 The trainings themselves run on different machines beside other work. Their times cannot be compared. So this comparison
-is a run of its
-own: some steps of every method, round after round.
+is a run of its own: some steps of every method, round after round.
 """
 
 import json
@@ -99,8 +98,8 @@ def measure_pace(data: PaperData, report: Callable[[str, int, int], None]) -> Pa
     """Measure all learned methods in turn, each with one thread.
 
     Of the paper's baseline only the first network counts: an image is one that GoogLeNet learns from. The time of
-    PointNetLK is left out, in
-    the baseline's favour. Data of another size than the paper's get a single step, as a check that everything runs.
+    PointNetLK is left out, in the baseline's favour. Data of another size than the paper's get a single step, as a
+    check that everything runs.
 
     Args:
         data: shared data.

@@ -1,9 +1,8 @@
 """``make bench-serving``: measure the service against the bare pipeline, under overload, swaps, signals and hostile clients.
 
 The default map is the paper's city, its survey thinned to one metre, with the stock encoder. The server has one core,
-the load generator
-another. The command keeps everything that it simulates or builds under ``--work``, as ``make evaluate`` does. Use an
-idle machine.
+the load generator another. The command keeps everything that it simulates or builds under ``--work``, as ``make
+evaluate`` does. Use an idle machine.
 """
 
 import argparse

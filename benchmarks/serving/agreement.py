@@ -39,8 +39,7 @@ def disagreements(first: str, switches: Sequence[Switch], answers: Sequence[Name
     """Find answers that no order of events explains.
 
     An answer may name any version that served at a moment between its request and itself. Once an answer names the
-    version of a switch, the
-    switch holds for all workers. No later request may get an answer from the version before.
+    version of a switch, the switch holds for all workers. No later request may get an answer from the version before.
 
     Args:
         first: the version that served before all switches.

@@ -1,9 +1,8 @@
 """The bare pipeline as a reference for services: decode, fuse, encode, search and register in a loop.
 
 ``python -m benchmarks.serving.bare BUNDLE DATASET QUERIES PAIRS`` opens everything. Then it runs the command of each
-input line and
-answers with a line of JSON. A command is ``full SECONDS`` or ``retrieval SECONDS``; ``fast`` selects the cheapest depth
-encoding.
+input line and answers with a line of JSON. A command is ``full SECONDS`` or ``retrieval SECONDS``; ``fast`` selects the
+cheapest depth encoding.
 """
 
 import json

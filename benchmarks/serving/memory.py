@@ -1,7 +1,8 @@
-"""The load that needs the most memory, under a real limit of it: does the service refuse, or is it killed?
+"""The load that needs the most memory, under a real memory limit: the service must refuse and must not be killed.
 
-66 REST bodies and 114 gRPC messages of 40 MiB at once (as many as the service would let in, were they counted and not weighed),
-calls of other gRPC services with such messages, sequences whose pictures are small as files and large as pixels, and the hostile kinds.
+The load sends 66 REST bodies and 114 gRPC messages of 40 MiB at once. The service would admit as many if it counted
+requests instead of bytes. It also sends such messages to other gRPC services, sequences with small files of many
+pixels, and the hostile kinds.
 """
 
 import json
@@ -31,7 +32,7 @@ LIMIT_MIB = 2048
 SECONDS = 30.0
 BODIES, MESSAGES, OF_OTHERS, SEQUENCES, HOSTILE = 66, 114, 16, 4, 20
 LARGE_BYTES = 40 * 2**20
-#: Requests of well-behaved clients after the load.
+#: Number of requests of well-behaved clients after the load.
 AFTERWARDS = 20
 _BOUNDARY = b"memory"
 _SERVICE = "/streetfix.v1.LocalizationService"
@@ -41,13 +42,19 @@ _TIMEOUT_S = 40.0
 
 
 def memory_rows(report: Report, site: Site) -> None:
-    """Whether it survives, its peak, and what became of well-behaved clients meanwhile and afterwards."""
+    """Add rows: survival, peak memory, and the requests of well-behaved clients during and after the load.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+    """
     sent = site.payloads(refine=True)
     good = _good_parts(sent[0].body, sent[0].content_type)
     with Limited(LIMIT_MIB) as limited:
-        # Where no control group can be made the service sees the machine's memory, so it is told what the limit would have left.
+        # Without a control group the service sees the machine's memory, so it gets the value that the limit would have
+        # left.
         told: dict[str, int] = {} if limited.enter else {"request_memory_mib": LIMIT_MIB // 2}
-        told["limits__max_message_bytes"] = LARGE_BYTES  # by default gRPC would refuse such messages by their length
+        told["limits__max_message_bytes"] = LARGE_BYTES  # with the default, gRPC refuses such messages by their length
         with Server(site.bundle, core=None, enter=limited.enter, **told) as server:
             limited.watch(server.process.pid)
             ends: dict[str, Counter[str]] = {}
@@ -75,7 +82,7 @@ def memory_rows(report: Report, site: Site) -> None:
 
 
 def _until_over(attackers: list[tuple[str, Callable[[], str]]], ends: dict[str, Counter[str]]) -> None:
-    """All of them at once, each again and again."""
+    """Run all attackers at once, each repeatedly."""
     until, begin = time.monotonic() + SECONDS, threading.Barrier(len(attackers))
     for name, _ in attackers:
         ends.setdefault(name, Counter())
@@ -124,14 +131,14 @@ def _against(kind: Callable[[str], str], url: str) -> Callable[[], str]:
 
 
 def _sent(url: str, path: str, body: memoryview, *, chunked: bool) -> str:
-    """A POST whose body is sent whether or not an answer is there already."""
+    """Send a POST whose body continues even after an early answer."""
     at = urlsplit(url)
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary={_BOUNDARY.decode()}\r\n"
     head += "Transfer-Encoding: chunked\r\n\r\n" if chunked else f"Content-Length: {len(body)}\r\n\r\n"
     try:
         with socket.create_connection((at.hostname, at.port), timeout=_TIMEOUT_S) as connection:
             connection.sendall(head.encode())
-            with suppress(ConnectionResetError, BrokenPipeError):  # it was refused, which its answer says
+            with suppress(ConnectionResetError, BrokenPipeError):  # the request was refused; the answer says so
                 _send_body(connection, body, chunked=chunked)
             return (
                 connection.recv(200).split(b"\r\n")[0].decode("ascii", "replace").removeprefix("HTTP/1.1 ") or "closed"
@@ -163,7 +170,7 @@ def _asked(url: str, payload: Payload) -> str:
 
 
 def _large_body() -> bytes:
-    """A body of the largest size whose pictures are whole: 3200 x 3200 pixels of noise, which do not compress."""
+    """Make a body of the largest size with complete images: 3200 x 3200 pixels of noise, which does not compress."""
     rng = np.random.default_rng(0)
     rgb = _png(rng.integers(0, 256, (_SIDE, _SIDE, 3), np.uint8))
     depth = _png(rng.integers(2000, 20_000, (_SIDE // 2, _SIDE // 2), np.uint16))
@@ -173,7 +180,7 @@ def _large_body() -> bytes:
 
 
 def _large_message() -> bytes:
-    """The same by gRPC, its rest bytes of no field that we know."""
+    """Make the same for gRPC, padded with bytes of an unknown field."""
     rng = np.random.default_rng(0)
     message = pb.LocalizeRequest(
         rgb=_png(rng.integers(0, 256, (_SIDE, _SIDE, 3), np.uint8)),
@@ -183,17 +190,17 @@ def _large_message() -> bytes:
         setattr(message.camera, name, value)
     written = message.SerializeToString()
     left = LARGE_BYTES - 32 - len(written)
-    return written + b"\xfa\x7f" + _varint(left) + bytes(left)  # field 2047, bytes
+    return written + b"\xfa\x7f" + _varint(left) + bytes(left)  # field 2047, type bytes
 
 
 def _as_frame(message: memoryview) -> bytes:
-    """A message as the frame of a stream's message, which is answered."""
+    """Wrap a message as the frame of a stream's message, which the service answers."""
     number = pb.LocalizeStreamRequest.DESCRIPTOR.fields_by_name["frame"].number
     return _varint(number << 3 | 2) + _varint(len(message)) + message
 
 
 def _sequence() -> bytes:
-    """Sixteen frames of 24 million pixels each, all of one colour and one depth: 4 KiB to 100 KiB as files."""
+    """Make sixteen frames of 24 million pixels each with one colour and one depth: 4 KiB to 100 KiB as files."""
     width, height = 6000, 4000
     rgb, depth = _png(np.full((height, width, 3), 90, np.uint8), 9), _png(np.full((height, width), 5000, np.uint16), 9)
     camera = {"width": width, "height": height, "fx": 3000.0, "fy": 3000.0, "cx": 2999.5, "cy": 1999.5}
@@ -224,7 +231,7 @@ def _varint(value: int) -> bytes:
 
 
 def _good_parts(body: bytes, content_type: str) -> dict[str, bytes]:
-    """Parts of a request that is answered."""
+    """Return the parts of a request that the service answers."""
     delimiter = b"--" + content_type.partition("boundary=")[2].encode()
     found: dict[str, bytes] = {}
     for piece in body.split(delimiter)[1:-1]:

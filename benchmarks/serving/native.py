@@ -1,4 +1,4 @@
-"""The compiled code as it is shipped: its instructions, whether builds of two compilers answer alike, and what sanitizers report."""
+"""The compiled code as shipped: its instructions, equal answers of two compilers' builds, and sanitizer reports."""
 
 import platform
 import tempfile
@@ -17,13 +17,21 @@ QUERIES = 200
 
 
 def native_plan() -> SimulationPlan:
-    """A small city: what the compiled code does with a query does not depend on the size of the map."""
+    """Plan a small city: the work of the compiled code per query does not depend on the size of the map."""
     queries = (QueryPlan(name="drive1", traversal=1, count=QUERIES, depths=("stereo",)),)
     return SimulationPlan(name="native", seed=EVALUATION_SEEDS[1], size_m=(160.0, 160.0), queries=queries)
 
 
 def native_rows(report: Report, work: Path) -> None:
-    """A wheel built without a system compiler: its instructions, and its answers beside those of a wheel built with gcc."""
+    """Add rows of a wheel built without a system compiler: its instructions, and its answers against a gcc build.
+
+    Args:
+        report: collects the rows.
+        work: folder of datasets and maps.
+
+    Raises:
+        RuntimeError: the answers of a build failed or are incomplete.
+    """
     with tempfile.TemporaryDirectory() as folder:
         by_zig = build_wheel(Path(folder) / "zig", "zig")
         found = {library.name: beyond_baseline(library) for library in libraries(by_zig)}
@@ -59,7 +67,11 @@ def native_rows(report: Report, work: Path) -> None:
 
 
 def sanitizer_rows(report: Report) -> None:
-    """Reports of AddressSanitizer and UndefinedBehaviorSanitizer (``make sanitize``)."""
+    """Add the number of reports of AddressSanitizer and UndefinedBehaviorSanitizer (``make sanitize``).
+
+    Args:
+        report: collects the rows.
+    """
     found = sanitize()
     for each in found:
         print(each, end="\n\n")

@@ -16,19 +16,19 @@ CPU_BARS: dict[tuple[str, str], float | None] = {
     ("retrieval", "rest"): 1.12,
     ("retrieval", "grpc"): 1.15,
 }
-#: Clients of a round whose processor time counts, and of one that saturates.
+#: Clients of a round that measures processor time, and of a round that saturates.
 FEW, MANY = 2, 8
 
 
 @dataclass(frozen=True)
 class Site:
-    """What is served, and what is asked.
+    """Map and queries of a measurement.
 
     Attributes:
         bundle: the map.
-        dataset: whose queries are sent.
-        queries: name of the set.
-        pairs: different ones.
+        dataset: dataset of the queries.
+        queries: name of the query set.
+        pairs: number of different queries.
     """
 
     bundle: Path
@@ -37,14 +37,31 @@ class Site:
     pairs: int
 
     def payloads(self, *, refine: bool, fast: bool = False) -> list[Payload]:
-        """Requests; ``fast`` with the cheapest depth encoding."""
+        """Return the requests.
+
+        Args:
+            refine: whether to register.
+            fast: whether to use the cheapest depth encoding.
+        """
         return payloads(
             Dataset(self.dataset), self.queries, map_name=None, refine=refine, most=self.pairs, cheap_depth=fast
         )
 
 
 def ratio_rows(report: Report, site: Site, *, seconds: float, rounds: int, core: int | None, suffix: str = "") -> float:
-    """Rows of processor time and throughput; returns the rate that saturates the service with full requests."""
+    """Add rows of processor time and throughput; return the saturating rate of full requests, per second.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        seconds: duration of each measurement.
+        rounds: number of rounds.
+        core: core of the server; None for all.
+        suffix: end of the row ids.
+
+    Raises:
+        RuntimeError: some requests failed.
+    """
     threads = {} if core is None else {"threads": 1}
     cpu: dict[tuple[str, str], list[float]] = {}
     rate: dict[tuple[str, str], list[float]] = {}
@@ -66,7 +83,8 @@ def ratio_rows(report: Report, site: Site, *, seconds: float, rounds: int, core:
                         cpu.setdefault((what, name), []).append(found.cpu_ms_per_answer)
                 found, _ = load(server, "rest", sent, closed(seconds, MANY))
                 rate.setdefault((what, "rest"), []).append(found.answered_per_s)
-    # While one client waits the load generator is still, which on cores that share execution units else slows the service alone.
+    # With one client the load generator is idle while the service works. On cores that share execution units a busy
+    # load generator slows only the service.
     alone: dict[tuple[str, str], float | None] = {(what, f"{face}.one_client"): None for what, face in CPU_BARS}
     for (what, face), bar in (CPU_BARS | alone).items():
         each = [a / b for a, b in zip(cpu[what, face], cpu[what, "bare"], strict=True)]
@@ -81,7 +99,7 @@ def ratio_rows(report: Report, site: Site, *, seconds: float, rounds: int, core:
     for what in ("full", "retrieval"):
         each = [a / b for a, b in zip(rate[what, "rest"], rate[what, "bare"], strict=True)]
         name = "throughput_over_bare" + ("" if what == "full" else ".retrieval")
-        # On several cores the bare loop is still one thread.
+        # On several cores the bare loop still has one thread.
         report.row(f"{name}{suffix}", median(each), "ratio", bar=None if suffix or what != "full" else 0.90, n=rounds)
         report.row(f"{what}.bare_cpu_ms{suffix}", median(cpu[what, "bare"]), "ms", n=rounds)
     if not suffix:
@@ -101,7 +119,17 @@ def ratio_rows(report: Report, site: Site, *, seconds: float, rounds: int, core:
 
 
 def tail_rows(report: Report, site: Site, *, seconds: float, rounds: int, core: int | None) -> None:
-    """Latency of retrieval at 70 % of the rate that saturates; the median round, since one stall of the machine is 1 % of one."""
+    """Add the latency of retrieval at 70 % of the saturating rate, by the median round.
+
+    The median excludes a stall of the machine, which can be 1 % of a round.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        seconds: duration of each saturation; latency takes three times as long.
+        rounds: number of rounds.
+        core: core of the server; None for all.
+    """
     sent = site.payloads(refine=False)
     threads = {} if core is None else {"threads": 1}
     middle, spread = [], []

@@ -1,26 +1,34 @@
-"""Write RVL, as ROS' compressedDepth may hold it (Wilson, Fast lossless depth image compression, ISS 2017); the service only reads it."""
+"""Write RVL, as ROS' compressedDepth may hold it (Wilson, Fast lossless depth image compression, ISS 2017).
+
+The service itself only reads RVL.
+"""
 
 import struct
 
 import numpy as np
 from numpy.typing import NDArray
 
-_BITS, _MORE, _NIBBLES = 3, 8, 8  # of a nibble, that another one follows, of a word
+#: Bits of a nibble, the flag of a continued nibble, and nibbles of a word.
+_BITS, _MORE, _NIBBLES = 3, 8, 8
 
 
 def write_rvl(values: NDArray[np.uint16]) -> bytes:
-    """Width, height, then words of nibbles, of depth (H, W)."""
+    """Encode a depth image: width, height, then words of nibbles.
+
+    Args:
+        values: depth (H, W).
+    """
     height, width = values.shape
     return struct.pack("<ii", width, height) + _packed(_numbers(values.ravel().astype(np.int64)))
 
 
 def _numbers(flat: NDArray[np.int64]) -> NDArray[np.int64]:
-    """By turns how many pixels are empty and how many are not, and after the latter their differences, signs folded in."""
+    """Return alternating counts of empty and measured pixels; the differences of measured pixels follow, signs folded in."""
     there = flat > 0
     changes = np.flatnonzero(there[1:] != there[:-1]) + 1
     bounds = np.r_[0, changes, len(flat)]
     if there[0]:
-        bounds = np.r_[0, bounds]  # it begins with no empty pixel
+        bounds = np.r_[0, bounds]  # the image begins with a measured pixel
     if len(bounds) % 2 == 0:
         bounds = np.r_[bounds, len(flat)]
     measured = flat[there]
@@ -46,5 +54,5 @@ def _packed(numbers: NDArray[np.int64]) -> bytes:
 
 
 def _bits(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of every number, 0 for 0."""
+    """Return the number of bits of every number, 0 for 0."""
     return np.ceil(np.log2(numbers + 1.0)).astype(np.int64)

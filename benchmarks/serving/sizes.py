@@ -1,4 +1,4 @@
-"""How soon it is ready, and what memory it takes."""
+"""Start time and memory of the service."""
 
 from statistics import median
 
@@ -12,7 +12,13 @@ STARTS = 5
 
 
 def size_rows(report: Report, site: Site, *, core: int | None) -> None:
-    """Of one process, and of a second one beside it."""
+    """Add the start time and memory of one process, and the memory of a second one beside it.
+
+    Args:
+        report: collects the rows.
+        site: map and queries.
+        core: core of the server; None for all.
+    """
     sent = site.payloads(refine=True)
     starts = []
     for _ in range(STARTS):

@@ -1,7 +1,7 @@
-"""Two hours of mixed traffic at 60 % of what saturates, with TLS, keys, metrics, traces, both faces and streams.
+"""Two hours of mixed traffic at 60 % of the saturating rate, with TLS, keys, metrics, traces, REST, gRPC and streams.
 
-What counts is memory: the slope of the service's anonymous pages. Pages of memory-mapped map files come and go with the system's
-cache, so they are reported beside it and not judged.
+The result is the slope of the service's anonymous memory. Pages of memory-mapped map files come and go with the
+system's cache. The report shows them, but they have no bar.
 """
 
 import asyncio
@@ -36,29 +36,29 @@ from service.geometry.rigid import inverse, quaternion_xyzw_from
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 
-#: The bar is for so many minutes.
+#: Duration for which the bar holds, minutes.
 JUDGED_MINUTES = 120.0
 LOAD = 0.6
 _CAPACITY_S, _SAMPLE_S, _SCRAPE_S, _TELL_S, _WRITE_S, _TIMEOUT_S = 20.0, 10.0, 15.0, 60.0, 600.0, 30.0
-_FRAMES = 3  # of a sequence, and requests of a batch
+_FRAMES = 3  # frames of a sequence, and requests of a batch
 _STREAM_FRAMES = 60
 _SAME_M = 1e-6
-#: How often each kind of request is drawn, and how many pairs of pictures it brings.
+#: Weight of each kind of request, and the number of image pairs that it contains.
 _MIX = {"rest": (38, 1), "grpc": (26, 1), "stream": (18, 1), "sequence": (3, _FRAMES), "batch": (3, _FRAMES),
         "refused": (6, 0), "listing": (6, 0)}  # fmt: skip
 
 
 @dataclass
 class Tally:
-    """What was sent and what became of it.
+    """Requests and their outcomes.
 
     Attributes:
-        sent: requests by kind.
-        failed: those that did not get the answer they should, by kind and reason.
-        told: the first of the failed ones, for people.
-        positions: of the first answer to each request; later answers must be the same.
-        differ: answers that were not.
-        spans: that the collector took, when last looked at.
+        sent: number of requests by kind.
+        failed: number of requests without the expected answer, by kind and reason.
+        told: the first failures in words.
+        positions: position of the first answer to each request, metres; later answers must be equal.
+        differ: number of answers that differ.
+        spans: spans that the collector had received at the last sample.
     """
 
     sent: Counter[str] = field(default_factory=Counter)
@@ -69,13 +69,23 @@ class Tally:
     spans: int = 0
 
     def fail(self, kind: str, reason: str) -> None:
-        """Count a request that did not get what it should."""
+        """Count a request without the expected answer.
+
+        Args:
+            kind: kind of the request.
+            reason: what went wrong.
+        """
         self.failed[f"{kind}: {reason[:60]}"] += 1
         if len(self.told) < 20:
             self.told.append(f"{time.strftime('%H:%M:%S')} {kind}: {reason[:300]}")
 
     def answered(self, what: str, position: tuple[float, float, float] | None) -> None:
-        """Compare an answer's position with the first one to the same request; None where the answer has no pose."""
+        """Compare an answer's position with the first answer to the same request.
+
+        Args:
+            what: name of the request.
+            position: position in the map frame, metres; None if the answer has no pose.
+        """
         if position is not None:
             first = self.positions.setdefault(what, position)
             self.differ += bool(np.abs(np.subtract(first, position)).max() > _SAME_M)
@@ -83,7 +93,15 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What the service held at a time."""
+    """Resources of the service at a time.
+
+    Attributes:
+        at_s: time since the beginning, seconds.
+        held: resources of its processes.
+        sent: requests sent so far.
+        failed: requests failed so far.
+        spans: spans received so far.
+    """
 
     at_s: float
     held: Held
@@ -93,7 +111,13 @@ class Sample:
 
 
 class Traffic:
-    """Sends each kind of request to a service behind TLS and keys, and checks what comes back."""
+    """Sends each kind of request to a service with TLS and keys, and checks the answers.
+
+    Args:
+        server: the service.
+        guarded: certificate and keys.
+        site: map and queries.
+    """
 
     def __init__(self, server: Server, guarded: Guard, site: Site) -> None:
         self.tally = Tally()
@@ -108,7 +132,7 @@ class Traffic:
 
     @asynccontextmanager
     async def open(self) -> AsyncIterator[None]:
-        """Connections that last, and the stream."""
+        """Open lasting connections and the stream."""
         headers = {"Authorization": f"Bearer {self._guard.key}", "Accept-Encoding": "identity"}
         timeout = aiohttp.ClientTimeout(total=_TIMEOUT_S)
         connector = aiohttp.TCPConnector(limit=0, ssl=self._trusted)
@@ -130,7 +154,11 @@ class Traffic:
         return grpc.aio.secure_channel(self._server.grpc, credentials, options=options)
 
     async def send(self, kind: str) -> None:
-        """One request of a kind; whatever happens is counted."""
+        """Send one request of a kind; count every outcome.
+
+        Args:
+            kind: kind of the request.
+        """
         number = next(self._turn)
         self.tally.sent[kind] += 1
         try:
@@ -144,7 +172,11 @@ class Traffic:
             self.tally.fail(kind, repr(error))
 
     async def rest(self, number: int) -> None:
-        """One pair over REST; one in eight without registration."""
+        """Send one query over REST; one in eight without registration.
+
+        Args:
+            number: number of the request.
+        """
         name, sent = self._single(number)
         content = await self._post("rest", "/v1/localize", sent.body, sent.content_type)
         if content is not None:
@@ -166,7 +198,7 @@ class Traffic:
             self.tally.fail("stream", "the stream is 200 frames behind")
 
     async def _stream(self) -> None:
-        """Frames of the queue on one stream after the other; each has a connection of its own, and every third is cancelled."""
+        """Send the queue's frames on one stream after another; each has its own connection, and every third is cancelled."""
         for turn in count():
             async with self._channel() as channel:
                 stub = LocalizationServiceStub(channel)  # type: ignore[no-untyped-call]  # generated code
@@ -177,7 +209,7 @@ class Traffic:
                     call.cancel()
 
     async def _frames_of(self, call: Any, most: int) -> bool:
-        """Send frames until the stream is old enough; whether this is the end of all."""
+        """Send frames until the stream is old enough; return whether the traffic has ended."""
         before: int | None = None
         number: int | None = 0
         try:
@@ -252,7 +284,7 @@ class Traffic:
         return [(number + k) % len(self._singles) for k in range(_FRAMES)]
 
     async def _refused(self, number: int) -> None:
-        """What must be refused: a key that is none, and a picture that is none, over each face."""
+        """Send requests that must be refused, over REST and gRPC: an invalid key and an invalid image."""
         sent = self._singles[number % len(self._singles)]
         broken = pb.LocalizeRequest()
         broken.CopyFrom(sent.message)
@@ -278,7 +310,7 @@ class Traffic:
             self.tally.fail("refused", f"got {found} instead of {wanted}")
 
     async def _listing(self, number: int) -> None:
-        """What a balancer and a console ask, each on a connection of its own."""
+        """Send the requests of a load balancer and a console, each on its own connection."""
         if number % 4 == 3:
             async with self._channel() as channel:
                 stub = LocalizationServiceStub(channel)  # type: ignore[no-untyped-call]  # generated code
@@ -297,7 +329,7 @@ class Traffic:
             self.tally.fail("listing", f"{path}: {response.status}")
 
     async def scrape(self) -> None:
-        """What Prometheus does."""
+        """Read the metrics as Prometheus does."""
         self.tally.sent["metrics"] += 1
         try:
             async with self._session.get(f"{self._server.url}/metrics") as response:
@@ -317,21 +349,21 @@ class Traffic:
         found: dict[str, Any] = json.loads(content)
         return found
 
-    _kinds: dict[str, Callable[["Traffic", int], Awaitable[None]]] = {  # noqa: RUF012  # it is never changed
+    _kinds: dict[str, Callable[["Traffic", int], Awaitable[None]]] = {  # noqa: RUF012  # never changed
         "rest": rest, "grpc": _grpc, "stream": _queue_frame, "sequence": _sequence, "batch": _batch,
         "refused": _refused, "listing": _listing,
     }  # fmt: skip
 
 
 def soak_rows(report: Report, site: Site, *, minutes: float, rate: float | None, core: int | None) -> None:
-    """Rows of memory, descriptors, threads and failures; Ctrl-C ends it early with the rows so far.
+    """Add rows of memory, descriptors, threads and failures; Ctrl-C ends early and keeps the rows so far.
 
     Args:
-        report: to add to; it is written every ten minutes.
-        site: what is served and asked.
-        minutes: how long.
-        rate: pairs of pictures a second; None takes 60 % of what one core answers over REST.
-        core: that the service is pinned to.
+        report: collects the rows; it is written every ten minutes.
+        site: map and queries.
+        minutes: duration, minutes.
+        rate: image pairs per second; None takes 60 % of what one core answers over REST.
+        core: core of the service; None for all.
     """
     asyncio.run(_soak(report, site, minutes=minutes, rate=rate, core=core))
 
@@ -406,7 +438,7 @@ async def _send(
     traffic: Traffic, rate: float, until: float, stop: asyncio.Event, running: set[asyncio.Task[None]], server: Server,
     beside: Sequence[asyncio.Task[None]],
 ) -> None:  # fmt: skip
-    """Requests as they arrive at random, which wait for no answer; until the time is over, somebody stops it or the service ends."""
+    """Send requests that arrive at random and wait for no answer, until the time is over, a signal comes or the service ends."""
     random, kinds = np.random.default_rng(0), list(_MIX)
     weights = np.array([_MIX[kind][0] for kind in kinds], float)
     shares, pairs = weights / weights.sum(), np.array([_MIX[kind][1] for kind in kinds])
@@ -415,7 +447,7 @@ async def _send(
     while due < until and not stop.is_set() and server.process.poll() is None:
         for task in beside:
             if task.done():
-                task.result()  # what watches has failed, and a soak that nobody watches is worth nothing
+                task.result()  # a monitoring task has failed, and a soak without monitoring is worthless
         due += float(random.exponential(1 / requests_per_s))
         await asyncio.sleep(max(0.0, due - time.monotonic()))
         task = asyncio.create_task(traffic.send(kinds[int(random.choice(len(kinds), p=shares))]))
@@ -424,14 +456,14 @@ async def _send(
 
 
 async def _capacity(traffic: Traffic, stop: asyncio.Event) -> float:
-    """Pairs a second that clients who wait for each answer get over REST."""
+    """Return the image pairs per second that clients get over REST if they wait for each answer."""
     until, answered = time.monotonic() + _CAPACITY_S, deque[float]()
 
     async def client(first: int) -> None:
         for number in count(first, MANY):
             if time.monotonic() >= until or stop.is_set():
                 return
-            await traffic.rest(8 * number + 1)  # never one without registration
+            await traffic.rest(8 * number + 1)  # never a request without registration
             answered.append(time.monotonic())
 
     await asyncio.gather(*(client(k) for k in range(MANY)))
@@ -455,7 +487,7 @@ def _line(samples: list[Sample], tally: Tally) -> str:
 
 
 def _write(report: Report, samples: list[Sample], tally: Tally, *, aimed: float, capacity: float | None) -> None:
-    """Rows, the series of samples and its picture; of what there is until now."""
+    """Add the rows, the series of samples and its plot from the data so far."""
     lasted = samples[-1].at_s / 60 if samples else 0.0
     short = None if lasted > JUDGED_MINUTES - 1 else f"of {lasted:.1f} minutes only; the bar is for {JUDGED_MINUTES:g}"
     sent = sum(tally.sent.values())
@@ -502,7 +534,7 @@ def _write(report: Report, samples: list[Sample], tally: Tally, *, aimed: float,
 
 
 def _slope(hours: NDArray[np.float64], values: NDArray[Any]) -> float | None:
-    """Median of the slopes of all pairs of samples (Theil and Sen): single jumps do not move it. None of fewer than three."""
+    """Return the Theil-Sen slope, the median over all pairs of samples, which single jumps do not move; None for fewer than three."""
     return float(theilslopes(values, hours).slope) if len(hours) >= 3 else None
 
 
@@ -541,10 +573,10 @@ def _draw(hours: NDArray[np.float64], series: dict[str, NDArray[Any]], path: Pat
 
 
 def _poses(site: Site) -> list[NDArray[np.float64]]:
-    """True poses of the pairs that ``Site.payloads`` sends, in their order.
+    """Return the ground-truth poses of the queries that ``Site.payloads`` sends, in their order.
 
     Raises:
-        RuntimeError: the query set has no truth, from which odometry is made.
+        RuntimeError: the query set has no ground truth, which the odometry needs.
     """
     frames = list(Dataset(site.dataset).queries(site.queries))
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(site.pairs, len(frames))).round().astype(int))
@@ -562,7 +594,7 @@ def _document(sent: Payload) -> dict[str, Any]:
 def _multipart(
     document: dict[str, Any], pairs: Sequence[pb.LocalizeRequest], *, numbered: bool = True
 ) -> tuple[bytes, str]:
-    """Body and content type of a document with the pictures of some requests."""
+    """Return body and content type of a document with the images of some requests."""
     parts = {"request": json.dumps(document).encode()}
     for k, each in enumerate(pairs):
         suffix = str(k) if numbered else ""

@@ -1,4 +1,4 @@
-"""What every baseline answers: a place on the ground and a street for each query."""
+"""The common answer of all baselines: a place on the ground and a street for each query."""
 
 from dataclasses import dataclass
 
@@ -11,16 +11,25 @@ from service.maps.streets import Streets
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceAnswers:
-    """A row a query: ``xy`` (n, 2), metres in the map, NaN where nothing was found; ``street`` (n), a class, -1 for none."""
+    """Answers of a baseline, one row per query.
+
+    Attributes:
+        xy: positions (n, 2), metres, map frame; NaN for no answer.
+        street: street classes (n,); -1 for no answer.
+    """
 
     xy: NDArray[np.float64]
     street: NDArray[np.int64]
 
 
 def nearest_streets(streets: Streets, xy: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The class whose polygon contains each point (n, 2), or else lies nearest to it; -1 for NaN.
+    """Return the street class that contains or is nearest to each position (n,); -1 for NaN.
 
-    A method that answers a position is not punished for missing a kerb: the nearest street is taken as its answer.
+    The nearest street counts as the answer, so a position just beyond a kerb is not a street error.
+
+    Args:
+        streets: streets of the map.
+        xy: positions (n, 2), metres, map frame.
     """
     shapes = [
         shapely.MultiPolygon([shapely.Polygon(rings[0], list(rings[1:])) for rings in street.polygons])

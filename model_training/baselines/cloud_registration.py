@@ -1,8 +1,8 @@
-"""Registration of a query's points to a map cloud by other people's libraries: with no guess at all, or from a retrieved pose.
+"""Registration of a query's points to a map cloud by other libraries, without an initial pose or from a retrieved pose.
 
 - KISS-Matcher (Lim et al., ICRA 2025): Faster-PFH features, graph-theoretic pruning, graduated non-convexity.
-- FPFH features and RANSAC (Rusu et al., ICRA 2009; Zhou et al., Open3D, 2018), then point to plane.
-- GICP (Koide, small_gicp, JOSS 2024) from a pose that retrieval found.
+- FPFH features and RANSAC (Rusu et al., ICRA 2009; Zhou et al., Open3D, 2018), then point-to-plane ICP.
+- GICP (Koide, small_gicp, JOSS 2024) from a retrieved pose.
 """
 
 from typing import Any
@@ -17,24 +17,24 @@ from service.geometry.rigid import Transform, transform_from
 
 Points = Float64[NDArray[np.float64], "N 3"]
 
-#: Both clouds are thinned to this for features; half of it for GICP.
+#: Voxel size of both clouds for features, metres. GICP uses half of it.
 VOXEL_M = 0.5
-#: Depth beyond it is left out: stereo errs by metres there.
+#: Largest depth, metres. Beyond it, stereo errors reach metres.
 REACH_M = 40.0
-#: A partner may be this far away while RANSAC counts its inliers, and while GICP converges.
+#: Largest distance of a correspondence, metres: for RANSAC inliers, and for GICP.
 NEAR_M, FROM_PLACE_M = 1.0, 3.0
 RANSAC_ROUNDS, RANSAC_CONFIDENCE = 1_000_000, 0.999
 
 
 def points_of_depth(depth_m: NDArray[np.float32], camera: PinholeCamera) -> Points:
-    """Back-project a depth picture.
+    """Back-project a depth image.
 
     Args:
-        depth_m: z (H, W), metres, 0 where nothing was measured.
-        camera: of the depth picture.
+        depth_m: z (H, W), metres, 0 for no measurement.
+        camera: camera of the depth image.
 
     Returns:
-        Points in the optical frame, metres.
+        Points (N, 3) in the optical frame, metres.
     """
     near = (depth_m > 0) & (depth_m < REACH_M)
     points: Points = camera.rays_of_pixels()[near] * depth_m[near][:, None].astype(np.float64)
@@ -42,7 +42,12 @@ def points_of_depth(depth_m: NDArray[np.float32], camera: PinholeCamera) -> Poin
 
 
 def thinned_to_voxels(points: Points, voxel_m: float) -> Points:
-    """Means of the points in each voxel."""
+    """Return the mean of the points in each voxel.
+
+    Args:
+        points: points (N, 3), metres.
+        voxel_m: size of a voxel, metres.
+    """
     _, of, counts = np.unique(
         np.floor(points / voxel_m).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
@@ -53,7 +58,11 @@ def thinned_to_voxels(points: Points, voxel_m: float) -> Points:
 
 
 def by_kiss_matcher(points: Points, map_points: Points) -> Transform | None:
-    """T_map_camera with no guess; None where it finds no pose.
+    """Estimate T_map_camera by KISS-Matcher without an initial pose; None if it finds no pose.
+
+    Args:
+        points: points of the query (N, 3), metres, optical frame.
+        map_points: points of the map (M, 3), metres, map frame.
 
     Raises:
         ExtraMissingError: kiss-matcher is not installed.
@@ -67,10 +76,10 @@ def by_kiss_matcher(points: Points, map_points: Points) -> Transform | None:
 
 
 class FpfhMap:
-    """A map cloud with its features, made once.
+    """A map cloud with its FPFH features, computed once.
 
     Args:
-        map_points: metres, map frame.
+        map_points: points of the map (M, 3), metres, map frame.
 
     Raises:
         ExtraMissingError: Open3D is not installed.
@@ -81,7 +90,11 @@ class FpfhMap:
         self._cloud, self._features = self._prepared(map_points)
 
     def locate(self, points: Points) -> Transform | None:
-        """T_map_camera with no guess; None where no three matches agree."""
+        """Estimate T_map_camera without an initial pose; None if no three matches agree.
+
+        Args:
+            points: points of the query (N, 3), metres, optical frame.
+        """
         registration = self._o3d.pipelines.registration
         self._o3d.utility.random.seed(0)
         cloud, features = self._prepared(points)
@@ -102,7 +115,7 @@ class FpfhMap:
         return np.array(finer.transformation)
 
     def _prepared(self, points: Points) -> tuple[Any, Any]:
-        """The thinned cloud with normals, and its features, radii as Open3D's manual advises."""
+        """Return the thinned cloud with normals, and its features; the radii follow Open3D's manual."""
         geometry = self._o3d.geometry
         cloud = geometry.PointCloud(self._o3d.utility.Vector3dVector(points)).voxel_down_sample(VOXEL_M)
         cloud.estimate_normals(geometry.KDTreeSearchParamHybrid(2 * VOXEL_M, 30))
@@ -116,7 +129,7 @@ class GicpMap:
     """A map cloud prepared for GICP.
 
     Args:
-        map_points: metres, map frame.
+        map_points: points of the map (M, 3), metres, map frame.
 
     Raises:
         ExtraMissingError: small_gicp is not installed.
@@ -129,7 +142,12 @@ class GicpMap:
         )
 
     def locate(self, points: Points, T_map_camera: Transform) -> Transform:
-        """T_map_camera from a guess."""
+        """Refine T_map_camera from an initial pose.
+
+        Args:
+            points: points of the query (N, 3), metres, optical frame.
+            T_map_camera: initial pose (4, 4).
+        """
         own, _ = self._package.preprocess_points(points, downsampling_resolution=VOXEL_M / 2, num_threads=1)
         found = self._package.align(
             self._cloud, own, self._tree, T_map_camera, registration_type="GICP",
@@ -143,5 +161,5 @@ def _package(module: str, wheel: str) -> Any:
 
     try:
         return importlib.import_module(module)
-    except ImportError as error:  # Open3D also where a library of the system is missing
+    except ImportError as error:  # Open3D also fails to import if a system library is missing
         raise ExtraMissingError(f'{module} cannot be used: {error}; pip install "{wheel}"', field=module) from error

@@ -1,7 +1,6 @@
-"""What the learned baselines share: a budget of processor time, a curve of what they gained, checkpoints to go on from.
+"""Shared parts of the learned baselines: a budget of processor time, a training curve, and checkpoints.
 
-A budget is counted in processor time of all threads, so that neither other work on the machine nor a pause changes what a
-method is given.
+The budget counts processor time of all threads. Other work on the machine and pauses therefore do not change it.
 """
 
 import json
@@ -18,14 +17,19 @@ import torch
 from service.errors import DatasetError
 
 CURVE = "curve.jsonl"
-WARM_UP = 0.02  # of a budget: the rate rises first
+#: Share of a budget during which the learning rate rises.
+WARM_UP = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class CurvePoint:
-    """State of a training after ``images`` shown: processor time (s), mean loss since the last point, and ``score``.
+    """State of a training at a point of its curve.
 
-    ``score`` is what the method watches, on frames of the training drive that are not shown; larger is better.
+    Attributes:
+        images: images shown so far.
+        processor_s: processor time so far, seconds.
+        loss: mean loss since the previous point.
+        score: validation score of the method on held-out frames of the training traversal; larger is better.
     """
 
     images: int
@@ -36,10 +40,10 @@ class CurvePoint:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch with one thread: two spend more processor time on waiting for each other than they save.
+    """Run torch with one thread inside the block: two threads spend more processor time on waiting than they save.
 
-    Measured with other work on two cores: 28.7 pictures of 112 x 112 learnt from in a second of processor time, with two
-    threads 14.6.
+    Measured with other work on two cores: 28.7 training images of 112 x 112 per second of processor time with one
+    thread, 14.6 with two.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -50,7 +54,13 @@ def one_thread() -> Iterator[None]:
 
 
 def cosine_share(share_spent: float, *, warm_up: float = 0.0, least: float = 0.01) -> float:
-    """Of a learning rate, when a share of the budget is spent: a line up, then half a cosine down to ``least``."""
+    """Return the factor of the learning rate: a linear rise, then half a cosine down to ``least``.
+
+    Args:
+        share_spent: spent share of the budget, 0 to 1.
+        warm_up: share of the budget for the rise.
+        least: smallest factor.
+    """
     if share_spent < warm_up:
         return max(share_spent / warm_up, least)
     done = (share_spent - warm_up) / (1.0 - warm_up)
@@ -58,13 +68,23 @@ def cosine_share(share_spent: float, *, warm_up: float = 0.0, least: float = 0.0
 
 
 def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
-    """Give all groups the rate, a group's ``times`` over where it has such a factor."""
+    """Set the learning rate of all groups, multiplied by a group's ``times`` if it has one.
+
+    Args:
+        optimiser: optimiser to change.
+        rate: learning rate.
+    """
     for group in optimiser.param_groups:
         group["lr"] = rate * group.get("times", 1.0)
 
 
 def rests(scores: Sequence[float], patience: int) -> int:
-    """How often a score rested: ``patience`` values in a row without a new best, counted anew after each rest."""
+    """Count the plateaus of a score: ``patience`` values in a row without a new best; the count restarts after each.
+
+    Args:
+        scores: scores in their order.
+        patience: length of a plateau.
+    """
     best, since, count = -math.inf, 0, 0
     for score in scores:
         best, since = (score, 0) if score > best else (best, since + 1)
@@ -74,11 +94,18 @@ def rests(scores: Sequence[float], patience: int) -> int:
 
 
 class Training:
-    """A run's folder: its settings, its curve and its last checkpoint.
+    """The folder of a run: settings, curve and last checkpoint.
 
-    ``settings`` (plain JSON values) are kept beside the checkpoint; a folder of other settings is refused. ``budget_s`` is no
-    setting: a run that ended at a budget goes on when it is given more. A run that may ``drops`` times go on at a lower rate
-    (``rests_so_far``) ends at the rest after them; without drops at the first.
+    The settings are kept beside the checkpoint, and a folder of other settings is refused. The budget is not a setting:
+    a run that ended at a budget continues with a larger one. With ``drops``, a run continues at a lower rate after each
+    plateau (``rests_so_far``). It ends at the plateau after the last drop.
+
+    Args:
+        folder: folder of the run.
+        settings: settings of the training, plain JSON values.
+        budget_s: budget, processor seconds.
+        patience: points without a new best score that make a plateau.
+        drops: number of plateaus after which the run continues.
 
     Raises:
         DatasetError: the folder belongs to other settings.
@@ -99,7 +126,7 @@ class Training:
 
     @property
     def processor_s(self) -> float:
-        """Processor time that the run has taken, in earlier sessions too, up to the last saved point of each."""
+        """Processor time of the run, seconds; of earlier processes it counts the time up to their last saved point."""
         return self._spent_before + time.process_time() - self._began
 
     @property
@@ -109,23 +136,30 @@ class Training:
 
     @property
     def share_spent(self) -> float:
-        """Of the budget, 0 to 1: what a learning rate may follow."""
+        """Spent share of the budget, 0 to 1; a learning rate may depend on it."""
         return min(1.0, self.processor_s / self._budget_s)
 
     @property
     def ended(self) -> str | None:
-        """Why there is nothing more to do: the budget is spent, or the score stopped gaining; None to go on."""
+        """Reason for the end: the budget is spent, or the score stopped gaining; None to continue."""
         if self.processor_s >= self._budget_s:
             return "budget"
         return "stopped gaining" if self.rests_so_far > self._drops else None
 
     @property
     def rests_so_far(self) -> int:
-        """How often the score stopped gaining: what a learning rate may follow that falls then."""
+        """Number of plateaus so far; a learning rate may depend on it."""
         return rests([point.score for point in self.curve], self._patience)
 
     def point(self, images: int, loss: float, score: float, state: Mapping[str, Any]) -> CurvePoint:
-        """Note a point of the curve and save ``state`` (state_dicts and plain values), and apart the best one so far."""
+        """Add a point to the curve and save the state, also as the best one if the score is the best so far.
+
+        Args:
+            images: images shown so far.
+            loss: mean loss since the previous point.
+            score: validation score; larger is better.
+            state: state to save: state_dicts and plain values.
+        """
         point = CurvePoint(images, self.processor_s, loss, score)
         best = not self.curve or score > max(each.score for each in self.curve)
         for name in ("checkpoint.pt", "best.pt") if best else ("checkpoint.pt",):
@@ -137,11 +171,11 @@ class Training:
         return point
 
     def checkpoint(self) -> dict[str, Any] | None:
-        """The last saved state, or None at the beginning."""
+        """Load the last saved state; None at the beginning."""
         return self._load("checkpoint.pt")
 
     def best(self) -> dict[str, Any]:
-        """The state with the best score.
+        """Load the state with the best score.
 
         Raises:
             DatasetError: nothing was saved yet.
@@ -160,17 +194,27 @@ class Training:
 
 
 def read_curve(path: Path) -> list[CurvePoint]:
-    """The points of a run; none where it has not begun."""
+    """Read the points of a run; none if it has not begun.
+
+    Args:
+        path: file of the curve.
+    """
     if not path.exists():
         return []
     return [CurvePoint(**json.loads(line)) for line in path.read_text().splitlines()]
 
 
 def write_curve(path: Path, curve: Sequence[CurvePoint]) -> None:
-    """Write the points of a run, whole or not at all."""
+    """Write the points of a run atomically.
+
+    Args:
+        path: file of the curve.
+        curve: points of the run.
+    """
     part = path.with_suffix(".part")
     part.write_text("".join(json.dumps(asdict(each)) + "\n" for each in curve))
     part.rename(path)
 
 
-Report = Callable[[str, int, int], None]  # stage, done, of; here: a method, and per mille of its budget
+#: Receives stage, number done and total; here a method and per mille of its budget.
+Report = Callable[[str, int, int], None]

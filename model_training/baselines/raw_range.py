@@ -1,9 +1,9 @@
-"""The baseline that learns nothing: nearest neighbour on the range images themselves, at its best setting.
+"""A baseline without learning: nearest neighbour on the range images themselves, at its best setting.
 
-Four ways to compare a query's range view with the map's: L2 of the log ranges over cells that both measured; the same with
-a penalty for cells that one measured and the other did not; cosine of the masked log ranges; cosine after each view's mean
-is taken off. Each with the query seen straight on, and at all turns at which the localizer asks it, which finds much more.
-The best of them is what an honest comparison must beat.
+There are four ways to compare a query's range view with the map's: L2 of log ranges over cells that both measured; the
+same with a penalty for cells that only one measured; cosine of the masked log ranges; and cosine after subtraction of
+each view's mean. Each runs with the query straight ahead, and with all turns of the localizer, which finds much more. A
+fair comparison must beat the best of them.
 """
 
 from collections.abc import Callable
@@ -29,14 +29,19 @@ CHUNK = 2048
 
 
 def _features(ranges: Ranges) -> tuple[Ranges, Ranges]:
-    """Log range against 10 m, 0 where nothing was measured, and the mask: both (n, cells)."""
+    """Return log ranges relative to 10 m, 0 for no measurement, and the mask; both (n, cells)."""
     flat = ranges.reshape(len(ranges), -1).astype(np.float32)
     mask = (flat > 0).astype(np.float32)
     return np.log(np.maximum(flat, 0.5) / 10.0).astype(np.float32) * mask, mask
 
 
 def similarities(queries: Ranges, views: Ranges) -> dict[str, Ranges]:
-    """Similarity (Q, V) of range views (Q, rows, columns) and (V, rows, columns) by every setting; larger is nearer."""
+    """Compute similarities (Q, V) by every way of comparison; larger is nearer.
+
+    Args:
+        queries: range views (Q, rows, columns), metres.
+        views: range views (V, rows, columns), metres.
+    """
     q, mq = _features(queries)
     v, mv = _features(views)
     cells = q.shape[1]
@@ -66,10 +71,16 @@ def raw_best_views(
     bundle: MapBundle, dataset: Dataset, names: list[str], *, every: int = 1,
     report: Callable[[str, int, int], None] = lambda *_: None,
 ) -> dict[str, NDArray[np.int64]]:  # fmt: skip
-    """Number of the best place of queries of the sets, by every setting; -1 where a query measures nothing.
+    """Return the best place of each query (N,) by setting; -1 for a query without measurements.
 
-    A query is asked at the same turns as the localizer asks it, by the settings that end in ``STRAIGHT`` at none. ``every`` takes each
-    n-th query of each set.
+    Queries use the same turns as the localizer. Settings that end in ``STRAIGHT`` use no turn.
+
+    Args:
+        bundle: the map.
+        dataset: dataset of the survey and the queries.
+        names: names of the query sets.
+        every: take each n-th query of each set.
+        report: receives a label, the number of places done and their total.
     """
     straight = turns_on(bundle.grid).index(0)
     queries, usable = _query_ranges(bundle, dataset, names, every)
@@ -105,7 +116,7 @@ def raw_best_views(
 def _query_ranges(
     bundle: MapBundle, dataset: Dataset, names: list[str], every: int
 ) -> tuple[Ranges, NDArray[np.bool_]]:
-    """Ranges (N, turns, rows, columns) and which queries measure anything (N)."""
+    """Return ranges (N, turns, rows, columns), and which queries (N,) measure anything."""
     grid: ViewGrid = bundle.grid
     rows, usable = [], []
     for name in names:

@@ -1,10 +1,10 @@
-"""Scan Context, from its publication (Kim and Kim, IROS 2018): what stands around a sensor, in polar bins, without learning.
+"""Scan Context (Kim and Kim, IROS 2018): the surroundings of a sensor in polar bins, without learning.
 
-Each bin of rings x sectors holds the height of its highest point above the ground. Two contexts are compared sector by sector
-(cosine of the columns, their mean) at every shift of the sectors, since nobody knows the heading. A depth picture fills a
-quarter of the sectors only, so the mean is taken over the sectors that the query fills: the publication's over all of them
-would measure mostly how much a camera does not see. Its ring key, the share of each ring that is filled, says as little about
-a quarter of a ring; so there is no search for candidates, and every place is compared at every shift.
+Each bin of rings x sectors holds the height of its highest point above the ground. Two contexts are compared sector by
+sector, by the mean cosine of the columns. The heading is unknown, so all shifts of the sectors are compared. A depth
+image fills only a quarter of the sectors, so the mean uses the sectors that the query fills. The publication's mean
+over all sectors would mostly measure the camera's narrow view. Its ring key, the filled share of each ring, is just as
+uninformative for a quarter of a ring. So there is no search for candidates, and every place is compared at every shift.
 """
 
 from collections.abc import Callable
@@ -24,19 +24,19 @@ from service.imaging.level import level_camera
 from service.imaging.view_grid import ViewGrid
 
 SPACING_M = 1.0
-CAMERA_HEIGHT_M = 1.5  # the usual one, for levelling
+CAMERA_HEIGHT_M = 1.5  # usual height, for levelling
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class ContextSettings:
-    """Bins and what fills them. ``floor_m``: points lower above the ground are left out.
+    """Bins and their content.
 
-    Chosen on a simulated city of 300 x 300 m (seed 2001, 1,868 places), shares of 150 pictures on the survey's track, and of
-    150 of another drive, whose nearest place lies within 5 m:
+    The settings were chosen on a simulated city of 300 x 300 m (seed 2001, 1,868 places). The table gives the share of
+    queries whose nearest place lies within 5 m, for 150 images on the survey's track and 150 of another traversal:
 
     ==================================================  =========  ===========
-    rings x sectors, floor, height; all else as below   on track   other drive
+    rings x sectors, floor, height; all else as below   on track   other trav.
     ==================================================  =========  ===========
     20 x 60 (the publication's), 0 m, highest           0.953      0.613
     the same, of all that the camera sees               0.753      0.433
@@ -51,6 +51,14 @@ class ContextSettings:
     60 x 180, 0.3 m, highest                            1.000      0.773
     30 x 240, 0.3 m, highest                            0.993      0.800
     ==================================================  =========  ===========
+
+    Attributes:
+        rings: number of rings.
+        sectors: number of sectors.
+        reach_m: radius of the outer ring, metres.
+        value: content of a bin: height of the highest point, or mean height.
+        floor_m: points below this height above the ground are left out, metres.
+        lidar_field: use of a depth image only the elevations that a LiDAR of the view grid sees.
     """
 
     rings: int = 40
@@ -58,13 +66,17 @@ class ContextSettings:
     reach_m: float = 40.0
     value: Literal["highest", "mean"] = "highest"
     floor_m: float = 0.3
-    lidar_field: bool = True  # of a depth picture, only what a LiDAR of the view grid's elevations would see
+    lidar_field: bool = True
 
 
 def context_of(points: NDArray[np.floating], settings: ContextSettings) -> NDArray[np.float32]:
-    """Bins (rings, sectors) of points (N, 3), metres: level, x along the heading, z above the ground; empty bins are 0.
+    """Compute the bins (rings, sectors) of points; empty bins are 0.
 
-    Ring 0 is the nearest; sector 0 begins at the heading and they go counter-clockwise.
+    Ring 0 is the nearest. Sector 0 begins at the heading, and the sectors go counter-clockwise.
+
+    Args:
+        points: points (N, 3), metres: level, x along the heading, z above the ground.
+        settings: bins and their content.
     """
     x, y, z = np.asarray(points, np.float32).T
     ring = np.floor(np.hypot(x, y) * np.float32(settings.rings / settings.reach_m)).astype(np.int64)
@@ -83,7 +95,14 @@ def context_of(points: NDArray[np.floating], settings: ContextSettings) -> NDArr
 def context_of_panorama(
     ranges: NDArray[np.floating], height_m: float, settings: ContextSettings, grid: ViewGrid | None = None
 ) -> NDArray[np.float32]:
-    """Context of a levelled LiDAR's range image all round (rows, around), metres; ``height_m`` of the LiDAR above the ground."""
+    """Compute the context (rings, sectors) of a levelled LiDAR panorama.
+
+    Args:
+        ranges: ranges (rows, around), metres, 0 for no measurement.
+        height_m: height of the LiDAR above the ground, metres.
+        settings: bins and their content.
+        grid: grid of the panorama; None for the default.
+    """
     grid = grid or ViewGrid()
     azimuth = (np.arange(grid.around) * (2 * np.pi / grid.around) - np.pi)[None]
     elevation = grid.elevations_rad[:, None]
@@ -97,7 +116,13 @@ def context_of_panorama(
 def context_of_depth(
     depth_m: NDArray[np.float32], camera: PinholeCamera, settings: ContextSettings
 ) -> NDArray[np.float32]:
-    """Context of a depth picture (H, W), z in metres, 0 where nothing was measured: back-projected and levelled."""
+    """Compute the context (rings, sectors) of a depth image, back-projected and levelled.
+
+    Args:
+        depth_m: z (H, W), metres, 0 for no measurement.
+        camera: camera of the depth image.
+        settings: bins and their content.
+    """
     level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=CAMERA_HEIGHT_M)
     measured = depth_m > 0
     points = (camera.rays_of_pixels()[measured] * depth_m[measured][:, None]) @ level.R_level_camera.T
@@ -109,9 +134,14 @@ def context_of_depth(
 
 
 def similarities(queries: NDArray[np.float32], places: NDArray[np.float32]) -> NDArray[np.float32]:
-    """One minus the distance of contexts (Q, rings, sectors) to contexts (P, rings, sectors), at the best shift: (Q, P).
+    """Compute one minus the distance of contexts (Q, P) at the best shift.
 
-    A sector that the query fills and the place does not has a cosine of 0. A query without any point is -inf to all.
+    A sector that the query fills and the place does not has a cosine of 0. A query without any point gets -inf for all
+    places.
+
+    Args:
+        queries: contexts (Q, rings, sectors).
+        places: contexts (P, rings, sectors).
     """
     asked, known = _unit_columns(queries), _unit_columns(places)
     sectors = asked.shape[2]
@@ -130,13 +160,13 @@ def similarities(queries: NDArray[np.float32], places: NDArray[np.float32]) -> N
 def locate(
     frames: Frames, test: Pairs, *, report: Report = lambda *_: None, settings: ContextSettings | None = None
 ) -> PlaceAnswers:
-    """Answer every pair of ``test`` by the frame whose context is nearest; its street by the five nearest.
+    """Answer every query by the frame with the nearest context, and its street by the five nearest.
 
     Args:
-        frames: the map's side, thinned to a place a metre.
-        test: queries; of them, only depth is looked at.
-        report: told of contexts made.
-        settings: bins; the best known by default.
+        frames: LiDAR frames, thinned here to one place per metre.
+        test: queries; only their depth is used.
+        report: receives a label, the number of contexts done and their total.
+        settings: bins and their content; None for the best known.
     """
     settings, grid = settings or ContextSettings(), ViewGrid()
     rows = thinned(frames.places[:, :2], SPACING_M)

@@ -1,4 +1,4 @@
-"""Sends requests at a rate that does not wait for answers, or from so many clients that each do."""
+"""Send requests at a rate that does not wait for answers, or from clients that each wait."""
 
 import asyncio
 import gc
@@ -18,12 +18,12 @@ class Shot:
     """One request of a run.
 
     Attributes:
-        due_s: when it was to be sent, from the run's beginning; latency counts from here, so that a generator or a service that falls
-            behind does not hide it (Tene's coordinated omission).
-        sent_s: when the generator came to send it; what lies between is the generator's own lateness.
-        done_s: when its outcome was known.
-        payload: number of the request sent.
-        reply: what came back.
+        due_s: scheduled time, seconds since the start. Latency counts from here, so that a late generator or service
+            does not hide it (Tene's coordinated omission).
+        sent_s: time of sending, seconds since the start; the difference is the generator's own delay.
+        done_s: time of the outcome, seconds since the start.
+        payload: number of the request.
+        reply: the outcome.
     """
 
     due_s: float
@@ -35,15 +35,15 @@ class Shot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Load:
-    """How much.
+    """Amount of load.
 
     Attributes:
-        rate: requests a second, arriving at random (a Poisson process); None for ``concurrency``.
-        concurrency: clients that each send the next request when they have an answer.
-        warm_up_s: the first seconds, which do not count.
-        duration_s: the seconds that do.
-        timeout_s: after which a request is given up.
-        seed: of the arrivals.
+        rate: requests per second that arrive at random (a Poisson process); None uses ``concurrency``.
+        concurrency: number of clients that each send the next request after an answer.
+        warm_up_s: duration of the warm-up, seconds; it does not count.
+        duration_s: duration that counts, seconds.
+        timeout_s: time after which a request is given up, seconds.
+        seed: seed of the arrivals.
     """
 
     rate: float | None
@@ -57,16 +57,16 @@ class Load:
 async def drive(
     target: Target, payloads: list[Payload], load: Load, tick: Callable[[float], None] = lambda _: None
 ) -> list[Shot]:
-    """Load a target; the shots of warm-up and run, by due time.
+    """Load a target; return the requests of warm-up and run, sorted by scheduled time.
 
     Args:
-        target: opened.
-        payloads: sent in turn.
-        load: how much.
-        tick: told the seconds since the beginning, now and then.
+        target: an open target.
+        payloads: requests, sent in turn.
+        load: amount of load.
+        tick: receives the seconds since the start, several times per second.
     """
     gc.collect()
-    gc.freeze()  # else a full collection, of all that was ever imported, holds up what is due for 70 ms
+    gc.freeze()  # otherwise a full garbage collection of all imported objects delays requests by 70 ms
     turn, shots, began = itertools.count(), list[Shot](), time.perf_counter()
     total = load.warm_up_s + load.duration_s
 
@@ -108,7 +108,13 @@ async def drive(
 
 
 def arrivals(rate: float, total_s: float, seed: int) -> list[float]:
-    """Times of a Poisson process of so many a second, until the total."""
+    """Draw the times of a Poisson process, seconds.
+
+    Args:
+        rate: arrivals per second.
+        total_s: end of the process, seconds.
+        seed: seed of the arrivals.
+    """
     rng = np.random.default_rng(seed)
     gaps = rng.exponential(1 / rate, size=int(rate * total_s + 10 * np.sqrt(rate * total_s) + 20))
     times = np.cumsum(gaps)

@@ -1,4 +1,4 @@
-"""A dataset's query pairs as requests, encoded once so that a load generator only sends bytes."""
+"""A dataset's queries as requests, encoded once so that a load generator only sends bytes."""
 
 import json
 import uuid
@@ -25,10 +25,10 @@ class Payload:
     """One request.
 
     Attributes:
-        body: multipart/form-data.
-        content_type: of the body.
-        message: the same for gRPC.
-        true_m: position of the camera, map frame; None where the dataset has no truth.
+        body: multipart/form-data for REST.
+        content_type: content type of the body.
+        message: the same request for gRPC.
+        true_m: position of the camera, metres, map frame; None without ground truth.
     """
 
     body: bytes
@@ -40,18 +40,18 @@ class Payload:
 def payloads(
     dataset: Dataset, queries: str | None, *, map_name: str | None, refine: bool, most: int, cheap_depth: bool = False
 ) -> list[Payload]:
-    """Requests of a query set, in its order.
+    """Encode the requests of a query set, in its order.
 
     Args:
-        dataset: opened.
-        queries: name of a set; None takes the first one with truth, else the first.
-        map_name: which map to ask; None where the service has one.
-        refine: whether to ask for registration.
-        most: no more than this many, evenly spread.
-        cheap_depth: send depth as raw16+lz4, the cheapest to encode and to decode, instead of as the file is.
+        dataset: an open dataset.
+        queries: name of a set; None takes the first one with ground truth, else the first.
+        map_name: name of the map; None if the service has one.
+        refine: whether to request registration.
+        most: largest number of requests, evenly spread.
+        cheap_depth: whether to send depth as raw16+lz4, the cheapest to encode and decode, instead of the file.
 
     Raises:
-        DatasetError: there is no such set, or it is empty.
+        DatasetError: there is no such set, it is empty, or its depth does not fit raw16.
     """
     names = dataset.query_sets(with_truth=True) or dataset.query_sets()
     if not names or queries not in (None, *dataset.query_sets()):

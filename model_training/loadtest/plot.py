@@ -1,4 +1,4 @@
-"""Latency against rate, as a picture."""
+"""Plot of latency against rate."""
 
 from pathlib import Path
 
@@ -7,7 +7,11 @@ from service.errors import ExtraMissingError
 
 
 def draw(found: list[Summary], path: Path) -> None:
-    """Percentiles of the answered requests over what was offered, and what was refused.
+    """Plot latency percentiles of answered requests, and the answered rate, over the offered rate.
+
+    Args:
+        found: results, one per run.
+        path: file to write.
 
     Raises:
         ExtraMissingError: matplotlib is not installed.

@@ -11,7 +11,13 @@ _TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Of a tree of processes: processor seconds, resident MiB, and so many of them that are no file's pages."""
+    """Resources of a tree of processes.
+
+    Attributes:
+        cpu_s: processor time, seconds.
+        resident_mib: resident memory, MiB.
+        anonymous_mib: resident memory without pages of files, MiB.
+    """
 
     cpu_s: float
     resident_mib: float
@@ -19,7 +25,10 @@ class Usage:
 
 
 def usage(pid: int) -> Usage:
-    """What a process and its descendants have used until now.
+    """Return the resources of a process and its descendants until now.
+
+    Args:
+        pid: the process.
 
     Raises:
         RequestError: there is no such process, or this system has no /proc.
@@ -32,7 +41,10 @@ def usage(pid: int) -> Usage:
 
 
 def descendants(pid: int) -> set[int]:
-    """A process and all that came of it.
+    """Return a process and all its descendants.
+
+    Args:
+        pid: the process.
 
     Raises:
         RequestError: there is no such process, or this system has no /proc.
@@ -41,7 +53,7 @@ def descendants(pid: int) -> set[int]:
 
 
 def _table() -> dict[int, tuple[int, float, int]]:
-    """Parent, processor seconds and resident pages of every process."""
+    """Return parent, processor seconds and resident pages of every process."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:

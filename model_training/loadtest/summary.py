@@ -1,4 +1,4 @@
-"""What a run of load came to."""
+"""Results of a load test."""
 
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -20,17 +20,21 @@ class Summary:
     """Figures of the counted seconds.
 
     Attributes:
-        offered_per_s: requests due a second;
-        answered_per_s: answers that came within the counted seconds, a second.
-        answered_ms: percentiles of the answered ones' latency: p50, p90, p95, p99, max; empty without any.
-        refused_ms: of the others'.
-        late_ms: by which the generator itself was late to send, of all; part of every latency here.
-        errors: others by what became of them.
-        localized: share of the answers that are LOCALIZED.
-        right: share of those within 1 m of the truth; None without truth.
-        inconsistent: answers that differ from another answer to the same request.
-        cpu_ms_per_answer: of the service's processes; None where they were not watched.
-        resident_mib: of them at the end.
+        rate: requested rate, per second; None for ``concurrency``.
+        concurrency: number of clients that wait for answers.
+        offered_per_s: scheduled requests per second.
+        answered_per_s: answers per second that came within the counted seconds.
+        answered_ms: latency percentiles of answered requests: p50, p90, p95, p99, max; empty without answers.
+        refused_ms: latency percentiles of the other requests.
+        late_ms: percentiles of the generator's own delay, of all requests; every latency here includes it.
+        errors: numbers of the other requests by outcome.
+        answers: number of answers.
+        localized: share of answers with status LOCALIZED; None without answers.
+        right: share of LOCALIZED answers within 1 m of the ground truth; None without ground truth.
+        inconsistent: number of answers that differ from another answer to the same request.
+        cpu_ms_per_answer: processor time of the service per answer, milliseconds; None if its processes were not
+            observed.
+        resident_mib: resident memory of the service at the end, MiB; None if its processes were not observed.
     """
 
     rate: float | None
@@ -49,25 +53,25 @@ class Summary:
     resident_mib: float | None
 
     def as_json(self) -> dict[str, Any]:
-        """For a file."""
+        """Return the figures as a JSON object."""
         return asdict(self)
 
 
 def summarise(
     shots: list[Shot], payloads: list[Payload], load: Load, before: Usage | None, after: Usage | None
 ) -> Summary:
-    """Figures of a run.
+    """Compute the figures of a run.
 
     Args:
-        shots: of ``drive``.
-        payloads: that were sent.
-        load: as it was asked for.
-        before: of the service's processes when the counted seconds began; None where they were not watched.
-        after: of them when the counted seconds ended.
+        shots: requests of ``drive``.
+        payloads: the requests that were sent.
+        load: requested amount of load.
+        before: resources of the service at the start of the counted seconds; None if not observed.
+        after: resources of the service at their end; None if not observed.
     """
     total_s = load.warm_up_s + load.duration_s
     counted = [shot for shot in shots if shot.due_s >= load.warm_up_s]
-    # What comes when the load has ended is late, but no part of what the service answers a second.
+    # Answers after the end of the load are late. They do not count as throughput.
     in_time = sum(shot.reply.code == "ok" and load.warm_up_s <= shot.done_s < total_s for shot in shots)
     answered = [shot for shot in counted if shot.reply.code == "ok"]
     refused = [shot for shot in counted if shot.reply.code != "ok"]

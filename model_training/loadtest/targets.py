@@ -1,4 +1,4 @@
-"""The two faces, as a load generator sees them: bytes out, an outcome back."""
+"""REST and gRPC for a load generator: send bytes, get an outcome."""
 
 import io
 import json
@@ -21,13 +21,14 @@ _AT_ONCE_BYTES = 2**20
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """What came back.
+    """Outcome of a request.
 
     Attributes:
-        code: ``ok``, or what went wrong: a status, ``timeout``, ``connection``.
-        status: of the answer, where there is one.
-        position_m: of the answer; None unless it is LOCALIZED.
-        spread_mean_m: of an answer that is not LOCALIZED; only compared with other answers to the same request.
+        code: ``ok``, or the failure: a status, ``timeout`` or ``connection``.
+        status: status of the answer; None without an answer.
+        position_m: position of the answer, metres, map frame; None unless it is LOCALIZED.
+        spread_mean_m: mean position of an answer that is not LOCALIZED, metres; only for comparison with other answers
+            to the same request.
     """
 
     code: str
@@ -37,10 +38,15 @@ class Reply:
 
 
 class Target(Protocol):
-    """Something that answers."""
+    """A service that answers requests."""
 
     async def ask(self, payload: Payload, timeout_s: float) -> Reply:
-        """Send one request and wait for what becomes of it."""
+        """Send one request and return its outcome.
+
+        Args:
+            payload: the request.
+            timeout_s: longest time to wait, seconds.
+        """
         ...
 
     async def __aenter__(self) -> Self:
@@ -50,29 +56,29 @@ class Target(Protocol):
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close them."""
+        """Close the connections."""
         ...
 
 
 class Rest:
-    """``POST /v1/localize``, by aiohttp: for bodies of this size it takes a third of httpx's processor time (decision log).
+    """``POST /v1/localize`` by aiohttp, which needs a third of httpx's processor time for such bodies (decision log).
 
     Args:
-        url: of the service.
-        key: of its API.
-        tls: of an ``https`` address; None trusts the public authorities.
+        url: address of the service.
+        key: API key; None without.
+        tls: TLS settings of an ``https`` address; None trusts the public authorities.
     """
 
     def __init__(self, url: str, *, key: str | None, tls: ClientTls | None = None) -> None:
         self._tls = tls
         self._url = URL(f"{url.rstrip('/')}/v1/localize")
-        # Nothing is gained by compressing a few kilobytes, and some servers do it wherever they may.
+        # Compression gains nothing for a few kilobytes, but some servers compress whenever they may.
         self._headers = {"Accept-Encoding": "identity"}
         if key is not None:
             self._headers["Authorization"] = f"Bearer {key}"
 
     async def __aenter__(self) -> Self:
-        """Be ready to open as many connections as it takes."""
+        """Open a session without a limit of connections."""
         self._session = aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(limit=0, ssl=self._context()), headers=self._headers, auto_decompress=False,
             trust_env=self._url.host not in ("127.0.0.1", "localhost", "::1"),
@@ -82,16 +88,21 @@ class Rest:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close them."""
+        """Close the session."""
         await self._session.close()
 
     def _context(self) -> ssl.SSLContext | bool:
-        """Of TLS; True takes the library's, which is not asked without TLS."""
+        """Return the TLS context; True takes the library's default, which has no effect without TLS."""
         return True if self._tls is None or self._url.scheme != "https" else self._tls.context()
 
     async def ask(self, payload: Payload, timeout_s: float) -> Reply:
-        """Send one request and wait for what becomes of it."""
-        # aiohttp writes a stream in pieces: bytes of over a mebibyte would hold up everything else.
+        """Send one request and return its outcome.
+
+        Args:
+            payload: the request.
+            timeout_s: longest time to wait, seconds.
+        """
+        # aiohttp writes a stream in pieces. Writing more than a mebibyte of bytes at once would block the event loop.
         body = payload.body if len(payload.body) <= _AT_ONCE_BYTES else io.BytesIO(payload.body)
         try:
             async with self._session.post(
@@ -121,8 +132,8 @@ class Grpc:
 
     Args:
         address: HOST:PORT.
-        key: of its API.
-        tls: to speak; None speaks without.
+        key: API key; None without.
+        tls: TLS settings; None uses no TLS.
     """
 
     def __init__(self, address: str, *, key: str | None, tls: ClientTls | None = None) -> None:
@@ -144,11 +155,16 @@ class Grpc:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it."""
+        """Close the channel."""
         await self._channel.close(grace=None)
 
     async def ask(self, payload: Payload, timeout_s: float) -> Reply:
-        """Send one request and wait for what becomes of it."""
+        """Send one request and return its outcome.
+
+        Args:
+            payload: the request.
+            timeout_s: longest time to wait, seconds.
+        """
         try:
             answer: pb.LocalizeResponse = await self._stub.Localize(
                 payload.message, timeout=timeout_s, metadata=self._metadata

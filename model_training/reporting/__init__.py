@@ -1,1 +1,1 @@
-"""Runs as pages that people read: self-contained HTML, without scripts."""
+"""Evaluations as pages for people: self-contained HTML without scripts."""

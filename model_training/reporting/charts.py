@@ -1,4 +1,4 @@
-"""Answers as plots: errors, recall, confidence against truth, sets beside each other."""
+"""Plots of answers: errors, recall, confidence against ground truth, and query sets side by side."""
 
 from collections.abc import Mapping
 
@@ -19,14 +19,22 @@ _BINS = 10
 
 
 def series_of(runs: Mapping[str, Predictions]) -> dict[str, Predictions]:
-    """What is drawn: all queries, and each set where there are colours for them."""
+    """Return the answers to plot by name: all queries, and each set if there are enough colours.
+
+    Args:
+        runs: answers by query set.
+    """
     if len(runs) == 1 or len(runs) >= COLOURS:
         return {"all queries": joined(list(runs.values()))}
     return {"all queries": joined(list(runs.values())), **runs}
 
 
 def error_curve(runs: Mapping[str, Predictions]) -> str:
-    """Share of all queries whose answer lies within a distance, whatever its status."""
+    """Plot the share of all queries whose answer lies within a distance, whatever its status; return SVG.
+
+    Args:
+        runs: answers by name.
+    """
     reach = np.geomspace(_METRES.low, _METRES.high, 90)
     drawn = [Series(name, np.column_stack([reach, _share_within(p, reach)])) for name, p in runs.items()]
     first = next(iter(runs.values()))
@@ -42,7 +50,11 @@ def _share_within(p: Predictions, reach: ArrayLike) -> NDArray[np.float64]:
 
 
 def error_histogram(p: Predictions) -> str:
-    """How many answers lie how far off; those beyond the axis are counted at its end."""
+    """Plot a histogram of position errors; return SVG. Errors beyond the axis count at its end.
+
+    Args:
+        p: answers with ground truth.
+    """
     errors = position_errors(p)
     edges = np.geomspace(_METRES.low, _METRES.high, 46)
     counts, _ = np.histogram(np.clip(errors[np.isfinite(errors)], edges[0], edges[-1]), edges)
@@ -56,7 +68,11 @@ def _median(errors: NDArray[np.float64]) -> float:
 
 
 def recall_curves(runs: Mapping[str, Predictions]) -> str:
-    """Share of queries with the right place among the first k neighbours."""
+    """Plot the share of queries with the correct place among the first k neighbours; return SVG.
+
+    Args:
+        runs: answers by name.
+    """
     k = np.arange(1, RANKED + 1)
     recalls = {name: [recall_at(p.ranked_xy, p.T_true[:, :2, 3], int(n)).mean() for n in k] for name, p in runs.items()}
     axis = Axis("most similar places that are looked at", 1, RANKED, tuple((float(n), str(n)) for n in k))
@@ -67,7 +83,11 @@ def recall_curves(runs: Mapping[str, Predictions]) -> str:
 
 
 def reliability(p: Predictions) -> tuple[str, float] | None:
-    """How often answers of a confidence are right, and the expected calibration error; None without confidences."""
+    """Plot the share of correct answers by confidence; return SVG and the expected calibration error, or None without confidences.
+
+    Args:
+        p: answers with ground truth.
+    """
     known = np.isfinite(p.confidence)
     if not known.any():
         return None
@@ -89,7 +109,12 @@ def reliability(p: Predictions) -> tuple[str, float] | None:
 
 
 def side_by_side(shares: Mapping[str, tuple[float, float, float]], label: str) -> str:
-    """A share of each set with its interval (share, low, high)."""
+    """Plot a share of each query set with its interval; return SVG.
+
+    Args:
+        shares: share, lower end and upper end by query set.
+        label: name of the share.
+    """
     names = list(shares)
     axis = Axis(
         "query set, in the table's order",

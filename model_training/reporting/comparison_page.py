@@ -1,4 +1,4 @@
-"""The page of two runs over the same queries."""
+"""The page of two evaluations over the same queries."""
 
 from collections.abc import Sequence
 from html import escape
@@ -18,7 +18,7 @@ from model_training.reporting.queries import Shown, gallery, locate
 from model_training.reporting.run_page import PAGE
 
 _SHOWN = 20
-#: No answer counts as one so far off where changes are put in order, metres.
+#: Error of a query without an answer when changes are sorted, metres.
 _FAR_M = 1e6
 LABELS = {
     "within_0_5_m": "accepted, within 0.5 m", "within_1_m": "accepted, within 1 m", "within_5_m": "accepted, within 5 m",
@@ -30,7 +30,16 @@ LABELS = {
 def write_comparison_page(
     folder: Path, first: SavedRun, second: SavedRun, found: Comparison, *, dataset: Dataset | None, plan: Plan | None
 ) -> Path:
-    """Write ``index.html`` and say where; without the dataset it has no pictures, without the map no plans."""
+    """Write ``index.html`` and return its path; images need the dataset, and maps need the plan.
+
+    Args:
+        folder: folder of the page.
+        first: evaluation A.
+        second: evaluation B.
+        found: comparison of both.
+        dataset: dataset of the queries; None if absent.
+        plan: the map from above; None if absent.
+    """
     sections = [
         Section("shares", "Shares", _shares(found)),
         Section("errors", "How far off", _errors(found)),
@@ -67,7 +76,12 @@ def _run(run: SavedRun) -> str:
 
 
 def row_of(label: str, each: PairedShares) -> list[str]:
-    """A measure's cells: A, B, difference, interval, how many only A and only B have, p."""
+    """Return the cells of a measure: A, B, difference, interval, queries that only A and only B have, and p.
+
+    Args:
+        label: name of the measure, HTML.
+        each: paired shares of the measure.
+    """
     low, high = each.interval
     return [
         label, f"{each.first:.1%}", f"{each.second:.1%}", f"{100 * each.difference:+.1f}", f"{100 * low:+.1f} to {100 * high:+.1f}",

@@ -1,4 +1,4 @@
-"""The frame of every page: one file, nothing from elsewhere, no scripts."""
+"""The frame of every page: one file without external content and without scripts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,13 +6,19 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 
-#: Even if a name in the data held markup that slipped through, a browser would load and run nothing.
+#: Second line of defence: if markup in a name of the data slipped through, a browser would load and run nothing.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of a page: the anchor and title that its contents list names, and HTML."""
+    """A part of a page.
+
+    Attributes:
+        anchor: target of the link in the contents list.
+        title: title of the part.
+        content: HTML.
+    """
 
     anchor: str
     title: str
@@ -20,7 +26,13 @@ class Section:
 
 
 def page(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """A whole HTML document; ``lead`` is HTML below the title."""
+    """Return a whole HTML document.
+
+    Args:
+        title: title of the document.
+        lead: HTML below the title.
+        sections: parts of the document.
+    """
     style = files("model_training.reporting").joinpath("page.css").read_text()
     contents = "".join(f'<a href="#{each.anchor}">{escape(each.title)}</a>' for each in sections)
     body = "".join(
@@ -36,7 +48,12 @@ def page(title: str, lead: str, sections: Sequence[Section]) -> str:
 
 
 def write_page(path: Path, document: str) -> None:
-    """Write a document whole or not at all."""
+    """Write a document atomically.
+
+    Args:
+        path: file to write.
+        document: the HTML.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
     part.write_text(document, encoding="utf-8")
@@ -44,12 +61,24 @@ def write_page(path: Path, document: str) -> None:
 
 
 def figure(content: str, caption: str) -> str:
-    """A drawing or a picture with its caption."""
+    """Return a drawing or an image with its caption, as HTML.
+
+    Args:
+        content: HTML of the drawing.
+        caption: text below it.
+    """
     return f"<figure>{content}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "figures") -> str:
-    """A table; the first cell of a row names it; cells are HTML; ``last-told`` ends in a column of words."""
+    """Return a table as HTML; the first cell of a row is its heading.
+
+    Args:
+        caption: text above the table.
+        head: HTML of the column headings.
+        rows: HTML of the cells.
+        kind: style class; ``last-told`` ends in a column of words.
+    """
     top = "".join(f'<th scope="col"{" class=text" if k == 0 else ""}>{cell}</th>' for k, cell in enumerate(head))
     body = "".join(
         f'<tr><th scope="row">{row[0]}</th>{"".join(f"<td>{cell}</td>" for cell in row[1:])}</tr>' for row in rows

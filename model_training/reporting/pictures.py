@@ -1,4 +1,4 @@
-"""Pictures inside the page: small copies as data URIs."""
+"""Images inside the page: small copies as data URIs."""
 
 import base64
 
@@ -6,26 +6,41 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-#: Of the pictures that stand beside each other in a row, pixels.
+#: Width of the images that stand side by side, pixels.
 WIDTH = 320
 _JPEG, _WEBP = [cv2.IMWRITE_JPEG_QUALITY, 72], [cv2.IMWRITE_WEBP_QUALITY, 80]
-#: What is drawn darkest; the view grid forgets what lies beyond it, metres.
+#: Depth with the darkest colour, metres. The view grid discards ranges beyond it.
 FARTHEST_M = 40.0
 
 
 def colour_uri(rgb: NDArray[np.uint8], *, width: int = WIDTH) -> str:
-    """A colour picture (H, W, 3), smaller."""
+    """Return a smaller colour image as a data URI.
+
+    Args:
+        rgb: colours (H, W, 3).
+        width: width of the result, pixels.
+    """
     small = cv2.resize(rgb, (width, round(rgb.shape[0] * width / rgb.shape[1])), interpolation=cv2.INTER_AREA)
     return uri("jpeg", cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes())
 
 
 def depth_uri(depth_m: NDArray[np.float32], *, width: int = WIDTH) -> str:
-    """A depth picture (H, W), metres, coloured: near is yellow, far is dark blue, nothing measured is grey."""
+    """Return a coloured depth image as a data URI: near is yellow, far is dark blue, no measurement is grey.
+
+    Args:
+        depth_m: depth (H, W), metres.
+        width: width of the result, pixels.
+    """
     return uri("jpeg", cv2.imencode(".jpg", depth_bgr(depth_m, width=width), _JPEG)[1].tobytes())
 
 
 def depth_bgr(depth_m: NDArray[np.float32], *, width: int) -> NDArray[np.uint8]:
-    """The coloured depth picture (h, width, 3), BGR; depths are spread by their logarithm, as the eye has them."""
+    """Colour a depth image by the logarithm of depth; return BGR (h, width, 3).
+
+    Args:
+        depth_m: depth (H, W), metres.
+        width: width of the result, pixels.
+    """
     small = cv2.resize(
         depth_m, (width, round(depth_m.shape[0] * width / depth_m.shape[1])), interpolation=cv2.INTER_NEAREST
     )
@@ -37,12 +52,21 @@ def depth_bgr(depth_m: NDArray[np.float32], *, width: int) -> NDArray[np.uint8]:
 
 
 def grey_webp_uri(alpha: NDArray[np.uint8]) -> str:
-    """A picture (H, W) of one grey that both light and dark pages show, by its opacity."""
+    """Return a grey image as a data URI; its opacity shows on light and dark pages.
+
+    Args:
+        alpha: opacity (H, W).
+    """
     grey = np.full((*alpha.shape, 4), 128, np.uint8)
     grey[..., 3] = alpha
     return uri("webp", cv2.imencode(".webp", grey, _WEBP)[1].tobytes())
 
 
 def uri(kind: str, data: bytes) -> str:
-    """``data:image/KIND`` of encoded bytes."""
+    """Return ``data:image/KIND`` of encoded bytes.
+
+    Args:
+        kind: format of the image.
+        data: encoded image.
+    """
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

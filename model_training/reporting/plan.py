@@ -1,4 +1,4 @@
-"""The map from above in metres, and what answers make of it; SVG's y points down, so it is minus the map's y."""
+"""The map from above in metres with the answers; SVG's y axis points down, so it is minus the map's y."""
 
 from dataclasses import dataclass
 
@@ -11,25 +11,34 @@ from model_training.reporting.pictures import grey_webp_uri
 from model_training.reporting.svg import drawing
 from service.maps.reader import MapBundle
 
-#: Classes of error that the map is coloured by: up to so many metres, and what the legend says.
+#: Classes of error: upper limit in metres, style class, and text of the legend.
 ERRORS = ((0.5, "e0", "up to 0.5 m"), (1.0, "e1", "up to 1 m"), (5.0, "e2", "up to 5 m"), (np.inf, "e3", "farther off"))
 _LONGEST_PX = 1400
 _MARGIN_M = 8.0
-#: Walls are surfels whose normal is this level.
+#: Surfels are walls if the vertical part of their normal is smaller.
 _UPRIGHT = 0.5
 _GROUND_ID = "ground"
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The map as a picture and where it lies: x, -y of its upper left corner, width, height, metres."""
+    """The map as an image, with its position.
+
+    Attributes:
+        picture: data URI of the image.
+        view: x, -y of the upper left corner, width and height, metres.
+    """
 
     picture: str
     view: tuple[float, float, float, float]
 
     @staticmethod
     def of(bundle: MapBundle) -> "Plan":
-        """Walls of the cloud, and the places where there is no cloud."""
+        """Render the walls of the cloud; without a cloud, the plan only covers the places.
+
+        Args:
+            bundle: the map.
+        """
         places = bundle.T_map_place[:, :2, 3]
         xy, upright = places, np.zeros(0, bool)
         if bundle.cloud is not None and len(bundle.cloud.surfels):
@@ -50,7 +59,11 @@ class Plan:
         )
 
     def whole(self, predictions: Predictions) -> str:
-        """Every query where it was taken, coloured by its error, with a line to an answer that is farther off than 5 m."""
+        """Draw every query coloured by its error, with a line to an answer more than 5 m off; return SVG.
+
+        Args:
+            predictions: answers with ground truth.
+        """
         errors, true_xy, answer_xy = (
             position_errors(predictions),
             predictions.T_true[:, :2, 3],
@@ -60,7 +73,7 @@ class Plan:
         lines, dots = [], []
         for k in np.argsort(-np.nan_to_num(errors, posinf=1e9))[
             ::-1
-        ]:  # the worst are drawn last, so that none is hidden
+        ]:  # the worst are drawn last, so that nothing hides them
             kind = class_of(errors[k])
             x, y = true_xy[k]
             told = f"query {k}: {'no answer' if not np.isfinite(errors[k]) else f'{errors[k]:.2f} m'}"
@@ -84,13 +97,13 @@ class Plan:
         *,
         with_picture: bool = False,
     ) -> str:
-        """A query's truth (circle), one answer or two (crosses) and the other poses that were looked at (dots).
+        """Draw a query's ground truth (circle), one or two answers (crosses) and other candidate poses (dots); return SVG.
 
         Args:
-            true_xy: map frame, metres.
-            answers_xy: (m, 2), NaN for no answer.
-            others: (n, 2), NaN for none.
-            with_picture: bring the map along; the others on the page, ``whole`` among them, refer to it.
+            true_xy: ground truth (2,), metres, map frame.
+            answers_xy: answers (m, 2), metres, map frame; NaN for no answer.
+            others: other candidates (n, 2), metres, map frame; NaN for none.
+            with_picture: whether to include the map's image; other drawings of the page, also ``whole``, refer to it.
         """
         answered = np.isfinite(answers_xy).all(axis=1)
         seen = np.concatenate([true_xy[None], answers_xy[answered]])
@@ -115,12 +128,20 @@ class Plan:
 
 
 def class_of(error_m: float) -> str:
-    """The colour class of an error; no answer is of the last."""
+    """Return the style class of an error; no answer is in the last class.
+
+    Args:
+        error_m: error, metres; infinite for no answer.
+    """
     return next(name for reach, name, _ in ERRORS if error_m <= reach)
 
 
 def counted(errors: NDArray[np.float64]) -> dict[str, int]:
-    """How many queries are in each class of error; those without an answer are in the last."""
+    """Count the queries in each class of error; those without an answer are in the last.
+
+    Args:
+        errors: errors (n,), metres.
+    """
     classes = [class_of(error) for error in errors]
     return {label: classes.count(name) for _, name, label in ERRORS}
 

@@ -1,4 +1,4 @@
-"""Single queries on a page: both pictures, truth and answer on the map, and what became of it."""
+"""Single queries on a page: both images, ground truth and answer on the map, and the outcome."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,14 @@ from model_training.reporting.plan import Plan
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A query to show: its set, its number there, its row among all, and what is said of it (HTML)."""
+    """A query to show.
+
+    Attributes:
+        query_set: name of its set.
+        number: number in its set.
+        row: row among all queries.
+        said: description, HTML.
+    """
 
     query_set: str
     number: int
@@ -24,7 +31,12 @@ class Shown:
 
 
 def locate(rows: Sequence[int], runs: dict[str, Predictions]) -> list[tuple[str, int, int]]:
-    """Set and number of rows of the joined sets."""
+    """Return set, number in the set, and row for rows of the joined sets.
+
+    Args:
+        rows: rows of the joined sets.
+        runs: answers by set.
+    """
     found = []
     for row in rows:
         first = 0
@@ -37,7 +49,14 @@ def locate(rows: Sequence[int], runs: dict[str, Predictions]) -> list[tuple[str,
 
 
 def said_of(p: Predictions, row: int, stage: Stage, error_m: float) -> str:
-    """What became of a query, as HTML."""
+    """Describe the outcome of a query as HTML.
+
+    Args:
+        p: answers of all sets, joined.
+        row: row of the query.
+        stage: stage at which it was lost, or success.
+        error_m: position error, metres.
+    """
     status = str(p.status[row]) or "no answer"
     confidence = "" if np.isnan(p.confidence[row]) else f", confidence {p.confidence[row]:.2f}"
     off = f"{error_m:.2f} m off" if np.isfinite(error_m) else "no position"
@@ -54,15 +73,15 @@ def gallery(
     shown: Sequence[Shown], p: Predictions, dataset: Dataset | None, plan: Plan | None, *,
     other: Predictions | None = None, has_plan: bool = False,
 ) -> str:  # fmt: skip
-    """Queries one below the other; without the dataset no pictures, without the map no plans.
+    """Show queries one below the other as HTML; images need the dataset, and maps need the plan.
 
     Args:
-        shown: what and in which order.
+        shown: queries in their order.
         p: answers of all sets, joined.
-        dataset: for the pictures.
-        plan: for the little maps.
-        other: another run's answers to the same queries, drawn as well.
-        has_plan: whether the page shows the map's picture already.
+        dataset: dataset of the images; None if absent.
+        plan: the map from above; None if absent.
+        other: another evaluation's answers to the same queries, drawn as well; None for none.
+        has_plan: whether the page already contains the map's image.
     """
     frames: dict[str, list[QueryFrame]] = {}
     articles = []

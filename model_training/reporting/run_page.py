@@ -1,4 +1,4 @@
-"""The page of one run: how far off, how sure, where, and what was lost by which stage."""
+"""The page of one evaluation: errors, confidence, the map, and the losses by stage."""
 
 from collections import Counter
 from html import escape
@@ -37,13 +37,13 @@ _NUMBERS = (
 
 
 def write_run_page(run: SavedRun, bundle: MapBundle, dataset: Dataset, figures: dict[str, Any]) -> Path:
-    """Write ``index.html`` beside the saved answers and say where.
+    """Write ``index.html`` beside the saved answers and return its path.
 
     Args:
-        run: saved.
+        run: saved evaluation.
         bundle: the map that answered.
-        dataset: whose queries were asked.
-        figures: of the evaluation.
+        dataset: dataset of the queries.
+        figures: figures of the evaluation.
     """
     everything = joined(list(run.predictions.values()))
     plan = Plan.of(bundle)

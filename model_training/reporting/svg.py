@@ -1,4 +1,4 @@
-"""Plots as SVG that takes its colours from the page, so that light, dark and print each have their own."""
+"""Plots as SVG with the page's colours, so that light, dark and print each have their own."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,16 +7,24 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-#: Of the drawing, in its own units: the whole and the margins left, right, above, below.
+#: Size of the drawing and its margins (left, right, above, below), in its own units.
 _WIDTH, _HEIGHT = 480, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 14, 10, 46
-#: Series that the page has colours for.
+#: Number of series colours of the page.
 COLOURS = 7
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """What an axis shows from ``low`` to ``high``; ``ticks`` are where numbers stand, ``log`` spaces by factors."""
+    """An axis.
+
+    Attributes:
+        label: text of the axis.
+        low: lower end.
+        high: upper end.
+        ticks: positions of the numbers and their texts.
+        log: whether the axis is logarithmic.
+    """
 
     label: str
     low: float
@@ -25,7 +33,11 @@ class Axis:
     log: bool = False
 
     def share(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where values lie between the axis' ends, 0 to 1."""
+        """Return the positions of values between the ends of the axis, 0 to 1 inside, in the shape of ``values`` such as (n,).
+
+        Args:
+            values: values (n,).
+        """
         if self.log:
             values = np.log(np.maximum(values, self.low))
             return np.asarray((values - np.log(self.low)) / (np.log(self.high) - np.log(self.low)))
@@ -34,7 +46,14 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Points (n, 2) under a name; ``line``, or ``dots`` with vertical ``intervals`` (n, 2) where there are some."""
+    """A series of points.
+
+    Attributes:
+        name: text of the legend.
+        points: points (n, 2).
+        line: whether to draw a line; otherwise dots.
+        intervals: lower and upper ends of vertical intervals of dots (n, 2); None for none.
+    """
 
     name: str
     points: NDArray[np.float64]
@@ -43,20 +62,24 @@ class Series:
 
 
 def percent_axis(label: str) -> Axis:
-    """An axis of shares."""
+    """Return an axis of shares.
+
+    Args:
+        label: text of the axis.
+    """
     return Axis(label, 0.0, 1.0, tuple((k / 5, f"{20 * k}") for k in range(6)))
 
 
 def plot(title: str, told: str, x: Axis, y: Axis, series: Sequence[Series], *, diagonal: bool = False) -> str:
-    """A drawing with a frame, a grid and a legend.
+    """Draw a plot with a frame, a grid and a legend; return SVG.
 
     Args:
-        title: for those who see it.
-        told: what it shows, in words, for those who do not.
-        x: axis to the right.
-        y: axis upwards.
-        series: drawn in this order, at most ``COLOURS``.
-        diagonal: the line from corner to corner as well.
+        title: title of the plot.
+        told: content in words, for screen readers.
+        x: horizontal axis.
+        y: vertical axis.
+        series: series in the order of drawing, at most ``COLOURS``.
+        diagonal: whether to draw the line from corner to corner.
     """
     parts = [_grid(x, y)]
     if diagonal:
@@ -80,7 +103,15 @@ def plot(title: str, told: str, x: Axis, y: Axis, series: Sequence[Series], *, d
 
 
 def histogram(title: str, told: str, x: Axis, edges: NDArray[np.float64], counts: NDArray[np.int64]) -> str:
-    """Counts between edges, as bars."""
+    """Draw a histogram; return SVG.
+
+    Args:
+        title: title of the plot.
+        told: content in words, for screen readers.
+        x: horizontal axis.
+        edges: edges of the bins (n + 1,).
+        counts: counts of the bins (n,).
+    """
     most = max(1, int(counts.max(initial=0)))
     step = max(1, int(10 ** np.floor(np.log10(most))) // 2)
     y = Axis(
@@ -101,7 +132,15 @@ def histogram(title: str, told: str, x: Axis, edges: NDArray[np.float64], counts
 
 
 def drawing(title: str, told: str, content: str, *, view: tuple[float, float, float, float], kind: str) -> str:
-    """An SVG element with its name and its words; ``view`` is x, y, width, height of what it shows."""
+    """Return an SVG element with a title and a description.
+
+    Args:
+        title: title of the drawing.
+        told: content in words, for screen readers.
+        content: SVG inside the element.
+        view: x, y, width and height of the visible area.
+        kind: style class.
+    """
     box = " ".join(f"{v:.2f}".rstrip("0").rstrip(".") for v in view)
     return f'<svg class="{kind}" viewBox="{box}" role="img" aria-label="{escape(f"{title}: {told}")}">{content}</svg>'
 

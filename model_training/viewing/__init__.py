@@ -1,1 +1,1 @@
-"""Datasets, maps and answers for viewers of other people: one stream of events, a writer for each format."""
+"""Datasets, maps and answers for external viewers: one stream of events, and a writer for each format."""

@@ -1,6 +1,6 @@
-"""What there is to see, whoever draws it. Everything lies in the map frame (metres, z up) but pictures.
+"""Visible content, independent of the viewer. All coordinates are in the map frame (metres, z up), except images.
 
-``stamp_s`` counts seconds from the start of what is shown; None is there all the time.
+``stamp_s`` counts seconds from the start. None means that the content is always visible.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,15 @@ from service.geometry.camera import PinholeCamera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """Points (n, 3), metres from ``origin_m`` (map frame), so that float32 suffices anywhere, with grey levels (n)."""
+    """A cloud. The local origin keeps float32 sufficient anywhere.
+
+    Attributes:
+        topic: name of the content.
+        stamp_s: time, seconds; None for always.
+        origin_m: origin of the points (3,), map frame.
+        points_m: points relative to the origin (n, 3).
+        grey: grey levels (n,).
+    """
 
     topic: str
     stamp_s: float | None
@@ -25,7 +33,13 @@ class Cloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Positions (n, 3) that belong together as a line."""
+    """Positions that form a line.
+
+    Attributes:
+        topic: name of the content.
+        stamp_s: time, seconds; None for always.
+        positions_m: positions (n, 3).
+    """
 
     topic: str
     stamp_s: float | None
@@ -34,7 +48,14 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outlines:
-    """Rings on the ground, each closed, (n, 3), with a name each."""
+    """Closed rings on the ground.
+
+    Attributes:
+        topic: name of the content.
+        stamp_s: time, seconds; None for always.
+        names: name of each ring.
+        rings_m: points of each ring (n, 3).
+    """
 
     topic: str
     stamp_s: float | None
@@ -44,7 +65,17 @@ class Outlines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera where it stood, what it saw: colour as JPEG, depth (H, W), metres, 0 for not measured, and the 2.5D picture as JPEG."""
+    """A camera and its images.
+
+    Attributes:
+        topic: name of the content.
+        stamp_s: time, seconds.
+        T_map_camera: pose (4, 4).
+        camera: intrinsics.
+        colour_jpeg: colour image, JPEG.
+        depth_m: depth (H, W), metres, 0 for no measurement.
+        fused_jpeg: 2.5D image, JPEG.
+    """
 
     topic: str
     stamp_s: float
@@ -57,7 +88,13 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Cameras' poses T_map_camera (n, 4, 4): truth, neighbours, hypotheses, what was registered, what was answered."""
+    """Poses of cameras: ground truth, neighbours, hypotheses, registered candidates or answers.
+
+    Attributes:
+        topic: name of the content.
+        stamp_s: time, seconds.
+        T_map_camera: poses (n, 4, 4).
+    """
 
     topic: str
     stamp_s: float
@@ -66,7 +103,14 @@ class Poses:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A line of text; ``good`` where nothing is amiss."""
+    """A line of text.
+
+    Attributes:
+        topic: name of the content.
+        stamp_s: time, seconds.
+        text: the text.
+        good: whether it reports success.
+    """
 
     topic: str
     stamp_s: float
@@ -78,5 +122,9 @@ Event: TypeAlias = Cloud | Track | Outlines | View | Poses | Note
 
 
 def millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """A depth picture as both formats take it: 0 for not measured, nothing beyond 65.5 m."""
+    """Convert a depth image to millimetres (H, W) for both formats: 0 for no measurement, clipped at 65.5 m.
+
+    Args:
+        depth_m: depth (H, W), metres.
+    """
     return np.asarray(np.clip(np.rint(1000.0 * np.nan_to_num(depth_m)), 0, 65535), np.uint16)

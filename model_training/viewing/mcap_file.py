@@ -1,4 +1,4 @@
-"""Events as an MCAP file with Foxglove's schemas, for Foxglove, Lichtblick and whoever reads these."""
+"""Events as an MCAP file with Foxglove's schemas, for Foxglove, Lichtblick and other readers."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,8 +16,13 @@ _POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<u1"
 
 
 def write_mcap(events: Iterable[Event], path: Path) -> int:
-    """Write events, whole or not at all, and say how many there were. What is there all the time has the time 0."""
-    from foxglove import Context, open_mcap  # an extra, needed by this command alone
+    """Write events atomically and return their number. Events that are always visible have time 0.
+
+    Args:
+        events: events in their order.
+        path: file to write.
+    """
+    from foxglove import Context, open_mcap  # an extra that only this command needs
 
     part = path.with_name(path.name + ".part")
     part.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +81,7 @@ def _cloud(fm: Any, cloud: Cloud, stamp: Any) -> Any:
 
 
 def _lines(fm: Any, name: str, strips_m: Iterable[NDArray[np.float64]], stamp: Any) -> Any:
-    """Each update replaces the entity of its name, so an empty one takes the last line away."""
+    """Return an update that replaces the entity of its name; an empty update removes the last line."""
     lines = [
         fm.LinePrimitive(
             type=fm.LinePrimitiveLineType.LineStrip, pose=_pose(fm, _at(np.zeros(3))), thickness=_LINE_M,

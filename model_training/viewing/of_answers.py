@@ -1,4 +1,4 @@
-"""A saved run as events: at every query its truth, what the search found, what was registered, what was answered."""
+"""A saved evaluation as events: ground truth, neighbours, registered candidates and answer of every query."""
 
 from collections.abc import Iterator
 
@@ -15,7 +15,12 @@ from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 
 
 def events_of_answers(run: SavedRun, dataset: Dataset | None) -> Iterator[Event]:
-    """Queries one after the other in the order of the sets; pictures where the dataset is at hand."""
+    """Yield the events of all queries in the order of the sets; images need the dataset.
+
+    Args:
+        run: saved evaluation.
+        dataset: dataset of the queries; None if absent.
+    """
     now_s = 0.0
     for name, p in run.predictions.items():
         frames = [] if dataset is None else list(dataset.queries(name))
@@ -46,7 +51,12 @@ def _query(p: Predictions, row: int, now_s: float, frame: QueryFrame | None) -> 
 
 
 def upright(xy_heading: NDArray[np.float64], height_m: float) -> NDArray[np.float64]:
-    """Cameras T_map_camera (m, 4, 4) that stand level at x, y (m) and heading (rad) of the rows that are finite."""
+    """Return level camera poses T_map_camera (m, 4, 4) of the finite rows.
+
+    Args:
+        xy_heading: x, y in metres and heading in radians (n, 3), map frame.
+        height_m: height of the cameras, metres, map frame.
+    """
     finite = xy_heading[np.isfinite(xy_heading).all(axis=1)]
     poses = [
         transform_from(rotation_z(heading) @ R_BODY_OPTICAL, np.array([x, y, height_m])) for x, y, heading in finite

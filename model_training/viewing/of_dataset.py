@@ -1,4 +1,4 @@
-"""A dataset as events: the survey's scans and track, then every query set's pictures where they were taken."""
+"""A dataset as events: scans and track of the survey, then the images of every query set at their poses."""
 
 from collections.abc import Iterator
 
@@ -12,18 +12,18 @@ from service.geometry.rigid import transform_points
 from service.imaging.fusion import fuse, picture_of
 from service.imaging.view_grid import ViewGrid
 
-#: Between two queries, which mostly have no time in common with anything else, seconds.
+#: Time between two queries, seconds. Their own times mostly do not relate to other content.
 STEP_S = 1.0
 _QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 85]
 
 
 def events_of_dataset(dataset: Dataset, *, most_scans: int, most_points: int) -> Iterator[Event]:
-    """Scans at their own time from the first, queries one after the other behind them.
+    """Yield scans at their times since the first one, then queries one after the other.
 
     Args:
-        dataset: opened.
-        most_scans: of a longer survey each n-th scan is shown.
-        most_points: of a larger scan each n-th point is shown.
+        dataset: an open dataset.
+        most_scans: largest number of scans; a longer survey shows each n-th scan.
+        most_points: largest number of points; a larger scan shows each n-th point.
     """
     stamps, T_map_lidar = dataset.survey_trajectory()
     now_s = 0.0
@@ -52,7 +52,13 @@ def _scan(scan: NDArray[np.float32], T_map_lidar: NDArray[np.float64], now_s: fl
 
 
 def view_of(frame: QueryFrame, now_s: float, T_map_camera: NDArray[np.float64]) -> View:
-    """A query's pictures at a pose."""
+    """Return a query's images at a pose.
+
+    Args:
+        frame: the query.
+        now_s: time of the event, seconds.
+        T_map_camera: pose (4, 4).
+    """
     rgb, depth_m = frame.rgb(), frame.depth_m()
     if depth_m.shape != rgb.shape[:2]:
         depth_m = cv2.resize(depth_m, rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST).astype(np.float32)

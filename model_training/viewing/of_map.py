@@ -1,4 +1,4 @@
-"""A map bundle as events: cloud, places, streets."""
+"""A map bundle as events: cloud, places and streets."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,12 @@ from service.maps.streets import Streets
 
 
 def events_of_map(bundle: MapBundle, *, most_points: int) -> Iterator[Event]:
-    """Everything is there all the time; of a larger cloud each n-th surfel is shown."""
+    """Yield the map's events, all of them always visible.
+
+    Args:
+        bundle: the map.
+        most_points: largest number of points; a larger cloud shows each n-th surfel.
+    """
     if bundle.cloud is not None:
         surfels = bundle.cloud.surfels[:: max(1, -(-len(bundle.cloud.surfels) // most_points))]
         upright = 1 - np.abs(surfels["normal"][:, 2])
@@ -24,7 +29,12 @@ def events_of_map(bundle: MapBundle, *, most_points: int) -> Iterator[Event]:
 
 
 def outlines_of(streets: Streets, ground_m: float) -> Outlines:
-    """The outer rings of streets that are given in map metres, at a height."""
+    """Return the outer rings of streets at a height.
+
+    Args:
+        streets: streets in map metres.
+        ground_m: height of the rings, metres, map frame.
+    """
     named = [(street.name, rings[0]) for street in streets.features for rings in street.polygons]
     flat = tuple(np.column_stack([ring, np.full(len(ring), ground_m)]) for _, ring in named)
     return Outlines("map/streets", None, tuple(name for name, _ in named), flat)

@@ -1,4 +1,4 @@
-"""Events for Rerun: into a file, or to a viewer on this screen."""
+"""Events for Rerun: to a file, or to a viewer on this screen."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,8 +18,13 @@ _GREY, _AXIS_M = (140, 140, 140), 2.0
 
 
 def write_rerun(events: Iterable[Event], path: Path | None) -> int:
-    """Log events; to ``path``, whole or not at all, or to a viewer that is started where it is None. Says how many there were."""
-    import rerun as rr  # an extra of 500 MB, needed by this command alone
+    """Log events and return their number.
+
+    Args:
+        events: events in their order.
+        path: file to write atomically; None starts a viewer.
+    """
+    import rerun as rr  # an extra of 500 MB that only this command needs
 
     recording = rr.RecordingStream("streetfix")
     part = None if path is None else path.with_name(path.name + ".part")

@@ -1,4 +1,4 @@
-"""What a folder holds that can be looked at."""
+"""Events of a folder's content."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +16,12 @@ from service.maps.reader import MapBundle
 
 
 def events_of(folder: Path, *, most_scans: int, most_points: int) -> Iterator[Event]:
-    """Events of a dataset, a map bundle, or a saved run with the map and the pictures where they still lie.
+    """Yield the events of a dataset, a map bundle, or a saved evaluation with its map and images if they still exist.
+
+    Args:
+        folder: folder to view.
+        most_scans: largest number of scans.
+        most_points: largest number of points of a scan or cloud.
 
     Raises:
         DatasetError: the folder is none of them.
@@ -40,7 +45,7 @@ def _map_of(run: SavedRun, most_points: int) -> Iterator[Event]:
     try:
         bundle = MapBundle.open(Path(run.settings.map.path), verify=False)
     except BundleError:
-        return  # moved or deleted since: answers can be looked at without it
+        return  # moved or deleted since: the answers can be viewed without the map
     yield from events_of_map(bundle, most_points=most_points)
 
 
@@ -48,4 +53,4 @@ def _dataset_of(run: SavedRun) -> Dataset | None:
     try:
         return Dataset(Path(run.settings.dataset.path))
     except DatasetError:
-        return None  # as above
+        return None  # moved or deleted since: the answers can be viewed without the images

@@ -1,8 +1,9 @@
 """The pipeline in BentoML: ``python -m benchmarks.serving.peers.bentoml_app BUNDLE PORT``.
 
-One worker with one thread for one core (docs.bentoml.com, "Parallelize requests handling"), a synchronous method, which BentoML runs beside
-its event loop, no batching; access log, metrics and monitoring are off, and the path is left out of tracing ("Configurations"). Files come
-as multipart (``Path``, "Input and output types"), the JSON as a model that BentoML checks.
+The settings follow BentoML's documentation. One worker with one thread serves one core (docs.bentoml.com, "Parallelize
+requests handling"). The method is synchronous; BentoML runs it beside its event loop. There is no batching. Access log,
+metrics and monitoring are off, and tracing excludes the path ("Configurations"). Files come as multipart (``Path``,
+"Input and output types"), the JSON as a model that BentoML validates.
 """
 
 import os
@@ -15,7 +16,7 @@ from service.contract.schema import LocalizeRequest
 import bentoml  # isort: skip
 from starlette.responses import Response  # isort: skip
 
-#: BentoML imports this file again in its worker, which has no arguments of ours.
+#: BentoML imports this file again in its worker, which does not get our arguments.
 BUNDLE = "STREETFIX_PEER_BUNDLE"
 
 
@@ -29,20 +30,26 @@ BUNDLE = "STREETFIX_PEER_BUNDLE"
     tracing={"excluded_urls": [PATH]},
 )
 class Localization:
-    """Parts in, JSON out."""
+    """Service that takes the parts of a request and returns JSON."""
 
     def __init__(self) -> None:
         self._pipeline = Pipeline(Path(os.environ[BUNDLE]))
 
     @bentoml.api(route=PATH)
     def localize(self, rgb: Path, depth: Path, request: LocalizeRequest):  # BentoML has no schema of a response
-        """Localize."""
+        """Localize one query.
+
+        Args:
+            rgb: file of the RGB image.
+            depth: file of the depth image.
+            request: the parsed request.
+        """
         answer = self._pipeline.answer(rgb.read_bytes(), depth.read_bytes(), request)
         return Response(answer, media_type="application/json")
 
 
 def main() -> None:
-    """Become ``bentoml serve``."""
+    """Replace this process by ``bentoml serve``."""
     command = Path(sys.executable).with_name("bentoml")
     os.environ[BUNDLE] = sys.argv[1]
     named = f"{Path(__file__).stem}:Localization"

@@ -1,4 +1,4 @@
-"""A peer's server: a tree of processes on one core, and how it is started, asked, measured and stopped."""
+"""A peer's server as a tree of processes on one core: start, request, measurement and stop."""
 
 import json
 import os
@@ -27,10 +27,10 @@ class Host:
     """A running peer.
 
     Args:
-        command: that listens on the port, which is put at its end.
-        first: what it is asked until it answers.
-        core: it is pinned to; None for all.
-        patience_s: with its start.
+        command: command that listens on a port; the port is appended.
+        first: request that is sent until the peer answers.
+        core: core that it is pinned to; None for all.
+        patience_s: longest time of the start, seconds.
 
     Raises:
         PeerError: it ended, or did not answer in time.
@@ -41,8 +41,9 @@ class Host:
     ) -> None:
         port = free_port()
         self.url = f"http://127.0.0.1:{port}"
-        self._folder = Path(tempfile.mkdtemp(prefix="peer-"))  # some write where they are started
-        # The code of this checkout; what the peers' environments lack of it they do not import.
+        self._folder = Path(tempfile.mkdtemp(prefix="peer-"))  # some peers write files where they are started
+        # The peers use the code of this checkout. They do not import the parts whose dependencies their environments
+        # lack.
         environment = os.environ | {"PYTHONPATH": str(ROOT), "BENTOML_HOME": str(self._folder), "BENTOML_DO_NOT_TRACK": "True"}  # fmt: skip
         with (self._folder / "log").open("wb") as log:
             self.process = subprocess.Popen(
@@ -57,22 +58,26 @@ class Host:
             raise
 
     def __enter__(self) -> Self:
-        """It runs already."""
+        """Return itself: the peer runs already."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop it."""
+        """Stop the peer."""
         self.stop()
 
     @property
     def used(self) -> Usage:
-        """Processor time and memory of it and its children."""
+        """Processor time and memory of the peer and its children."""
         return usage(self.process.pid)
 
     def stop(self) -> None:
-        """End the tree: it is asked to, then what is left of it is killed."""
+        """End the tree: send SIGTERM, then kill the remaining processes.
+
+        Raises:
+            PeerError: some processes did not end.
+        """
         tree = {pid: _began(pid) for pid in descendants(self.process.pid)} if self.process.poll() is None else {}
         if tree:
             self.process.send_signal(signal.SIGTERM)
@@ -82,7 +87,7 @@ class Host:
                 self.process.kill()
                 self.process.wait()
         for pid, began in tree.items():
-            if began is not None and _began(pid) == began:  # and not another that got its number
+            if began is not None and _began(pid) == began:  # not another process that reuses the number
                 os.kill(pid, signal.SIGKILL)
         deadline = time.monotonic() + STOP_S
         while any(began is not None and _began(pid) == began for pid, began in tree.items()):
@@ -111,15 +116,19 @@ class Host:
         raise PeerError(f"no answer within {patience_s:.0f} s, the last was {last}: {self._said()}")
 
     def _said(self) -> str:
-        """The end of its log, on one line."""
+        """Return the end of the log on one line."""
         return " ".join((self._folder / "log").read_text(errors="replace").split())[-300:]
 
 
 def ask(url: str, payload: Payload) -> dict[str, Any]:
-    """The answer to one request.
+    """Return the answer to one request.
+
+    Args:
+        url: address of the peer.
+        payload: the request.
 
     Raises:
-        PeerError: there is none.
+        PeerError: there is no answer, or its status is not 200.
     """
     try:
         answered = httpx.post(
@@ -134,7 +143,7 @@ def ask(url: str, payload: Payload) -> dict[str, Any]:
 
 
 def _began(pid: int) -> str | None:
-    """When a process began, in the kernel's ticks; None where there is none, or it is only not yet waited for."""
+    """Return the start time of a process in kernel ticks; None if it does not exist or is a zombie."""
     try:
         fields = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()
     except OSError:

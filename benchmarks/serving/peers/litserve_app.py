@@ -1,8 +1,9 @@
 """The pipeline in LitServe: ``python -m benchmarks.serving.peers.litserve_app BUNDLE PORT``.
 
-One inference worker for one core and one API server (lightning.ai/docs/litserve/api-reference/litserver: "for CPU, set to the
-number of cores"), no batching, no request tracking, no OpenAPI, warnings alone in the log; files come as multipart, read with
-``request["rgb"].file``. Answers go through ZeroMQ (``fast_queue``), advised above a hundred requests a second and no dearer below.
+One inference worker serves one core, with one API server (lightning.ai/docs/litserve/api-reference/litserver: "for CPU,
+set to the number of cores"). Batching, request tracking and OpenAPI are off, and the log holds only warnings. Files
+come as multipart, read with ``request["rgb"].file``. Answers go through ZeroMQ (``fast_queue``). LitServe advises
+ZeroMQ above a hundred requests per second; below, it costs no more.
 """
 
 import sys
@@ -15,26 +16,43 @@ from fastapi import Response  # isort: skip
 
 
 class Localization(litserve.LitAPI):
-    """Parts in, JSON out."""
+    """Service that takes the parts of a request and returns JSON."""
 
     def setup(self, device: str) -> None:  # noqa: ARG002  # LitServe's signature
-        """Open the map, in the worker."""
+        """Open the map in the worker.
+
+        Args:
+            device: unused device name of LitServe.
+        """
         self._pipeline = Pipeline(Path(sys.argv[1]))
 
-    def decode_request(self, request):  # noqa: D102  # an annotation would name a body to FastAPI
+    def decode_request(self, request):  # FastAPI would take an annotation for the schema of a body
+        """Read the three parts of the multipart body.
+
+        Args:
+            request: the request of LitServe.
+        """
         return tuple(request[name].file.read() for name in ("rgb", "depth", "request"))
 
     def predict(self, x: tuple[bytes, bytes, bytes]) -> bytes:
-        """Localize."""
+        """Localize one query.
+
+        Args:
+            x: RGB image, depth image and request, as bytes.
+        """
         return self._pipeline.answer(*x)
 
     def encode_response(self, output: bytes) -> Response:
-        """As it is: FastAPI would read the JSON to write it again."""
+        """Return the JSON unchanged; FastAPI would parse and write it again.
+
+        Args:
+            output: the JSON.
+        """
         return Response(output, media_type="application/json")
 
 
 def main() -> None:
-    """Serve until told to stop."""
+    """Serve until the process is stopped."""
     server = litserve.LitServer(
         Localization(api_path=PATH),
         accelerator="cpu",

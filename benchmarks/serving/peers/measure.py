@@ -1,4 +1,4 @@
-"""Rows of the same pipeline hosted by others, each in turn on the same core, under the same load, against Streetfix's REST."""
+"""Rows of the same pipeline in other servers, each in turn on the same core under the same load, against Streetfix's REST."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,20 +20,22 @@ OWN = "streetfix"
 TITLES = {"litserve": "LitServe", "bentoml": "BentoML", "mlserver": "MLServer", "ray": "Ray Serve", OWN: "Streetfix"}
 KINDS = ("retrieval", "full")
 BARS = {"retrieval": 1.2, "full": 1.02}
-#: Of the rate that saturates the slowest: the most that all of them can be asked equally and still be on the flat of the curve.
+#: Share of the slowest server's saturating rate. At this rate all servers are still on the flat part of their latency
+#: curve.
 SHARE = 0.7
 SAME_M, COMPARED = 1e-6, 5
 
 
 @dataclass
 class Figures:
-    """Of one server.
+    """Figures of one server.
 
     Attributes:
-        per_s: answers a second that saturated it, of each round.
-        cpu_ms: processor time of an answer then.
-        p99_ms: latencies at the equal rate, of each round: a stall of the machine spoils one round, not all of them.
-        asked: requests that these are of.
+        per_s: saturated answers per second, of each round.
+        cpu_ms: processor time of an answer at saturation, milliseconds, of each round.
+        p99_ms: 99th percentile of the latency at the common rate, of each round. A stall of the machine spoils only one
+            round.
+        asked: number of requests behind ``p99_ms``.
     """
 
     per_s: dict[str, list[float]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
@@ -48,15 +50,16 @@ Start = Callable[[str], Server | Host]
 def peer_rows(
     report: Report, site: Site, *, seconds: float, rounds: int, core: int | None, names: Sequence[str] = PEERS
 ) -> None:
-    """Install, start, check and measure; a peer with which that cannot be done says why in its rows.
+    """Install, start, check and measure the peers; the rows of a peer that fails give the reason.
 
     Args:
-        report: that gets the rows.
-        site: what is served, and what is asked.
-        seconds: of each saturation; latency is measured for three times as long.
-        rounds: in each of which every server is started, measured and stopped, so that none runs beside another.
-        core: of the server.
-        names: of the peers.
+        report: collects the rows.
+        site: map and queries.
+        seconds: duration of each saturation; latency takes three times as long.
+        rounds: number of rounds. Each round starts, measures and stops every server, so that no two run at the same
+            time.
+        core: core of the server; None for all.
+        names: names of the peers.
     """
     sent = {kind: site.payloads(refine=kind == "full") for kind in KINDS}
     failed: dict[str, str] = {}
@@ -81,7 +84,15 @@ def peer_rows(
 def measured(
     names: Sequence[str], start: Start, sent: dict[str, list[Payload]], failed: dict[str, str], *, seconds: float, rounds: int
 ) -> tuple[dict[str, Figures], float]:  # fmt: skip
-    """Figures of each server that ran, and the rate that they were all asked; ``failed`` gets the others.
+    """Measure the servers; return their figures by name and the common request rate.
+
+    Args:
+        names: names of the servers; Streetfix comes first.
+        start: starts a server by its name.
+        sent: requests by kind.
+        failed: receives the reasons of servers that fail, by name.
+        seconds: duration of each saturation.
+        rounds: number of rounds.
 
     Raises:
         PeerError: Streetfix itself failed.
@@ -92,13 +103,13 @@ def measured(
     def each(turn: int, work: Callable[[str, Server | Host], None]) -> None:
         for name in (
             names if turn % 2 == 0 else names[::-1]
-        ):  # what changes slowly falls on the first and the last alike
+        ):  # alternate the order, so that slow drifts affect all servers alike
             if name in failed:
                 continue
             try:
                 with start(name) as server:
                     work(name, server)
-            except (PeerError, ExceptionGroup) as error:  # a group, where the server ended under load
+            except (PeerError, ExceptionGroup) as error:  # a group, if the server ended under load
                 if name == OWN:
                     raise
                 failed[name] = str(error if isinstance(error, PeerError) else error.exceptions[0])
@@ -132,7 +143,11 @@ def measured(
 
 
 def require_same(own: list[dict[str, Any]], told: list[dict[str, Any]]) -> None:
-    """Compare answers to the same requests.
+    """Require equal answers to the same requests.
+
+    Args:
+        own: answers of Streetfix.
+        told: answers of the peer.
 
     Raises:
         PeerError: a street, a status or a position differs.
@@ -148,7 +163,14 @@ def require_same(own: list[dict[str, Any]], told: list[dict[str, Any]]) -> None:
 
 
 def write_rows(report: Report, found: dict[str, Figures], failed: dict[str, str], *, rounds: int) -> None:
-    """Rows of each server, and of Streetfix against the best of those that ran."""
+    """Add the rows of each server, and of Streetfix against the best other server.
+
+    Args:
+        report: collects the rows.
+        found: figures by name.
+        failed: reasons of servers that failed, by name.
+        rounds: number of rounds.
+    """
     own, peers = found[OWN], {name: figures for name, figures in found.items() if name != OWN}
     for kind, bar in BARS.items():
         ran = {name: figures.per_s[kind] for name, figures in peers.items() if len(figures.per_s[kind]) == rounds}
@@ -177,13 +199,13 @@ def write_rows(report: Report, found: dict[str, Figures], failed: dict[str, str]
 
 
 def _against(best: str | None, failed: dict[str, str]) -> str:
-    """Who the best is, and who did not run."""
+    """Name the best peer, and the peers that did not run."""
     absent = [f"{TITLES[name]} did not run: {why}" for name, why in failed.items()]
     return "; ".join(([] if best is None else [f"the best is {TITLES[best]}"]) + absent)
 
 
 def _without_vote(value: Any) -> Any:
-    """A street by its names: the vote is a figure."""
+    """Return a street without its vote, which is a figure."""
     return {name: each for name, each in value.items() if name != "vote"} if isinstance(value, dict) else value
 
 

@@ -1,8 +1,9 @@
 """The pipeline in MLServer: ``python -m benchmarks.serving.peers.mlserver_app BUNDLE PORT``.
 
-``parallel_workers`` is 0, which runs models in the server's own process (docs.seldon.ai/mlserver/user-guide/parallel-inference): with one
-core a second process only adds copies. No batching, metrics, gzip or access log. A custom REST handler takes multipart, as JSON of the V2
-protocol would carry the pictures in base64; it runs in the event loop, as MLServer's own runtimes do without workers.
+``parallel_workers`` is 0, so models run in the server's own process
+(docs.seldon.ai/mlserver/user-guide/parallel-inference). On one core a second process only adds copies. Batching,
+metrics, gzip and access log are off. A custom REST handler takes multipart, because JSON of the V2 protocol would need
+base64 for the images. The handler runs in the event loop, as MLServer's own runtimes do without workers.
 """
 
 import json
@@ -19,7 +20,7 @@ from mlserver.handlers import custom_handler  # isort: skip
 
 
 class Localization(MLModel):
-    """Parts in, JSON out."""
+    """Service that takes the parts of a request and returns JSON."""
 
     async def load(self) -> bool:
         """Open the map."""
@@ -28,14 +29,18 @@ class Localization(MLModel):
 
     @custom_handler(rest_path=PATH)
     async def localize(self, request: Request) -> Response:
-        """Localize."""
+        """Localize one query.
+
+        Args:
+            request: multipart request.
+        """
         async with request.form() as form:
             parts = [await form[name].read() for name in ("rgb", "depth", "request")]
         return Response(self._pipeline.answer(*parts), media_type="application/json")
 
 
 def main() -> None:
-    """Write the settings where it was started, and become ``mlserver start``."""
+    """Write the settings to the current folder, and replace this process by ``mlserver start``."""
     bundle, port = sys.argv[1:]
     settings = {
         "debug": False, "parallel_workers": 0, "host": "127.0.0.1", "http_port": int(port), "grpc_port": free_port(),

@@ -1,6 +1,6 @@
-"""What every peer hosts: the pipeline of ``benchmarks.serving.bare``, with the service's own reading of requests and writing of answers.
+"""The pipeline that every peer hosts: ``benchmarks.serving.bare`` with the service's own parsing and writing.
 
-It runs in a peer's environment, so it imports the core and the contract, and no face.
+It runs in a peer's environment, so it imports the core and the contract, but no request handler.
 """
 
 from pathlib import Path
@@ -18,12 +18,12 @@ from service.localization.query import Query  # noqa: E402
 from service.maps.reader import MapBundle  # noqa: E402
 from service.runtime.engine import Located  # noqa: E402
 
-#: Where each peer listens, so that one load generator sends the same bytes to all.
+#: Path of every peer, so that one load generator sends the same bytes to all.
 PATH = "/v1/localize"
 
 
 class Pipeline:
-    """An open map that answers.
+    """An open map that answers requests.
 
     Args:
         bundle: the map.
@@ -35,7 +35,13 @@ class Pipeline:
         self._localizer = Localizer(self._bundle, Encoder.open(self._bundle.encoder_bytes()))
 
     def answer(self, rgb: bytes, depth: bytes, request: LocalizeRequest | bytes) -> bytes:
-        """The JSON of REST's answer to the three parts of its body; the request may have been read already."""
+        """Return the JSON of REST's answer to the three parts of its body.
+
+        Args:
+            rgb: encoded RGB image.
+            depth: encoded depth image.
+            request: the JSON of the request, or the parsed request.
+        """
         read = parsed(request, LocalizeRequest) if isinstance(request, bytes) else request
         asked = query_from(read, rgb=rgb, depth=depth)
         depth_m = decode_depth(

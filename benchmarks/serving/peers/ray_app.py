@@ -1,9 +1,9 @@
 """The pipeline in Ray Serve: ``python -m benchmarks.serving.peers.ray_app BUNDLE PORT``.
 
-One replica that reserves the one core, an ``async`` method with ``max_ongoing_requests`` above its default of 5, and the
-throughput-optimized flags (docs.ray.io/en/latest/serve/advanced-guides/performance.html), with HAProxy in the place of the proxy in
-Python (kuberay/user-guides/serve-high-throughput.html): 21 ms of processor time for a retrieval instead of 27, both on a busy
-machine. No access log, dashboard, metrics or usage report.
+One replica reserves the one core. Its ``async`` method has ``max_ongoing_requests`` above the default of 5. The
+throughput-optimized flags are on (docs.ray.io/en/latest/serve/advanced-guides/performance.html). HAProxy replaces the
+proxy in Python (kuberay/user-guides/serve-high-throughput.html): 21 ms of processor time for a retrieval instead of 27
+ms, both on a busy machine. Access log, dashboard, metrics and usage report are off.
 """
 
 import os
@@ -18,9 +18,9 @@ FLAGS = {
     "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1", "RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
     "RAY_SERVE_CONTROL_LOOP_INTERVAL_S": "1", "RAY_enable_metrics_collection": "0", "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_AUTH_MODE": "disabled",
-    "RAY_worker_niceness": "0",  # else its workers yield to whatever else runs on the machine
+    "RAY_worker_niceness": "0",  # otherwise its workers yield to all other processes
 }  # fmt: skip
-os.environ.update(FLAGS)  # read when Ray is imported
+os.environ.update(FLAGS)  # Ray reads them at import
 
 import ray  # noqa: E402  # after its flags
 from ray import serve  # noqa: E402
@@ -30,20 +30,20 @@ from starlette.responses import Response  # noqa: E402
 
 @serve.deployment(num_replicas=1, max_ongoing_requests=100, ray_actor_options={"num_cpus": 1})
 class Localization:
-    """Parts in, JSON out."""
+    """Service that takes the parts of a request and returns JSON."""
 
     def __init__(self, bundle: str) -> None:
         self._pipeline = Pipeline(Path(bundle))
 
     async def __call__(self, request: Request) -> Response:
-        """Localize."""
+        """Localize one query."""
         async with request.form() as form:
             parts = [await form[name].read() for name in ("rgb", "depth", "request")]
         return Response(self._pipeline.answer(*parts), media_type="application/json")
 
 
 def main() -> None:
-    """Serve until told to stop."""
+    """Serve until SIGTERM."""
     bundle, port = sys.argv[1:]
     ray.init(
         num_cpus=1, include_dashboard=False, log_to_driver=False, _node_ip_address="127.0.0.1", _temp_dir=str(Path.cwd() / "ray")

@@ -1,4 +1,4 @@
-"""A virtual environment for each peer, with the libraries of the pipeline at the versions that Streetfix itself runs with."""
+"""A virtual environment for each peer, with the pipeline's libraries at the versions that Streetfix runs with."""
 
 import subprocess
 import sys
@@ -8,7 +8,7 @@ from pathlib import Path
 from benchmarks.report import ROOT
 
 FOLDER = ROOT / "data" / "peers"
-#: What is installed, to the letter: the framework and what it serves with.
+#: Exact requirements of each peer: the framework and the packages that it serves with.
 REQUIREMENTS: dict[str, tuple[str, ...]] = {
     "litserve": (
         "litserve==0.2.19", "fastapi==0.165.0", "httptools==0.9.0", "python-multipart==0.0.34", "starlette==1.10.0", "uvicorn==0.54.0",
@@ -26,8 +26,8 @@ REQUIREMENTS: dict[str, tuple[str, ...]] = {
         "uvloop==0.23.0",
     ),
 }  # fmt: skip
-#: What the pipeline and the contract import, at the versions that run here, or the comparison would be of these. Not all that
-#: Streetfix needs: its gRPC face wants a newer protobuf than MLServer.
+#: Packages that the pipeline and the contract import. Equal versions keep the comparison fair. Streetfix's gRPC side is
+#: left out: it needs a newer protobuf than MLServer.
 PIPELINE = (
     "deflate", "faiss-cpu", "jaxtyping", "lz4", "numpy", "onnxruntime", "opencv-python-headless", "prometheus-client", "pydantic",
     "pydantic-settings", "zstandard",
@@ -35,11 +35,15 @@ PIPELINE = (
 
 
 class PeerError(Exception):
-    """A peer could not be installed, started or asked; says why, for the report."""
+    """A peer could not be installed, started or queried; the message goes into the report."""
 
 
 def python_of(name: str, folder: Path = FOLDER) -> Path:
-    """The interpreter of a peer's environment, which is made where it is not as the table says.
+    """Return the interpreter of a peer's environment; create the environment if it differs from the table.
+
+    Args:
+        name: name of the peer.
+        folder: folder of the environments.
 
     Raises:
         PeerError: it cannot be installed.
@@ -49,7 +53,7 @@ def python_of(name: str, folder: Path = FOLDER) -> Path:
     pinned = [f"{each}=={version(each)}" for each in PIPELINE]
     wanted = "\n".join([sys.version, *REQUIREMENTS[name], *pinned]) + "\n"
     if not stamp.exists() or stamp.read_text() != wanted:
-        # Streetfix is not installed: a peer runs the code of this checkout, by PYTHONPATH, and needs what that imports.
+        # Do not install Streetfix: a peer runs the code of this checkout by PYTHONPATH, and needs only its imports.
         uv("venv", "--clear", "--python", sys.executable, str(place))
         uv("pip", "install", "--compile-bytecode", "--python", str(python), *REQUIREMENTS[name], *pinned)
         stamp.write_text(wanted)
@@ -57,10 +61,13 @@ def python_of(name: str, folder: Path = FOLDER) -> Path:
 
 
 def uv(*arguments: str) -> None:
-    """Run it.
+    """Run uv.
+
+    Args:
+        *arguments: arguments of uv.
 
     Raises:
-        PeerError: it failed; with the last line that it said.
+        PeerError: uv is absent, or failed; the message ends with its last output.
     """
     command = [str(Path(sys.executable).with_name("uv")), *arguments, "--quiet"]
     try:

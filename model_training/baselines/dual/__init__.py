@@ -1,7 +1,8 @@
-"""Dual encoders: a tower for each sensor, one space (CLIP, LIP-Loc), and the same behind a field of view (ModaLink).
+"""Dual encoders: one tower per sensor and a common space (CLIP, LIP-Loc), also restricted to a field of view (ModaLink).
 
-Written from what their publications describe: Radford et al., ICML 2021; Shubodh et al., WACV workshops 2024; Xie et al.,
-2024. Neither levels the camera's pictures, fuses colour with depth before a tower or registers an answer.
+The code follows the publications: Radford et al., ICML 2021; Shubodh et al., WACV workshops 2024; Xie et al., 2024.
+These methods do not level the camera's images, do not fuse colour with depth before a tower, and do not register an
+answer.
 """
 
 from model_training.baselines.dual.answer import DualResult, run

@@ -18,12 +18,20 @@ from model_training.baselines.paper_data.frames import Frames
 from model_training.baselines.paper_data.pairs import Pairs
 from service.imaging.view_grid import ViewGrid
 
-SPACING_M = 1.0  # between the places that answers are chosen from
+#: Spacing of the places that can be answered, metres.
+SPACING_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class DualResult:
-    """Answers to each test; the training's processor time (s), images shown (both sides'), and its curve's file."""
+    """Answers and cost of a dual encoder.
+
+    Attributes:
+        answers: answers by test.
+        processor_s: processor time of the training, seconds.
+        images: images shown in training, of both sides.
+        curve: file of the training curve.
+    """
 
     answers: dict[str, PlaceAnswers]
     processor_s: float
@@ -35,21 +43,21 @@ def run(
     frames: Frames, pairs: Pairs, tests: Mapping[str, Pairs], work: Path, *, kind: Kind, budget_s: float = 3600.0,
     report: Callable[[str, int, int], None] = lambda *_: None, settings: LearnSettings | None = None,
 ) -> DualResult:  # fmt: skip
-    """Train the towers of a kind, or go on, and answer the tests by the best of their points.
+    """Train the towers of a kind, or resume, and answer the tests by the best checkpoint.
 
     Args:
-        frames: the LiDAR's side: what pictures are paired with, and the places of the answers.
-        pairs: to learn from.
-        tests: by name; of the pairs' camera.
+        frames: LiDAR frames, the partners of the images and the places of the answers.
+        pairs: RGB-D training pairs.
+        tests: RGB-D queries by name, from the camera of ``pairs``.
         work: folder of the training.
-        kind: ``dual`` sees whole panoramas, ``fov`` what a camera would see of them, at 24 headings a place.
-        budget_s: processor seconds of the process for the training, those of earlier sessions included; so two trainings need
-            two processes.
-        report: told of the training (per mille of its budget) and of places encoded.
-        settings: of the training; the best known by default.
+        kind: ``dual`` sees whole panoramas; ``fov`` sees a camera's field of view at 24 headings per place.
+        budget_s: training budget, processor seconds of this process and of earlier ones; two trainings need two
+            processes.
+        report: receives the progress of the training (per mille of the budget) and of the encoded places.
+        settings: settings of the training; the best known by default.
 
     Raises:
-        DatasetError: ``work`` is of other settings, or no pair was taken near a frame.
+        DatasetError: ``work`` belongs to other settings, or no pair is near a frame.
     """
     settings = settings or BEST[kind]
     grid, size = ViewGrid(), size_of(kind)
@@ -69,7 +77,16 @@ def answered(
     towers: Towers, views: LidarViews, frames: Frames, tests: Mapping[str, Pairs], settings: LearnSettings,
     report: Callable[[str, int, int], None],
 ) -> dict[str, PlaceAnswers]:  # fmt: skip
-    """Answers to each test: the place with the most similar view, and the street that most of the five nearest lie in."""
+    """Answer each test: the place with the most similar view, and the majority street of the five nearest places.
+
+    Args:
+        towers: trained towers.
+        views: views of a place for the LiDAR tower.
+        frames: LiDAR frames, the places of the answers.
+        tests: RGB-D queries by name.
+        settings: settings of the training.
+        report: receives a label, the number of encoded views and their total.
+    """
     places = Sweeps.of(frames, thinned(frames.places[:, :2], SPACING_M))
     rows = np.arange(len(places))
     total = len(places) * views.headings

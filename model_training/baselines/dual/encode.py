@@ -1,4 +1,4 @@
-"""Descriptors of many pictures and of many places' views, by trained towers."""
+"""Descriptors of images and of the views of places, by trained towers."""
 
 from collections.abc import Callable
 
@@ -10,12 +10,18 @@ from model_training.baselines.dual.lidar_views import LidarViews, fan
 from model_training.baselines.dual.pictures import Pictures, Sweeps
 from model_training.baselines.dual.towers import Towers
 
-CHUNK = 240  # images at once
+CHUNK = 240  # images per batch
 
 
 @torch.inference_mode()
 def encoded_pictures(towers: Towers, pictures: Pictures, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Unit descriptors (B, D) of some pictures."""
+    """Compute unit descriptors (B, D) of images.
+
+    Args:
+        towers: trained towers.
+        pictures: images of one camera.
+        rows: rows of ``pictures`` (B,).
+    """
     towers.eval()
     parts = [towers.camera(pictures.planes(rows[k : k + CHUNK])).numpy() for k in range(0, len(rows), CHUNK)]
     return np.concatenate(parts)
@@ -29,7 +35,15 @@ def encoded_places(
     rows: NDArray[np.int64],
     report: Callable[[int], None] = lambda _: None,
 ) -> NDArray[np.float32]:
-    """Unit descriptors (B * headings, D) of the views of some frames, a frame's views next to each other."""
+    """Compute unit descriptors (B * headings, D) of the views of frames; the views of a frame are adjacent.
+
+    Args:
+        towers: trained towers.
+        views: views of a place for the LiDAR tower.
+        sweeps: LiDAR frames.
+        rows: rows of ``sweeps`` (B,).
+        report: receives the number of encoded views.
+    """
     towers.eval()
     at, heading = np.repeat(rows, views.headings), np.tile(fan(views), len(rows))
     parts = []

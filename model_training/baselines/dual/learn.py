@@ -1,4 +1,4 @@
-"""Training of two towers, within a budget: pairs of a picture and a frame near it, told from the batch's other places."""
+"""Training of two towers within a budget: pairs of an image and a near frame, against the other places of the batch."""
 
 import math
 from collections.abc import Iterator
@@ -30,10 +30,10 @@ WATCH_SPACING_M, WATCH_REACH_M = {"dual": 1.0, "fov": 4.0}, 5.0
 
 @dataclass(frozen=True, slots=True)
 class LearnSettings:
-    """Everything that decides what is learnt within a budget; kept beside the checkpoint.
+    """All settings that determine the result of a training; kept beside the checkpoint.
 
-    Pilots of 160 processor seconds on the paper city's 3,800 pairs of the survey's own drive, 198 of them kept back; recall at
-    1 within 5 m after half of them, and at the end:
+    The table gives pilots of 160 processor seconds on the paper city's 3,800 pairs of the survey traversal, 198 of them
+    held out. The figures are recall at 1 within 5 m, after half of the pilot and at its end:
 
     ==================================  =====  =====
     ``dual``, 128 pairs, rate 2e-3      0.010  0.126
@@ -43,23 +43,41 @@ class LearnSettings:
     ``fov``, 128 pairs, NetVLAD head    0.005  0.086
     ==================================  =====  =====
 
-    A full budget is 22 times as long, and a batch of 48 is soon too easy (loss 0.07 for ``fov``); so the batches are larger
-    than the pilots' best, and the smaller rate stays. Panoramas keep the vehicle's heading: pictures look along it or against
-    it, and a street all round says which way it runs; with a random heading that would have to be learnt.
+    A full budget is 22 times as long. A batch of 48 then becomes too easy (loss 0.07 for ``fov``). So the batches are
+    larger than the pilots' best, and the smaller rate stays. Panoramas keep the vehicle's heading. Images look along it
+    or against it, and a panorama of a street shows its direction. With a random heading the network would have to learn
+    this.
+
+    Attributes:
+        kind: ``dual`` or ``fov``.
+        pairs: pairs per batch.
+        learning_rate: largest learning rate of AdamW.
+        weight_decay: weight decay of AdamW.
+        warm_up_share: share of the budget for the warm-up.
+        gradient_norm: limit of the gradient norm.
+        largest_scale: limit of the inverse temperature.
+        turn_deg: largest turn between an image and its LiDAR view, degrees; the nearest of 24 headings is off by up to
+            7.5.
+        frames_spacing_m: spacing of the frames that are paired with images, metres.
+        widths: channels of the patches and of each stage of a tower.
+        descriptor: size of the descriptor.
+        points: number of points of the curve.
+        precision: precision of the forward pass.
+        seed: seed of weights and batches.
     """
 
     kind: Kind
-    pairs: int = 64  # of a batch
+    pairs: int = 64
     learning_rate: float = 1.5e-3
     weight_decay: float = 1e-2
-    warm_up_share: float = 0.03  # of the budget
+    warm_up_share: float = 0.03
     gradient_norm: float = 2.0
     largest_scale: float = 60.0
-    turn_deg: float = 9.0  # between a picture and its LiDAR view, at most: a fan of 24 is off by up to 7.5
-    frames_spacing_m: float = 0.5  # of the frames that pictures are paired with
+    turn_deg: float = 9.0
+    frames_spacing_m: float = 0.5
     widths: tuple[int, ...] = (48, 96, 160)
     descriptor: int = 256
-    points: int = 12  # of the curve
+    points: int = 12
     precision: Precision = field(default_factory=native_precision)
     seed: int = 0
 
@@ -68,17 +86,32 @@ BEST = {"dual": LearnSettings("dual"), "fov": LearnSettings("fov", pairs=128)}
 
 
 def size_of(kind: Kind) -> tuple[int, int]:
-    """(height, width) of a picture as the camera's tower reads it."""
+    """Return the size (height, width) of an image for the camera tower, pixels.
+
+    Args:
+        kind: ``dual`` or ``fov``.
+    """
     return WHOLE if kind == "dual" else FIELD
 
 
 def views_of(kind: Kind, camera: PinholeCamera, grid: ViewGrid) -> LidarViews:
-    """How the LiDAR's tower is shown a place; ``camera`` is that of the pictures at ``size_of(kind)``."""
+    """Return the views of a place for the LiDAR tower.
+
+    Args:
+        kind: ``dual`` or ``fov``.
+        camera: camera of the images at ``size_of(kind)``.
+        grid: view grid of the panoramas.
+    """
     return WholePanorama(grid) if kind == "dual" else CameraField(camera, grid)
 
 
 def towers_of(settings: LearnSettings, views: LidarViews) -> Towers:
-    """New towers of the chosen widths."""
+    """Create new towers of the chosen widths.
+
+    Args:
+        settings: settings of the training.
+        views: views of a place for the LiDAR tower.
+    """
     all_round = settings.kind == "dual"
 
     def tower(planes: int, size: tuple[int, int], *, around: bool = False) -> Tower:
@@ -92,25 +125,43 @@ def towers_of(settings: LearnSettings, views: LidarViews) -> Towers:
 
 @dataclass(frozen=True)
 class Lesson:
-    """What is learnt from: pictures with the frames near each, and those kept back with the places they are sought among."""
+    """Training data: images with the frames near each, and held-out images with the places to search.
+
+    Attributes:
+        pictures: all images.
+        views: views of a place for the LiDAR tower.
+        poses: poses of the images (n, 4), as in ``Pairs.views``.
+        sweeps: LiDAR frames.
+        near: for each image, the rows of ``sweeps`` near it.
+        shown: rows of the training images.
+        kept_back: rows of the held-out images.
+        watch_places: rows of ``sweeps`` that the validation searches.
+    """
 
     pictures: Pictures
     views: LidarViews
-    poses: NDArray[np.float64]  # (n, 4) of the pictures, as ``Pairs.views``
+    poses: NDArray[np.float64]
     sweeps: Sweeps
     near: list[NDArray[np.int64]]
     shown: NDArray[np.int64]
     kept_back: NDArray[np.int64]
-    watch_places: NDArray[np.int64]  # of ``sweeps``
+    watch_places: NDArray[np.int64]
 
     @staticmethod
     def of(
         pictures: Pictures, poses: NDArray[np.float64], sweeps: Sweeps, views: LidarViews, settings: LearnSettings
     ) -> "Lesson":
-        """Choose what is shown.
+        """Split the images into training and held-out images.
+
+        Args:
+            pictures: all images.
+            poses: poses of the images (n, 4), as in ``Pairs.views``.
+            sweeps: LiDAR frames.
+            views: views of a place for the LiDAR tower.
+            settings: settings of the training.
 
         Raises:
-            DatasetError: no picture was taken near a frame.
+            DatasetError: no image is near a frame.
         """
         near = frames_near(poses[:, :2], sweeps.places[:, :2])
         usable = np.array([k for k, rows in enumerate(near) if len(rows)], np.int64)
@@ -123,7 +174,12 @@ class Lesson:
     def batches(
         self, settings: LearnSettings, rng: np.random.Generator
     ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """For ever: planes and positions (B, 2) of pictures, and of a frame near each, drawn by chance."""
+        """Yield batches without end: planes and positions (B, 2) of images, and of a random near frame for each.
+
+        Args:
+            settings: settings of the training.
+            rng: source of randomness.
+        """
         turn = math.radians(settings.turn_deg)
         size = min(settings.pairs, len(self.shown))
         while True:
@@ -139,10 +195,17 @@ class Lesson:
 
 
 def learn(lesson: Lesson, settings: LearnSettings, folder: Path, *, budget_s: float, report: Report) -> Training:
-    """Train until the budget is spent, or go on with what a stopped run left; Ctrl-C loses what came after the last point.
+    """Train until the budget is spent, or resume a stopped run; Ctrl-C loses the work after the last point.
 
-    The learning rate rises, then falls to nothing along a cosine over the budget, so the run is not stopped for a score that
-    rests on a plateau.
+    The learning rate rises, then falls to zero along a cosine over the budget. The run therefore does not stop at a
+    plateau of the score.
+
+    Args:
+        lesson: training data.
+        settings: settings of the training.
+        folder: folder of the run.
+        budget_s: budget, processor seconds.
+        report: receives the kind and the progress per mille.
     """
     with one_thread():
         return _learn(lesson, settings, folder, budget_s, report)
@@ -165,7 +228,7 @@ def _learn(lesson: Lesson, settings: LearnSettings, folder: Path, budget_s: floa
         losses.clear()
 
     for batch in lesson.batches(settings, np.random.default_rng([settings.seed, 2, images])):
-        if (training.curve or losses) and training.ended is not None:  # a short budget buys a step too
+        if (training.curve or losses) and training.ended is not None:  # even a short budget gets one step
             break
         set_rate(optimiser, settings.learning_rate * cosine_share(training.share_spent, warm_up=settings.warm_up_share))
         losses.append(step(towers.train(), optimiser, batch, settings))
@@ -173,7 +236,7 @@ def _learn(lesson: Lesson, settings: LearnSettings, folder: Path, budget_s: floa
         report(settings.kind, round(1000 * training.share_spent), 1000)
         if training.share_spent >= _next_point(training, settings, budget_s):
             point()
-    if losses:  # since the last point, where the budget ended while a batch was drawn
+    if losses:  # losses since the last point: the budget ended while a batch was drawn
         point()
     return training
 
@@ -181,7 +244,14 @@ def _learn(lesson: Lesson, settings: LearnSettings, folder: Path, budget_s: floa
 def step(
     towers: Towers, optimiser: torch.optim.Optimizer, batch: tuple[Tensor, Tensor, Tensor, Tensor], settings: LearnSettings
 ) -> float:  # fmt: skip
-    """One step down the symmetric loss (CLIP's), places within 6 m of each other left out; returns it before the step."""
+    """Take a step on the symmetric loss of CLIP, without negatives within 6 m; return the loss before the step.
+
+    Args:
+        towers: towers in training.
+        optimiser: optimiser of the towers.
+        batch: planes and positions of images and of views, as ``Lesson.batches`` yields them.
+        settings: settings of the training.
+    """
     planes, xy, views, views_xy = batch
     scale = towers.log_scale.exp().clamp(max=settings.largest_scale)
     with forward_in(settings.precision):
@@ -196,7 +266,12 @@ def step(
 
 
 def watch_score(towers: Towers, lesson: Lesson) -> float:
-    """Share of the pictures kept back whose best place lies within ``WATCH_REACH_M``, of places all over the drive."""
+    """Return the share of held-out images whose best place is within ``WATCH_REACH_M``, among places of the whole traversal.
+
+    Args:
+        towers: towers in training.
+        lesson: training data.
+    """
     rows = lesson.watch_places
     places = encoded_places(towers, lesson.views, lesson.sweeps, rows)
     pictures = encoded_pictures(towers, lesson.pictures, lesson.kept_back)
@@ -207,6 +282,6 @@ def watch_score(towers: Towers, lesson: Lesson) -> float:
 
 
 def _next_point(training: Training, settings: LearnSettings, budget_s: float) -> float:
-    """Share of the budget at which the curve gets its next point."""
+    """Return the share of the budget at which the curve gets its next point."""
     last_s = training.curve[-1].processor_s if training.curve else 0.0
     return min(1.0, (math.floor(settings.points * last_s / budget_s) + 1) / settings.points)

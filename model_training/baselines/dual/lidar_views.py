@@ -1,7 +1,7 @@
-"""What of a LiDAR's panorama a tower is shown: all of it, or what a camera at the place would see of it.
+"""Views of a LiDAR panorama for a tower: the whole panorama, or a camera's field of view at the place.
 
-The second follows ModaLink (field of view first, then one image plane for both sides): here the LiDAR's ranges are drawn on
-the camera's own picture plane, for a fan of headings at each place, since the camera's heading is not known.
+The second kind follows ModaLink: first the field of view, then one image plane for both sides. Here the LiDAR's ranges
+are projected onto the camera's image plane. The camera's heading is unknown, so each place has a fan of headings.
 """
 
 from typing import Protocol
@@ -17,17 +17,32 @@ from service.imaging.view_grid import ViewGrid
 
 
 class LidarViews(Protocol):
-    """Cuts views out of panoramas. ``headings``: views of each place; ``size`` (height, width) of a view."""
+    """Cuts views out of panoramas.
+
+    Attributes:
+        headings: number of views per place.
+        size: height and width of a view, cells.
+    """
 
     headings: int
     size: tuple[int, int]
 
     def planes(self, sweeps: Sweeps, rows: NDArray[np.int64], heading_rad: NDArray[np.float64]) -> Tensor:
-        """Planes (B, 3, height, width) of views of ``rows`` (B), each along a heading (B) against its panorama's x."""
+        """Return planes (B, 3, height, width) of views.
+
+        Args:
+            sweeps: LiDAR frames.
+            rows: rows of ``sweeps`` (B,).
+            heading_rad: heading of each view (B,) against the panorama's x axis, radians.
+        """
 
 
 class WholePanorama:
-    """All round, whatever the heading; every second column."""
+    """The whole panorama for any heading, with every second column.
+
+    Args:
+        grid: view grid of the panoramas.
+    """
 
     headings = 1
 
@@ -35,12 +50,23 @@ class WholePanorama:
         self.size = (grid.rows, grid.around // 2)
 
     def planes(self, sweeps: Sweeps, rows: NDArray[np.int64], heading_rad: NDArray[np.float64]) -> Tensor:  # noqa: ARG002 (none is needed)
-        """See ``LidarViews``."""
+        """Return planes of whole panoramas; see ``LidarViews``.
+
+        Args:
+            sweeps: LiDAR frames.
+            rows: rows of ``sweeps`` (B,).
+            heading_rad: unused.
+        """
         return lidar_planes(sweeps.panoramas[rows][:, :, ::2], sweeps.intensities[rows][:, :, ::2])
 
 
 class CameraField:
-    """A level camera's picture plane: z, metres, of the panorama's cell that lies nearest to each pixel's ray."""
+    """A level camera's image plane: z in metres of the panorama cell nearest to each pixel's ray.
+
+    Args:
+        camera: camera of the views.
+        grid: view grid of the panoramas.
+    """
 
     headings = 24
 
@@ -57,7 +83,13 @@ class CameraField:
         self._around = grid.around
 
     def planes(self, sweeps: Sweeps, rows: NDArray[np.int64], heading_rad: NDArray[np.float64]) -> Tensor:
-        """See ``LidarViews``."""
+        """Return planes of the camera's view; see ``LidarViews``.
+
+        Args:
+            sweeps: LiDAR frames.
+            rows: rows of ``sweeps`` (B,).
+            heading_rad: heading of each view (B,) against the panorama's x axis, radians.
+        """
         turned = heading_rad[:, None, None] * (self._around / (2 * np.pi))
         column = np.rint(self._column + turned).astype(np.int64) % self._around
         cells = (rows[:, None, None], self._row, column)
@@ -67,5 +99,9 @@ class CameraField:
 
 
 def fan(views: LidarViews) -> NDArray[np.float64]:
-    """Headings of a place's views, radians against the panorama's x."""
+    """Return the headings of a place's views (headings,), radians against the panorama's x axis.
+
+    Args:
+        views: kind of the views.
+    """
     return np.linspace(0.0, 2 * np.pi, views.headings, endpoint=False)

@@ -1,4 +1,4 @@
-"""Which frames belong to a picture, and which pictures are kept from the training to watch it."""
+"""Assignment of frames to images, and the choice of held-out images."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +9,26 @@ WATCH_RADIUS_M, WATCH_SHARE = 8.0, 0.05
 
 
 def frames_near(pictures_xy: NDArray[np.float64], frames_xy: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    """For each picture (n, 2) the frames (m, 2) it may be paired with: those within ``PAIR_REACH_M``, maybe none."""
+    """Return, for each image, the rows of the frames within ``PAIR_REACH_M``; possibly none.
+
+    Args:
+        pictures_xy: positions of the images (n, 2), metres.
+        frames_xy: positions of the frames (m, 2), metres.
+    """
     near = cKDTree(frames_xy).query_ball_point(pictures_xy, PAIR_REACH_M, return_sorted=True)
     return [np.array(rows, np.int64) for rows in near]
 
 
 def watched(xy: NDArray[np.float64], rng: np.random.Generator, share: float = WATCH_SHARE) -> NDArray[np.bool_]:
-    """Which positions (n, 2) are not shown: all that lie in some circles, so that whole pieces of street are unseen.
+    """Return which positions (n,) are held out: all within some circles, so that whole pieces of street are unseen.
 
-    Circles are drawn about positions by chance until they hold ``share`` of all. They do not ask which lane or drive a
-    picture is of, so nothing near the middle of one is shown.
+    The function draws circles around random positions until they hold ``share`` of all. It ignores lane and traversal,
+    so training sees nothing near the centre of a circle.
+
+    Args:
+        xy: positions (n, 2), metres.
+        rng: source of randomness.
+        share: share of positions to hold out.
     """
     tree, held = cKDTree(xy), np.zeros(len(xy), np.bool_)
     for centre in rng.permutation(len(xy)):

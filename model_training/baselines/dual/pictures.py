@@ -1,4 +1,4 @@
-"""What the towers read: small pictures of a camera, range images of a LiDAR, and both as planes near one."""
+"""Inputs of the towers: small camera images, LiDAR range images, and both as planes of values near one."""
 
 import math
 from dataclasses import dataclass
@@ -14,21 +14,35 @@ from model_training.baselines.paper_data.pairs import Pairs
 from service.geometry.camera import PinholeCamera
 
 CAMERA_PLANES, LIDAR_PLANES = 5, 3  # red, green, blue, log depth, measured; log range, measured, intensity
-REACH_M = 40.0  # the panoramas forget what lies beyond, so the pictures do
-FIELD_DEG = 15.0  # above and below the axis: what a LiDAR of the view grid sees
-WHOLE, FIELD = (112, 112), (32, 128)  # (height, width) of a whole picture, and of one cut to the LiDAR's elevations
+#: Largest distance in images, metres. The panoramas discard ranges beyond it too.
+REACH_M = 40.0
+#: Elevation above and below the axis that a LiDAR of the view grid sees, degrees.
+FIELD_DEG = 15.0
+#: Height and width of a whole image, and of one cut to the LiDAR's elevations, pixels.
+WHOLE, FIELD = (112, 112), (32, 128)
 
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """Pictures of one camera: ``rgb`` (n, h, w, 3), sRGB; ``depth_m`` (n, h, w), z, 0 where nothing was measured."""
+    """Images of one camera.
+
+    Attributes:
+        rgb: colours (n, h, w, 3), sRGB.
+        depth_m: z (n, h, w), metres, 0 for no measurement.
+        camera: camera of the images.
+    """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float16]
     camera: PinholeCamera
 
     def planes(self, rows: NDArray[np.int64], rng: np.random.Generator | None = None) -> Tensor:
-        """Planes (B, 5, h, w) of some pictures; ``rng`` changes the light, each picture's own way, for training."""
+        """Return planes (B, 5, h, w) of images.
+
+        Args:
+            rows: rows of the images (B,).
+            rng: source of random brightness and tint of each image, for training; None keeps the colours.
+        """
         rgb = torch.from_numpy(self.rgb[rows]).permute(0, 3, 1, 2).float() / 255
         if rng is not None:
             gain = rng.uniform(0.7, 1.3, (len(rows), 1)) * rng.uniform(0.9, 1.1, (len(rows), 3))
@@ -40,7 +54,14 @@ class Pictures:
 
 @dataclass(frozen=True, slots=True)
 class Sweeps:
-    """Frames of a drive in memory: the fields of ``Frames`` that share their names."""
+    """Frames of a traversal in memory, with the fields of ``Frames`` of the same names.
+
+    Attributes:
+        panoramas: ranges (n, rows, around), metres.
+        intensities: intensities (n, rows, around), 255 times the root of 0..1.
+        places: x, y, heading and height of each frame (n, 4), metres and radians.
+        street: street classes (n,).
+    """
 
     panoramas: NDArray[np.float16]
     intensities: NDArray[np.uint8]
@@ -49,7 +70,12 @@ class Sweeps:
 
     @staticmethod
     def of(frames: Frames, rows: NDArray[np.int64]) -> "Sweeps":
-        """Read some frames, in increasing order."""
+        """Read some frames into memory.
+
+        Args:
+            frames: LiDAR frames on disk.
+            rows: rows to read (n,), in increasing order.
+        """
         return Sweeps(
             frames.panoramas[rows], frames.intensities[rows], np.array(frames.places[rows]), frames.street[rows]
         )
@@ -59,7 +85,12 @@ class Sweeps:
 
 
 def pictures_of(pairs: Pairs, size: tuple[int, int]) -> Pictures:
-    """All pictures of ``pairs``: at ``WHOLE`` as they are, at ``FIELD`` cut to what a LiDAR sees too; colour is averaged."""
+    """Return all images of ``pairs``, whole for ``WHOLE`` or cut to the LiDAR's elevations for ``FIELD``; colour is averaged.
+
+    Args:
+        pairs: RGB-D pairs.
+        size: ``WHOLE`` or ``FIELD``.
+    """
     camera, top, bottom = pairs.camera, 0, pairs.camera.height
     if size == FIELD:
         half = camera.fy * math.tan(math.radians(FIELD_DEG))
@@ -78,7 +109,12 @@ def pictures_of(pairs: Pairs, size: tuple[int, int]) -> Pictures:
 
 
 def lidar_planes(distance_m: NDArray[np.float16], intensity: NDArray[np.uint8]) -> Tensor:
-    """Planes (B, 3, h, w) of a LiDAR's images (B, h, w): metres, 0 where nothing was measured; 255 times root intensity."""
+    """Return planes (B, 3, h, w) of LiDAR images.
+
+    Args:
+        distance_m: distances (B, h, w), metres, 0 for no measurement.
+        intensity: intensities (B, h, w), 255 times the root of 0..1.
+    """
     bright = torch.from_numpy(np.ascontiguousarray(intensity)).float().unsqueeze(1) / 255
     return torch.cat(
         [*_distance(torch.from_numpy(np.ascontiguousarray(distance_m)).float().unsqueeze(1)), bright], dim=1

@@ -1,4 +1,4 @@
-"""Two convolutional towers, one for each sensor, that end in unit descriptors of one space."""
+"""Two convolutional towers, one per sensor, that end in unit descriptors of one space."""
 
 from itertools import pairwise
 
@@ -6,12 +6,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-PATCH = 4  # pixels a side that the first layer takes together
-NARROW = 64  # channels that the last layer reads
+#: Side of the patches of the first layer, pixels.
+PATCH = 4
+#: Channels that the last layer reads.
+NARROW = 64
 
 
 class Convolution(nn.Module):
-    """3 x 3, batch norm; ``around``: the last axis is closed, its first column borders on the last."""
+    """A 3 x 3 convolution with batch normalisation.
+
+    Args:
+        inputs: input channels.
+        outputs: output channels.
+        stride: stride along both axes.
+        around: whether the last axis is closed, so that its first column borders on the last.
+    """
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, *, around: bool) -> None:
         super().__init__()
@@ -20,7 +29,11 @@ class Convolution(nn.Module):
         self.norm = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, inputs, h, w) to (B, outputs, h / stride, w / stride)."""
+        """Map (B, inputs, h, w) to (B, outputs, h / stride, w / stride).
+
+        Args:
+            x: input (B, inputs, h, w).
+        """
         if self.around:
             x = torch.cat([x[..., -1:], x, x[..., :1]], dim=3)
         out: Tensor = self.norm(self.convolution(x))
@@ -28,7 +41,12 @@ class Convolution(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two convolutions with a shortcut round both (He et al., CVPR 2016)."""
+    """Two convolutions with a shortcut around both (He et al., CVPR 2016).
+
+    Args:
+        channels: input and output channels.
+        around: whether the last axis is closed.
+    """
 
     def __init__(self, channels: int, *, around: bool) -> None:
         super().__init__()
@@ -36,23 +54,27 @@ class Residual(nn.Module):
         self.second = Convolution(channels, channels, around=around)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, channels, h, w), the same shape."""
+        """Map (B, channels, h, w) to the same shape.
+
+        Args:
+            x: input (B, channels, h, w).
+        """
         return functional.relu(x + self.second(functional.relu(self.first(x))))
 
 
 class Tower(nn.Module):
     """Patches, stages of a residual pair at half the size each, and one fully connected layer over all cells.
 
-    The last layer reads where things are, not an average. Patches of 4 x 4 pixels instead of convolutions at full size: on a
-    processor those took most of the time.
+    The last layer reads positions of cells, not an average. Patches of 4 x 4 pixels replace convolutions at full size,
+    which took most of the time on a processor.
 
     Args:
-        inputs: planes.
-        size: (height, width) of them.
+        inputs: number of planes.
+        size: height and width of the planes.
         widths: channels of the patches and of each stage.
-        patch_pair: a residual pair on the patches, too.
+        patch_pair: whether the patches get a residual pair too.
         descriptor: size of the descriptor.
-        around: the pictures are closed in azimuth; shifting them by 4 columns then shifts the patches by one.
+        around: whether the images are closed in azimuth; a shift by 4 columns then shifts the patches by one.
     """
 
     def __init__(
@@ -75,13 +97,22 @@ class Tower(nn.Module):
         self.full = nn.Linear(NARROW * height * width, descriptor)
 
     def forward(self, planes: Tensor) -> Tensor:
-        """Unit descriptors (B, D) of planes (B, inputs, height, width)."""
+        """Compute unit descriptors (B, D).
+
+        Args:
+            planes: input (B, inputs, height, width).
+        """
         cells = self.cells(planes.contiguous(memory_format=torch.channels_last))
         return functional.normalize(self.full(cells.flatten(1)), dim=1)
 
 
 class Towers(nn.Module):
-    """The camera's tower, the LiDAR's, and the logarithm of the inverse temperature (Radford et al., ICML 2021)."""
+    """The camera tower, the LiDAR tower, and the logarithm of the inverse temperature (Radford et al., ICML 2021).
+
+    Args:
+        camera: tower of the camera.
+        lidar: tower of the LiDAR.
+    """
 
     def __init__(self, camera: Tower, lidar: Tower) -> None:
         super().__init__()

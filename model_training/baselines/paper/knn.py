@@ -1,4 +1,4 @@
-"""The paper's classifier: K nearest neighbours by Euclidean distance over features (2.III, eq. 1)."""
+"""The paper's classifier: K nearest neighbours by Euclidean distance of features (2.III, eq. 1)."""
 
 from dataclasses import dataclass
 
@@ -14,24 +14,38 @@ KS = tuple(range(1, 22, 2))
 
 @dataclass(frozen=True, eq=False)
 class Gallery:
-    """What is known: ``features`` (n, d), where each was taken, ``xy`` (n, 2), metres, and its class ``street`` (n)."""
+    """Known samples.
+
+    Attributes:
+        features: features (n, d).
+        xy: positions (n, 2), metres, map frame.
+        street: street classes (n,).
+    """
 
     features: NDArray[np.float32]
     xy: NDArray[np.float64]
     street: NDArray[np.int64]
 
     def neighbours(self, features: NDArray[np.float32], k: int) -> NDArray[np.int64]:
-        """Rows of the k nearest, nearest first, (m, k)."""
+        """Return the rows (m, k) of the k nearest samples, nearest first.
+
+        Args:
+            features: features of the queries (m, d).
+            k: number of neighbours.
+        """
         index = faiss.IndexFlatL2(self.features.shape[1])
         index.add(np.ascontiguousarray(self.features))
         found: NDArray[np.int64] = index.search(np.ascontiguousarray(features), k)[1]
         return found
 
     def answers(self, neighbours: NDArray[np.int64]) -> PlaceAnswers:
-        """Majority of the neighbours' classes, ties to the nearer; the position is the nearest one's of that class.
+        """Answer the majority class of the neighbours, ties to the nearer, and the position of its nearest neighbour.
 
-        The paper says how K-NN finds the class, not how a position follows; the nearest frame of the winning class is what
-        its "ground true position" can mean, and a mean over several would lie between streets.
+        The paper describes how K-NN finds the class, but not how a position follows. The nearest frame of the winning
+        class is a possible meaning of its "ground true position". A mean over several frames would lie between streets.
+
+        Args:
+            neighbours: rows of the neighbours (m, k), nearest first.
         """
         classes = self.street[neighbours]
         won, at = np.empty(len(classes), np.int64), np.empty(len(classes), np.int64)
@@ -44,7 +58,15 @@ class Gallery:
 
 
 def class_centres(xy: NDArray[np.float64], street: NDArray[np.int64], classes: int) -> NDArray[np.float64]:
-    """Mean position (classes, 2) of each class, NaN of one without frames: where the softmax, which knows none, is taken to be."""
+    """Return the mean position (classes, 2) of each class, NaN for an empty class.
+
+    The softmax gives no position, so this mean is its answer.
+
+    Args:
+        xy: positions (n, 2), metres, map frame.
+        street: street classes (n,).
+        classes: number of classes.
+    """
     centres = np.full((classes, 2), np.nan)
     for each in np.unique(street):
         centres[each] = xy[street == each].mean(axis=0)

@@ -1,8 +1,8 @@
-"""What the paper's CNN is shown: pictures of LiDAR frames and of fused RGB-D pairs, in two image spaces.
+"""Inputs of the paper's CNN: images of LiDAR frames and of fused RGB-D pairs, in two image spaces.
 
-*From above* is the paper's: a whole LiDAR frame as a 2.5D image, against which it holds the fused picture as the camera sees it.
-*One space* is what the paper would need: both on the view grid (azimuth x elevation, levelled), range in the place of intensity,
-enlarged to the network's 224 x 224. A LiDAR has no colour, so its pictures are grey.
+*From above* is the paper's space: a whole LiDAR frame as a 2.5D image. The paper compares it with the fused image in
+the camera's view. *One space* is what the paper would need: both on the levelled view grid (azimuth x elevation), with
+range in the place of intensity, enlarged to the network's 224 x 224. A LiDAR has no colour, so its images are grey.
 """
 
 from dataclasses import dataclass
@@ -21,19 +21,30 @@ from service.imaging.view_grid import ViewGrid
 Space = Literal["aligned", "plain", "view"]
 Pictures = NDArray[np.uint8]  # (B, 224, 224, 3)
 Rows = NDArray[np.int64]
-TURN_RAD = np.deg2rad(15.0)  # of a training view against the street, either way along it: as queries are
+#: Largest turn of a training view against the street, either way along it, radians. The queries have the same range.
+TURN_RAD = np.deg2rad(15.0)
 _GRID = ViewGrid()
 
 
 @dataclass(frozen=True)
 class LidarPictures:
-    """Pictures of LiDAR frames: ``aligned`` by PCA and ``plain`` from above, or cut along a heading (``view``)."""
+    """Images of LiDAR frames.
+
+    Attributes:
+        frames: LiDAR frames.
+        space: ``aligned`` by PCA or ``plain`` from above, or ``view`` along a heading.
+    """
 
     frames: Frames
     space: Space
 
     def of(self, rows: Rows, headings_rad: NDArray[np.float64] | None = None) -> Pictures:
-        """Pictures of frames (B); ``headings_rad`` (B), against the vehicle's own, for views; 0 by default."""
+        """Return the images of frames (B, 224, 224, 3).
+
+        Args:
+            rows: rows of the frames (B,).
+            headings_rad: headings of views (B,) against the vehicle's, radians; None for 0.
+        """
         if self.space == "view":
             turned = np.zeros(len(rows)) if headings_rad is None else headings_rad
             columns = (turned[:, None] + _GRID.azimuths_rad + np.pi) / (2 * np.pi) * _GRID.around
@@ -44,15 +55,24 @@ class LidarPictures:
         return np.repeat(grey[..., None], 3, axis=3)
 
     def shaken(self, rows: Rows, rng: np.random.Generator) -> Pictures:
-        """Pictures to learn from: views look either way along the street, turned a little; others are as they are."""
+        """Return training images (B, 224, 224, 3): views look either way along the street with a small turn; others are unchanged.
+
+        Args:
+            rows: rows of the frames (B,).
+            rng: source of randomness.
+        """
         turn = rng.uniform(-TURN_RAD, TURN_RAD, len(rows)) + np.pi * rng.integers(0, 2, len(rows))
         return self.of(rows, turn)
 
 
 def fused_pictures(pairs: Pairs, rows: Rows, space: Space, *, colour: bool = True) -> Pictures:
-    """Pictures of RGB-D pairs (B): fused by IHS as the camera sees them, or on the view grid for ``view``.
+    """Return images of RGB-D pairs (B, 224, 224, 3), fused by IHS in the camera's view, or on the view grid for ``view``.
 
-    Without ``colour`` depth alone is drawn, in grey.
+    Args:
+        pairs: RGB-D pairs.
+        rows: rows of the pairs (B,).
+        space: image space.
+        colour: whether to use colour; otherwise depth alone in grey.
     """
     if space == "view":
         return drawn_views(pairs.ranges[rows], pairs.colours[rows] if colour else None)
@@ -65,7 +85,12 @@ def fused_pictures(pairs: Pairs, rows: Rows, space: Space, *, colour: bool = Tru
 
 
 def drawn_views(ranges: NDArray[np.floating], colours: NDArray[np.uint8] | None) -> Pictures:
-    """Views on the grid (B, rows, columns), metres, and their colours, as pictures of the network's size."""
+    """Return views as images of the network's size (B, 224, 224, 3).
+
+    Args:
+        ranges: ranges on the view grid (B, rows, columns), metres.
+        colours: colours (B, rows, columns, 3); None for grey.
+    """
     found = np.zeros((len(ranges), SIDE, SIDE, 3), np.uint8)
     for k, each in enumerate(ranges):
         metres = np.asarray(each, np.float32)

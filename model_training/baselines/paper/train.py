@@ -1,4 +1,4 @@
-"""Training the paper's CNN: as the paper says (84 iterations), and until it stops gaining."""
+"""Training of the paper's CNN: as published (84 iterations), and until it stops gaining."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -16,34 +16,45 @@ from model_training.baselines.paper_data.frames import Frames
 from model_training.baselines.paper_data.pairs import Pairs
 from model_training.training.precision import Precision, forward_in, native_precision
 
-LEARNT_SHARE = 0.7  # of the frames, at random: the paper's split
-ITERATIONS_AN_EPOCH, EPOCHS = 21, 4  # the paper's
+#: Random share of the frames for training, as in the paper.
+LEARNT_SHARE = 0.7
+ITERATIONS_AN_EPOCH, EPOCHS = 21, 4  # as in the paper
 WATCHED_BLOCKS, WATCHED_SHARE, WATCHED_EACH = 20, 0.05, 10
-PATIENCE = 4  # points of the curve without a gain, a quarter of an epoch each, after which the rate falls
-DROPS, DROP = 2, 0.2  # how often, and to how much; a rest at the last rate ends the run
-CHUNK = 128  # pictures in memory at a time; gradients of a larger batch are summed over them
+#: Points of the curve without a gain, a quarter of an epoch each, after which the rate falls.
+PATIENCE = 4
+#: Number of drops of the rate, and their factor. A plateau at the last rate ends the run.
+DROPS, DROP = 2, 0.2
+#: Images in memory at a time. Larger batches sum gradients over such chunks.
+CHUNK = 128
 SEED = 0
 
 
 @dataclass(frozen=True, slots=True)
 class CnnPlan:
-    """One way to train it.
+    """One way to train the CNN.
 
     Attributes:
-        space: the LiDAR's image space.
-        as_paper: SGDM, rate 3e-4, 84 iterations of a 21st of the training frames; else SGDM at ``rate`` in batches of ``batch``,
-            the rate falling whenever it stops gaining, until that helps no more or its budget is spent.
-        pairs_too: a third of each batch are fused RGB-D pairs of the training drives, in the same image space.
-        precision: of the forward pass.
+        space: image space of the LiDAR.
+        as_paper: True trains by SGDM at rate 3e-4 for 84 iterations, each with a 21st of the training frames. False
+            trains by SGDM at ``rate`` in batches of ``batch``; the rate falls at each plateau, until that no longer
+            helps or the budget is spent.
+        pairs_too: whether a third of each batch are fused RGB-D pairs of the training traversals, in the same image
+            space.
+        rate: first learning rate, unless ``as_paper``.
+        batch: images per batch, unless ``as_paper``. 32 gives a quarter more images per second than 128, since the
+            largest planes fit the processor's cache.
+        momentum: momentum of SGD.
+        weight_decay: weight decay of SGD, MATLAB's default L2 regularisation.
+        precision: precision of the forward pass.
     """
 
     space: Space
     as_paper: bool = False
     pairs_too: bool = False
     rate: float = 0.01
-    batch: int = 32  # a quarter more pictures a second than 128: a batch's largest planes stay in the processor's cache
+    batch: int = 32
     momentum: float = 0.9
-    weight_decay: float = 1e-4  # MATLAB's default L2 regularisation
+    weight_decay: float = 1e-4
     precision: Precision = field(default_factory=native_precision)
 
 
@@ -52,7 +63,13 @@ AS_PAPER_RATE = 3e-4
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Rows of frames: 70 % to learn from, of which ``watched`` (whole stretches of street) are kept aside, and 30 % to test."""
+    """Rows of frames: 70 % for training, with a held-out part in whole stretches of street, and 30 % for testing.
+
+    Attributes:
+        learnt: rows for training.
+        watched: held-out rows of the 70 %.
+        tested: rows for testing.
+    """
 
     learnt: NDArray[np.int64]
     watched: NDArray[np.int64]
@@ -60,12 +77,16 @@ class Split:
 
     @property
     def known(self) -> NDArray[np.int64]:
-        """The paper's 70 %: what K-NN may find."""
+        """Rows (n,) of the paper's 70 %, the frames that K-NN may find."""
         return np.sort(np.concatenate([self.learnt, self.watched]))
 
 
 def split_of(total: int) -> Split:
-    """The paper's random 70/30 split; stretches of the drive that stopping is decided on are taken from the 70 %."""
+    """Make the paper's random 70/30 split; take the held-out stretches from the 70 %.
+
+    Args:
+        total: number of frames.
+    """
     rng = np.random.default_rng(SEED)
     order = rng.permutation(total)
     learnt = np.sort(order[: round(LEARNT_SHARE * total)])
@@ -78,26 +99,44 @@ def split_of(total: int) -> Split:
 
 
 def shown_pairs(total: int) -> NDArray[np.int64]:
-    """Rows of the training pairs that are learnt from; every twentieth is kept aside, to end a training and to choose among variants."""
+    """Return rows (n,) of the training pairs; every twentieth is kept aside, to end a training and to choose among variants.
+
+    Args:
+        total: number of pairs.
+    """
     rows = np.arange(total, dtype=np.int64)
     shown: NDArray[np.int64] = rows[rows % 20 != 0]
     return shown
 
 
 def aside_pairs(total: int) -> NDArray[np.int64]:
-    """The others."""
+    """Return the rows (n,) that ``shown_pairs`` keeps aside.
+
+    Args:
+        total: number of pairs.
+    """
     return np.arange(0, total, 20)
 
 
 class CnnTrainer:
-    """One run: a plan, its data, its folder."""
+    """One training run.
+
+    Args:
+        plan: way to train.
+        frames: LiDAR frames.
+        pairs: RGB-D pairs; None without.
+        folder: folder of the run.
+        budget_s: budget, processor seconds.
+        patience: points without a gain after which the rate falls.
+    """
 
     def __init__(
         self, plan: CnnPlan, frames: Frames, pairs: Pairs | None, folder: Path, *, budget_s: float, patience: int = PATIENCE
     ) -> None:  # fmt: skip
         self.plan, self.frames, self.pairs = plan, frames, pairs
         self.split = split_of(len(frames))
-        # As printed nothing is chosen by what is watched: all of the 70 % is learnt from, some of the 30 % is watched.
+        # The published variant does no model selection: it trains on all of the 70 %, and its curve shows a part of
+        # the 30 %.
         self._learnt = self.split.known if plan.as_paper else self.split.learnt
         self._watched = self.split.tested[::WATCHED_EACH] if plan.as_paper else self.split.watched
         self.pictures = LidarPictures(frames, plan.space)
@@ -115,7 +154,12 @@ class CnnTrainer:
             self._optimiser.load_state_dict(state["optimiser"])
 
     def run(self, name: str, report: Report = lambda *_: None) -> PaperCnn:
-        """Train to the end and give the network back: the last one as in the paper, else the best one."""
+        """Train to the end and return the network: the last one for the published variant, else the best one.
+
+        Args:
+            name: label of the run.
+            report: receives the label and the progress per mille.
+        """
         with one_thread():
             self._train(name, report)
         if not self.plan.as_paper:
@@ -143,26 +187,30 @@ class CnnTrainer:
             report(name, round(1000 * spent), 1000)
             if images // every > (images - batch) // every:
                 point()
-        if losses:  # since the last point, where the budget ended between two
+        if losses:  # losses since the last point: the budget ended between two points
             point()
 
     @property
     def batch(self) -> int:
-        """Pictures of a step."""
+        """Images per step."""
         return -(-len(self._learnt) // ITERATIONS_AN_EPOCH) if self.plan.as_paper else self.plan.batch
 
     @property
     def iterations(self) -> int:
-        """Of a run as the paper has it."""
+        """Iterations of a published run."""
         return ITERATIONS_AN_EPOCH * EPOCHS
 
     def _done(self, images: int, most: int | None) -> bool:
         if most is not None:
             return images >= most
-        return images > 0 and self.training.ended is not None  # a short budget buys a step too
+        return images > 0 and self.training.ended is not None  # even a short budget gets one step
 
     def step(self, batch: int) -> float:
-        """Learn from so many pictures drawn at random; the mean loss."""
+        """Train on random images and return the mean loss.
+
+        Args:
+            batch: number of images.
+        """
         self.net.train()
         self._optimiser.zero_grad(set_to_none=True)
         total = 0.0
@@ -178,7 +226,7 @@ class CnnTrainer:
         return total
 
     def _drawn(self, count: int) -> tuple[Pictures, NDArray[np.int64]]:
-        """Pictures and classes, drawn at random."""
+        """Draw random images and their classes."""
         of_pairs = count // 3 if self.plan.pairs_too and self.pairs is not None else 0
         rows = np.sort(self._rng.choice(self._learnt, count - of_pairs, replace=False))
         pictures, street = self.pictures.shaken(rows, self._rng), self.frames.street[rows]
@@ -189,7 +237,7 @@ class CnnTrainer:
         return pictures, street
 
     def _watched_accuracy(self) -> float:
-        """Of stretches of street that are not shown; of pairs that are not shown, where pairs are learnt from."""
+        """Return the accuracy on held-out stretches of street, or on held-out pairs if the plan trains on pairs."""
         if self.plan.pairs_too and self.pairs is not None:
             pairs, aside = self.pairs, aside_pairs(len(self.pairs))
             _, scores = outputs(
@@ -202,14 +250,24 @@ class CnnTrainer:
 
 
 def as_input(pictures: Pictures) -> torch.Tensor:
-    """Pictures (B, H, W, 3) as the network reads them: (B, 3, H, W) in 0..1."""
+    """Convert images to the network's input (B, 3, H, W) in 0..1.
+
+    Args:
+        pictures: images (B, H, W, 3).
+    """
     return torch.from_numpy(pictures).permute(0, 3, 1, 2).float().div_(255)
 
 
 def outputs(
     net: PaperCnn, drawn: Callable[[NDArray[np.int64]], Pictures], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Features (n, 128) and class scores (n, 16) of ``drawn(rows)`` for rows 0 to ``count``."""
+    """Compute features (n, 128) and class scores (n, 16) of images.
+
+    Args:
+        net: the network.
+        drawn: returns the images of rows.
+        count: number of rows n; the rows are 0 to n - 1.
+    """
     net.eval()
     features, scores = [], []
     with torch.inference_mode():

@@ -1,7 +1,8 @@
-"""Every way in which the paper's method is tried, and what each answers.
+"""All variants of the paper's method, and their answers.
 
-The paper trains on LiDAR images and asks with fused RGB-D images, two kinds of picture that share no image space, and does not
-say how features of one could meet those of the other. So it is tried as it stands, and in every way that could be meant.
+The paper trains on LiDAR images and queries with fused RGB-D images. These two kinds share no image space, and the
+paper does not explain how their features could match. So we run the method as published, and in every way that it could
+be meant.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +21,7 @@ from model_training.baselines.paper.train import CnnPlan, CnnTrainer, Split, asi
 from model_training.baselines.paper_data.frames import Frames
 from model_training.baselines.paper_data.pairs import Pairs
 
-#: By name; the first is the paper to the letter.
+#: Plans by name. The first follows the paper to the letter.
 PLANS = {
     "as_printed": CnnPlan("aligned", as_paper=True),
     "converged": CnnPlan("aligned"),
@@ -39,7 +40,15 @@ WHAT = {
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """What one set of queries is answered: by softmax, and by K-NN for every k; ``kind`` says what the queries are."""
+    """Answers of a variant to one set of queries.
+
+    Attributes:
+        kind: kind of the queries.
+        softmax: answers by softmax.
+        knn: answers by K-NN, by k.
+        truth_xy: ground-truth positions (n, 2), metres, map frame.
+        truth_street: ground-truth street classes (n,).
+    """
 
     kind: str
     softmax: PlaceAnswers
@@ -50,7 +59,16 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A trained variant: its answers by set, its cost and its curve."""
+    """A trained variant.
+
+    Attributes:
+        name: name in ``PLANS``.
+        asked: answers by set of queries.
+        processor_s: processor time of the training, seconds.
+        images: images shown in training.
+        curve: training curve.
+        ended: why the training ended.
+    """
 
     name: str
     asked: Mapping[str, Asked]
@@ -64,17 +82,18 @@ def run_variant(
     name: str, frames: Frames, pairs: Pairs, tests: Mapping[str, Pairs], other_lidar: Frames, work: Path, *, budget_s: float,
     report: Report = lambda *_: None,
 ) -> Variant:  # fmt: skip
-    """Train one variant and ask it everything.
+    """Train one variant and answer all sets of queries.
 
     Args:
-        name: of ``PLANS``.
-        frames: of the survey's drive.
-        pairs: of the training drives.
+        name: name in ``PLANS``.
+        frames: LiDAR frames of the survey traversal.
+        pairs: RGB-D pairs of the training traversals.
         tests: RGB-D queries by split.
-        other_lidar: frames of the other drive, where ``tests`` are: to tell the leak from the gap between sensors.
-        work: where the run is kept.
-        budget_s: of processor time; the variant as printed takes its 84 iterations instead.
-        report: told the name and how much is done.
+        other_lidar: LiDAR frames of the other traversal at the places of ``tests``. They separate the leak of the
+            random split from the gap between the sensors.
+        work: folder of the runs.
+        budget_s: budget, processor seconds; the published variant takes its 84 iterations instead.
+        report: receives the label and the progress per mille.
     """
     plan = PLANS[name]
     trainer = CnnTrainer(plan, frames, pairs if plan.pairs_too else None, work / name, budget_s=budget_s)
@@ -117,7 +136,7 @@ def run_variant(
 
 
 def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs | None) -> Gallery:
-    """Features of the paper's 70 %; views look both ways along the street. Pairs learnt from are known places too."""
+    """Compute the features of the paper's 70 %, views in both directions of the street, and of the training pairs."""
     frames, rows = pictures.frames, split.known
     headings = (0.0, np.pi) if pictures.space == "view" else (0.0,)
     features, xy, street = [], [], []
@@ -140,5 +159,10 @@ def _gallery(net: PaperCnn, pictures: LidarPictures, split: Split, pairs: Pairs 
 
 
 def street_accuracy(answers: PlaceAnswers, asked: Asked) -> float:
-    """Share of queries whose class is right; an unanswered one is wrong."""
+    """Return the share of queries with the correct class; an unanswered query is wrong.
+
+    Args:
+        answers: answers to the queries.
+        asked: the queries' ground truth.
+    """
     return float((answers.street == asked.truth_street).mean())

@@ -1,7 +1,7 @@
-"""LiDAR frames at the paper's size: simulated, drawn and forgotten, so that 46,741 scans need no place on disk.
+"""LiDAR frames at the paper's size: simulated and rendered, without storing the 46,741 scans.
 
-Every frame draws its errors from its own seed. Frames are made in blocks; a block that is done is marked, and a run that was
-stopped goes on with the others.
+Every frame draws its errors from its own seed. Frames are made in blocks. A finished block is marked, and a stopped run
+continues with the other blocks.
 """
 
 import hashlib
@@ -32,7 +32,8 @@ from service.imaging.pca import level_scan
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 
 LIDAR, CITY_SEED, FORMAT = "paper_32", 0, 1
-STEP_M = 0.02  # between the stations that frames are chosen from; the densest class has a frame every 3 cm
+#: Spacing of the stations that frames are chosen from, metres. The densest class has a frame every 3 cm.
+STEP_M = 0.02
 BLOCK = 128
 FINISHED, BEGUN = "frames.json", "frames.begun.json"
 Report = Callable[[str, int, int], None]
@@ -42,12 +43,16 @@ PoseOf = Callable[[int, np.random.Generator], Transform]
 
 @dataclass(frozen=True)
 class Frames:
-    """The drive's frames in the order of the drive, memory-mapped.
+    """LiDAR frames of a traversal in its order, memory-mapped.
 
-    ``aligned`` and ``plain`` (n, 224, 224): the paper's 2.5D image with and without PCA; ``panoramas`` (n, rows, around),
-    metres, and ``intensities`` of the same shape (255 times the root of 0..1), levelled, column 0 at azimuth -pi against
-    ``places``; ``places`` (n, 4): x, y, heading of the panorama's x axis, LiDAR's height (m, rad); ``T_map_lidar`` (n, 4, 4);
-    ``street`` (n): the class of Table I, 0 to 15.
+    Attributes:
+        aligned: the paper's 2.5D images with PCA (n, 224, 224).
+        plain: the paper's 2.5D images without PCA (n, 224, 224).
+        panoramas: levelled ranges (n, rows, around), metres; column 0 is at azimuth -pi against ``places``.
+        intensities: levelled intensities (n, rows, around), 255 times the root of 0..1.
+        places: x, y, heading of the panorama's x axis, and height of the LiDAR (n, 4), metres and radians.
+        T_map_lidar: poses (n, 4, 4).
+        street: classes of Table I (n,), 0 to 15.
     """
 
     aligned: NDArray[np.uint8]
@@ -60,10 +65,13 @@ class Frames:
 
     @staticmethod
     def open(folder: Path) -> "Frames":
-        """Map what ``make_frames`` made.
+        """Open finished frames.
+
+        Args:
+            folder: folder of ``make_frames``.
 
         Raises:
-            DatasetError: the folder is not whole.
+            DatasetError: the folder is incomplete.
         """
         if not (folder / FINISHED).exists():
             raise DatasetError(f"{folder} holds no finished frames; run make paper", field="frames")
@@ -75,7 +83,12 @@ class Frames:
 
 
 def stations_of(city: City, total: int) -> tuple[list[Station], NDArray[np.int64]]:
-    """Where the frames are taken, ``total`` in Table I's proportions, evenly along each class; and their classes."""
+    """Choose stations in Table I's proportions, evenly along each class; return them and their classes (total,).
+
+    Args:
+        city: the city.
+        total: number of stations.
+    """
     along = stations(city, STEP_M)
     points = shapely.points([(station.x, station.y) for station in along])
     class_of = np.full(len(along), -1, np.int64)
@@ -90,7 +103,13 @@ def stations_of(city: City, total: int) -> tuple[list[Station], NDArray[np.int64
 
 
 def make_frames(folder: Path, total: int, *, workers: int | None = None, report: Report = lambda *_: None) -> Frames:
-    """Simulate, draw and keep ``total`` frames of the survey's drive, or go on with what a stopped run left.
+    """Simulate, render and keep frames of the survey traversal, or resume a stopped run.
+
+    Args:
+        folder: folder of the frames.
+        total: number of frames.
+        workers: number of processes; None for one per core.
+        report: receives a label, the number done and the total.
 
     Raises:
         DatasetError: the folder holds other frames.
@@ -111,7 +130,15 @@ def make_frames_at(
     folder: Path, T_map_lidar: NDArray[np.float64], street: NDArray[np.int64], *, traversal: int,
     workers: int | None = None, report: Report = lambda *_: None,
 ) -> Frames:  # fmt: skip
-    """The same of given poses (n, 4, 4) among the vehicles and people of another drive.
+    """Make frames at given poses among the vehicles and people of another traversal.
+
+    Args:
+        folder: folder of the frames.
+        T_map_lidar: poses (n, 4, 4).
+        street: street classes (n,).
+        traversal: number of the traversal.
+        workers: number of processes; None for one per core.
+        report: receives a label, the number done and the total.
 
     Raises:
         DatasetError: the folder holds other frames.
@@ -132,10 +159,10 @@ def make_frames_at(
 
 
 def _finished(folder: Path, made_of: dict[str, Any]) -> bool:
-    """Whether there is nothing to do; ``folder`` holds these frames, or nothing.
+    """Return whether the folder already holds these frames.
 
     Raises:
-        DatasetError: it holds others.
+        DatasetError: it holds other frames.
     """
     for path in (folder / FINISHED, folder / BEGUN):
         if path.exists() and json.loads(path.read_text()) != made_of:
@@ -180,7 +207,7 @@ def _make(
 
 @dataclass
 class _Job:
-    """What a worker has inherited."""
+    """Shared data of the workers."""
 
     folder: Path
     city: City
@@ -192,7 +219,8 @@ class _Job:
     rays: NDArray[np.float32]
 
 
-_job: _Job | None = None  # set before the workers are forked: they share the scene instead of copying it
+#: Set before the workers fork: they share the scene instead of copying it.
+_job: _Job | None = None
 
 
 def _mark(folder: Path, first: int) -> Path:

@@ -1,4 +1,4 @@
-"""RGB-D pairs as the learned methods read them: small pictures in memory maps, made once from a dataset's query sets."""
+"""RGB-D pairs for the learned methods: small images in memory maps, made once from a dataset's query sets."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -29,9 +29,15 @@ Report = Callable[[str, int, int], None]
 class Pairs:
     """RGB-D pairs, memory-mapped.
 
-    ``rgb`` (n, 224, 224, 3), sRGB; ``depth_mm`` (n, 224, 224), z, 0 where nothing was measured; ``ranges`` (n, rows, columns),
-    metres, and ``colours`` (n, rows, columns, 3) on the view grid, levelled; ``views`` (n, 4): x, y, heading of the view, height
-    of the camera (m, rad); ``T_map_camera`` (n, 4, 4); ``street`` (n), the class of Table I, 0 to 15.
+    Attributes:
+        rgb: colours (n, 224, 224, 3), sRGB.
+        depth_mm: z (n, 224, 224), millimetres, 0 for no measurement.
+        ranges: levelled ranges on the view grid (n, rows, columns), metres.
+        colours: levelled colours on the view grid (n, rows, columns, 3).
+        views: x, y, heading of the view, and height of the camera (n, 4), metres and radians.
+        T_map_camera: poses (n, 4, 4).
+        street: classes of Table I (n,), 0 to 15.
+        camera: camera of ``rgb`` and ``depth_mm``.
     """
 
     rgb: NDArray[np.uint8]
@@ -45,10 +51,13 @@ class Pairs:
 
     @staticmethod
     def open(folder: Path) -> "Pairs":
-        """Map what ``make_pairs`` made.
+        """Open finished pairs.
+
+        Args:
+            folder: folder of ``make_pairs``.
 
         Raises:
-            DatasetError: the folder is not whole.
+            DatasetError: the folder is incomplete.
         """
         if not (folder / "pairs.json").exists():
             raise DatasetError(f"{folder} holds no finished pairs; run make paper", field="pairs")
@@ -62,10 +71,16 @@ class Pairs:
 
 
 def make_pairs(dataset: Dataset, names: Sequence[str], folder: Path, *, report: Report = lambda *_: None) -> Pairs:
-    """Shrink the pairs of query sets into ``folder``, which appears whole or not at all.
+    """Shrink the pairs of query sets into a folder that appears complete or not at all.
+
+    Args:
+        dataset: dataset of the query sets.
+        names: names of the query sets.
+        folder: folder to create.
+        report: receives a label, the number done and the total.
 
     Raises:
-        DatasetError: a set has no truth.
+        DatasetError: a set has no ground truth, or the dataset has no streets.
     """
     if (folder / "pairs.json").exists():
         return Pairs.open(folder)
@@ -104,7 +119,7 @@ def make_pairs(dataset: Dataset, names: Sequence[str], folder: Path, *, report: 
 
 
 def _shrunk(frame: QueryFrame, grid: ViewGrid) -> dict[str, NDArray[np.generic]]:
-    """One row: colour averaged over the pixels that become one, depth taken from the nearest, never averaged."""
+    """Shrink one pair: colour is averaged; depth is the nearest pixel's, never an average."""
     T = frame.T_map_camera
     if T is None:
         raise DatasetError("a query set has no poses.txt, so nothing can be learnt from it", field="queries")

@@ -1,8 +1,8 @@
-"""The paper's 2.5D image: a whole LiDAR frame seen from above, 224 x 224, height as brightness (II.IV, II.V, section 3).
+"""The paper's 2.5D image: a whole LiDAR frame from above, 224 x 224, height as brightness (II.IV, II.V, section 3).
 
-The paper aligns a cloud "along x-axis" by PCA about z and gets rid of negative z. Its rotation leaves two choices that it does
-not speak of, made here: which end of the principal axis is +x (the side towards which the points' third moment lies), and the
-square that is drawn (50 m to each side, so that nearly all returns of a street are inside).
+The paper aligns a cloud "along x-axis" by PCA about z and removes negative z. It leaves two choices open. We take as +x
+the end of the principal axis towards the third moment of the points. We render a square of 50 m to each side, which
+contains nearly all returns of a street.
 """
 
 import numpy as np
@@ -13,14 +13,19 @@ from service.imaging.pca import principal_components
 
 SIZE = 224
 REACH_M = 50.0
-TOP_M = 12.0  # heights above the lowest ground are drawn from 1 to 255; 0 is "no return"
+#: Height above the lowest ground that maps to 255, metres. Heights use 1 to 255, and 0 means no return.
+TOP_M = 12.0
 
 Points = NDArray[np.floating]
 Picture = NDArray[np.uint8]
 
 
 def aligned_heading(points: Points) -> float:
-    """Angle (rad) of the first principal axis of the points' ground plan, its sign by the third moment along it."""
+    """Return the angle (rad) of the first principal axis in the ground plane; the third moment gives its sign.
+
+    Args:
+        points: points (N, 3), metres.
+    """
     plan = principal_components(points[:, :2])
     axis = plan.axes[:, 0]
     along = (np.asarray(points[:, :2], np.float64) - plan.mean) @ axis
@@ -30,14 +35,14 @@ def aligned_heading(points: Points) -> float:
 
 
 def picture_from_above(points: Points, *, aligned: bool) -> Picture:
-    """Draw a frame: each cell takes its highest return.
+    """Render a frame from above; each cell takes its highest return.
 
     Args:
-        points: (N, 3), metres, sensor axes, z up.
-        aligned: turn the first principal axis to x (the paper); else the sensor's own heading stays.
+        points: points (N, 3), metres, sensor axes, z up.
+        aligned: True rotates the first principal axis to x, as in the paper; False keeps the sensor's heading.
 
     Returns:
-        (224, 224): row 0 is +x, column 0 is +y; 0 where nothing was met.
+        Image (224, 224): row 0 is +x, column 0 is +y; 0 for no return.
     """
     picture = np.zeros((SIZE, SIZE), np.uint8)
     if len(points) < 3:

@@ -1,9 +1,9 @@
-"""The RGB-D pairs of the comparison: 7,600 to learn from, and twice the 626 test images of Table I.
+"""Plan of the comparison's RGB-D pairs: 7,600 for training, and twice the 626 test images of Table I.
 
-The paper says "two training data sets, each with 7600 image pairs" and not how they were driven. Half of ours ride on the
-survey's own drive, half on another, in both lanes and both directions with other vehicles, so that a method that learns from
-pairs has seen what the other drive's questions look like. The questions of ``same_drive`` stand on the survey's own track among
-its own vehicles, as the paper's random split has it; those of ``other_drive`` come from a drive that nothing was learnt from.
+The paper says "two training data sets, each with 7600 image pairs", but not how they were recorded. Half of our pairs
+follow the survey traversal, half another one, in both lanes and directions with other vehicles. A method that trains on
+pairs therefore knows queries of another traversal. The queries of ``same_drive`` lie on the survey's track among its
+vehicles, like the paper's random split. The queries of ``other_drive`` come from a traversal that no training uses.
 """
 
 from model_training.baselines.paper_data.table_one import PAPER_PAIRS
@@ -11,20 +11,22 @@ from model_training.simulation.plan import QueryPlan, SimulationPlan
 
 TRAINING_SETS = ("own_drive_precise", "second_drive_precise")
 SPLITS = ("same_drive", "other_drive")
-DENSEST_M = 0.5  # between scans of the survey at the paper's size
-TEST_TRAVERSAL, TRAINING_TRAVERSAL = 6, 20  # nothing else in the project drives these here
+#: Spacing of the survey's scans at the paper's size, metres.
+DENSEST_M = 0.5
+#: Traversals of the tests and of the second training set. Nothing else in the project uses these numbers in this city.
+TEST_TRAVERSAL, TRAINING_TRAVERSAL = 6, 20
 
 
 def pairs_plan(pairs: int, *, test_images: int | None = None) -> SimulationPlan:
-    """The paper's city with its training pairs and both tests.
+    """Plan the paper's city with its training pairs and both tests.
 
     Args:
-        pairs: to learn from.
-        test_images: for each split; None for Table I's 626.
+        pairs: number of training pairs.
+        test_images: test images per split; None for Table I's 626.
     """
 
     def test(name: str, traversal: int, *, on_track: bool) -> QueryPlan:
-        few = test_images or 64  # says nothing where Table I does
+        few = test_images or 64  # has no effect with Table I's counts
         return QueryPlan(name=name, traversal=traversal, on_track=on_track, per_class=test_images is None, count=few)
 
     queries = (
@@ -33,6 +35,6 @@ def pairs_plan(pairs: int, *, test_images: int | None = None) -> SimulationPlan:
         test("same_drive", 0, on_track=True),
         test("other_drive", TEST_TRAVERSAL, on_track=False),
     )
-    # As many stations as the survey's own drive has pairs to stand on, and a margin for those that are blocked.
+    # The survey needs as many stations as its own pairs, and a margin for blocked stations.
     spacing_m = min(4.0, DENSEST_M * (PAPER_PAIRS // 2) / max(1, pairs // 2))
     return SimulationPlan(name="paper-comparison", city="paper", seed=0, spacing_m=spacing_m, queries=queries)

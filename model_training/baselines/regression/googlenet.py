@@ -1,8 +1,8 @@
-"""GoogLeNet that regresses a camera's pose from an RGB-D picture.
+"""GoogLeNet that regresses a camera's pose from an RGB-D image.
 
-The network is that of Szegedy et al. (CVPR 2015) with batch normalisation (Ioffe and Szegedy, 2015), its first layer for four
-planes and its three classifiers made regressors, as PoseNet did (Kendall et al., ICCV 2015). All pools before the heads adapt
-to the size of the picture, so that any side from 32 pixels works; at 224 the cells are those published.
+The network is that of Szegedy et al. (CVPR 2015) with batch normalisation (Ioffe and Szegedy, 2015). Its first layer
+takes four planes, and its three classifiers are regressors, as in PoseNet (Kendall et al., ICCV 2015). All pools before
+the heads adapt to the size of the image, so any side from 32 pixels works. At 224 the cells are the published ones.
 """
 
 from typing import NamedTuple
@@ -14,29 +14,42 @@ from torch.nn import functional
 from model_training.training.precision import forward_in
 
 PLANES = 4  # red, green, blue, depth
-AUXILIARY_CELLS = 4  # a side; what an auxiliary head sees of the picture
+#: Cells per side of the feature map that an auxiliary head reads.
+AUXILIARY_CELLS = 4
 
 
 class Pose(NamedTuple):
-    """``position`` (B, 3), normalised map coordinates; ``quaternion`` (B, 4), unit, x, y, z, w; T_map_camera's."""
+    """Poses T_map_camera.
+
+    Attributes:
+        position: normalised map coordinates (B, 3).
+        quaternion: unit quaternions x, y, z, w (B, 4).
+    """
 
     position: Tensor
     quaternion: Tensor
 
 
 def convolution(inputs: int, outputs: int, size: int = 1, *, stride: int = 1) -> nn.Sequential:
-    """A convolution that keeps the picture's size but for its stride, batch normalisation, ReLU."""
+    """Make a convolution that keeps the image's size except for its stride, with batch normalisation and ReLU.
+
+    Args:
+        inputs: input channels.
+        outputs: output channels.
+        size: side of the kernel.
+        stride: stride along both axes.
+    """
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
     )
 
 
 class Inception(nn.Module):
-    """Four branches side by side: 1 x 1, 3 x 3, 5 x 5 and a pool, the last three narrowed by a 1 x 1 convolution.
+    """Four parallel branches: 1 x 1, 3 x 3, 5 x 5 and a pool; a 1 x 1 convolution narrows the last three.
 
     Args:
-        inputs: planes.
-        widths: a row of the paper's table 1: #1x1, #3x3 reduce, #3x3, #5x5 reduce, #5x5, pool proj.
+        inputs: input channels.
+        widths: a row of the publication's table 1: #1x1, #3x3 reduce, #3x3, #5x5 reduce, #5x5, pool proj.
     """
 
     def __init__(self, inputs: int, widths: tuple[int, int, int, int, int, int]) -> None:
@@ -49,12 +62,22 @@ class Inception(nn.Module):
         self.pooled = nn.Sequential(nn.MaxPool2d(3, 1, 1), convolution(inputs, pooled))
 
     def forward(self, planes: Tensor) -> Tensor:
-        """(B, inputs, h, w) to (B, outputs, h, w)."""
+        """Map (B, inputs, h, w) to (B, outputs, h, w).
+
+        Args:
+            planes: input (B, inputs, h, w).
+        """
         return torch.cat([self.one(planes), self.three(planes), self.five(planes), self.pooled(planes)], dim=1)
 
 
 class PoseHead(nn.Module):
-    """A hidden layer, then position and quaternion."""
+    """A hidden layer, then position and quaternion.
+
+    Args:
+        inputs: size of the features.
+        hidden: size of the hidden layer.
+        dropout: share of hidden units to drop.
+    """
 
     def __init__(self, inputs: int, hidden: int, dropout: float) -> None:
         super().__init__()
@@ -62,14 +85,23 @@ class PoseHead(nn.Module):
         self.position, self.quaternion = nn.Linear(hidden, 3), nn.Linear(hidden, 4)
 
     def forward(self, features: Tensor) -> Pose:
-        """(B, inputs) to a pose."""
+        """Map features to poses.
+
+        Args:
+            features: features (B, inputs).
+        """
         hidden = self.hidden(features).float()
-        with forward_in("float32"):  # eight bits would tell a city's width in steps of a metre
+        with forward_in("float32"):  # eight bits would resolve a city's width only to a metre
             return Pose(self.position(hidden), functional.normalize(self.quaternion(hidden), dim=1))
 
 
 class AuxiliaryHead(nn.Module):
-    """A pose from the middle of the network: pool, 1 x 1 convolution to 128 planes, 1,024 hidden units."""
+    """Pose from the middle of the network: a pool, a 1 x 1 convolution to 128 planes, and 1,024 hidden units.
+
+    Args:
+        inputs: input channels.
+        dropout: share of hidden units to drop.
+    """
 
     def __init__(self, inputs: int, dropout: float) -> None:
         super().__init__()
@@ -77,17 +109,22 @@ class AuxiliaryHead(nn.Module):
         self.head = PoseHead(128 * AUXILIARY_CELLS**2, 1024, dropout)
 
     def forward(self, planes: Tensor) -> Pose:
-        """(B, inputs, h, w) to a pose."""
+        """Map feature maps to poses.
+
+        Args:
+            planes: feature maps (B, inputs, h, w).
+        """
         cells = functional.adaptive_avg_pool2d(planes, AUXILIARY_CELLS)
         found: Pose = self.head(self.narrow(cells).flatten(1))
         return found
 
 
 class GoogLeNet(nn.Module):
-    """RGB-D pictures to poses.
+    """The network from RGB-D images to poses.
 
     Args:
-        dropout: before the outputs of every head (published: 0.4, and 0.7 for the auxiliary ones, for 1.2 million pictures).
+        dropout: share of units dropped before the outputs of every head (published: 0.4, and 0.7 for the auxiliary
+            heads, with 1.2 million images).
     """
 
     def __init__(self, *, dropout: float = 0.0) -> None:
@@ -111,7 +148,11 @@ class GoogLeNet(nn.Module):
         self.auxiliary = nn.ModuleList([AuxiliaryHead(512, dropout), AuxiliaryHead(528, dropout)])
 
     def forward(self, planes: Tensor) -> list[Pose]:
-        """Pictures (B, 4, side, side) to the poses of the last head and, while training, of the two auxiliary ones."""
+        """Return the poses of the last head and, in training, of the two auxiliary heads.
+
+        Args:
+            planes: images (B, 4, side, side).
+        """
         at_4a = self.until_4a(self.stem(planes))
         at_4d = self.until_4d(at_4a)
         last = functional.adaptive_avg_pool2d(self.until_5b(at_4d), 1).flatten(1)

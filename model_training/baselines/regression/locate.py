@@ -1,4 +1,4 @@
-"""The whole of [31], stage by stage: GoogLeNet's pose, PointNetLK's, ICP's."""
+"""The whole method of [31] by stage: the poses of GoogLeNet, PointNetLK and ICP."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,13 +16,19 @@ from model_training.baselines.regression.refine import by_icp, by_pointnet_lk
 from model_training.baselines.regression.train_pose import PoseRegressor
 from service.maps.streets import Streets
 
-#: Each goes on from the one before it; the last is the method.
+#: Stages; each continues from the previous one, and the last one is the method.
 STAGES = ("googlenet", "googlenet_pointnetlk", "icp_pointnetlk_googlenet")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageAnswers:
-    """``places``; ``T_map_camera`` (n, 4, 4); ``registered`` (n): the stage's own answer, not the one of the stage before it."""
+    """Answers of a stage.
+
+    Attributes:
+        places: position and street of each query.
+        T_map_camera: poses (n, 4, 4).
+        registered: whether the pose is the stage's own (n,); otherwise it is the previous stage's.
+    """
 
     places: PlaceAnswers
     T_map_camera: NDArray[np.float64]
@@ -31,7 +37,14 @@ class StageAnswers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Method:
-    """What is needed to locate."""
+    """Trained parts of the method.
+
+    Attributes:
+        regressor: trained GoogLeNet.
+        net: trained PointNet.
+        cloud: map cloud.
+        streets: streets of the map.
+    """
 
     regressor: PoseRegressor
     net: PointNet
@@ -40,7 +53,12 @@ class Method:
 
 
 def locate(method: Method, pairs: Pairs, *, report: Report = lambda *_: None) -> PlaceAnswers:
-    """Where each pair was taken, after all stages.
+    """Locate each pair by all stages.
+
+    Args:
+        method: trained parts.
+        pairs: RGB-D queries.
+        report: receives a label, the number done and the total.
 
     Raises:
         ExtraMissingError: small_gicp is not installed.
@@ -49,7 +67,12 @@ def locate(method: Method, pairs: Pairs, *, report: Report = lambda *_: None) ->
 
 
 def locate_by_stage(method: Method, pairs: Pairs, *, report: Report = lambda *_: None) -> Mapping[str, StageAnswers]:
-    """The same with what each of ``STAGES`` answered.
+    """Locate each pair, and return the answers of each of ``STAGES``.
+
+    Args:
+        method: trained parts.
+        pairs: RGB-D queries.
+        report: receives a label, the number done and the total.
 
     Raises:
         ExtraMissingError: small_gicp is not installed.

@@ -1,6 +1,6 @@
-"""PointNetLK: Lucas and Kanade's inverse-compositional alignment on the features of PointNet (Aoki et al., CVPR 2019).
+"""PointNetLK: inverse-compositional alignment of Lucas and Kanade on PointNet features (Aoki et al., CVPR 2019).
 
-Twists are translation first, then rotation (rad); lengths are in the clouds' own unit.
+Twists are translation first, then rotation (rad). Lengths are in the clouds' own unit.
 """
 
 from dataclasses import dataclass
@@ -10,17 +10,20 @@ from torch import Tensor
 
 from model_training.baselines.regression.pointnet import PointNet
 
-STEP = 1e-2  # of the finite differences, as published
+STEP = 1e-2  # step of the finite differences, as published
 ITERATIONS = 10
-DAMPING = 1e-4  # of the mean diagonal of J'J: clouds may hold nothing against which one of six motions shows
+#: Damping relative to the mean diagonal of J'J. A cloud may leave one of the six motions unobservable.
+DAMPING = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The motion found, and what is left of the features.
+    """The motion that was found, and the remaining feature difference.
 
-    ``T_template_source`` (B, 4, 4); ``residual`` and ``first_residual`` (B, F): features of the source, as it was found and as it
-    was given, less the template's.
+    Attributes:
+        T_template_source: motions (B, 4, 4).
+        residual: features of the moved source minus those of the template (B, F).
+        first_residual: features of the given source minus those of the template (B, F).
     """
 
     T_template_source: Tensor
@@ -29,7 +32,11 @@ class Alignment:
 
 
 def transform_of(twist: Tensor) -> Tensor:
-    """Exponential map of SE(3): (..., 6) to (..., 4, 4)."""
+    """Compute the exponential map of SE(3), (..., 4, 4).
+
+    Args:
+        twist: twists (..., 6).
+    """
     x, y, z, a, b, c = twist.unbind(-1)
     o = torch.zeros_like(x)
     rows = [(o, -c, b, x), (c, o, -a, y), (-b, a, o, z), (o, o, o, o)]
@@ -38,12 +45,23 @@ def transform_of(twist: Tensor) -> Tensor:
 
 
 def moved(T: Tensor, points: Tensor) -> Tensor:
-    """Points (..., N, 3) through T (..., 4, 4)."""
+    """Transform points (..., N, 3).
+
+    Args:
+        T: transforms (..., 4, 4).
+        points: points (..., N, 3).
+    """
     return points @ T[..., :3, :3].transpose(-1, -2) + T[..., None, :3, 3]
 
 
 def jacobian(net: PointNet, template: Tensor, features: Tensor) -> Tensor:
-    """How the template's features (B, F) change as it moves by a twist, backwards: (B, F, 6), by finite differences."""
+    """Compute the derivative (B, F, 6) of the template's features by the inverse of a twist, by finite differences.
+
+    Args:
+        net: network of the features.
+        template: points (B, N, 3).
+        features: features of the template (B, F).
+    """
     back = transform_of(-STEP * torch.eye(6, dtype=template.dtype))  # (6, 4, 4)
     turned = moved(back[None], template[:, None])  # (B, 6, N, 3)
     each = net(turned.flatten(0, 1)).unflatten(0, turned.shape[:2])
@@ -54,13 +72,13 @@ def jacobian(net: PointNet, template: Tensor, features: Tensor) -> Tensor:
 def aligned(net: PointNet, template: Tensor, source: Tensor, *, iterations: int = ITERATIONS) -> Alignment:
     """Find the motion that takes each source to its template.
 
-    The Jacobian is of the template where it lies, so it and the matrix that solves for a step are computed once.
+    The Jacobian belongs to the fixed template. It and the matrix of the step are therefore computed once.
 
     Args:
-        net: its features.
-        template: (B, N, 3).
-        source: (B, M, 3).
-        iterations: steps.
+        net: network of the features.
+        template: points (B, N, 3).
+        source: points (B, M, 3).
+        iterations: number of steps.
     """
     wanted = net(template)
     J = jacobian(net, template, wanted)
@@ -76,7 +94,12 @@ def aligned(net: PointNet, template: Tensor, source: Tensor, *, iterations: int 
 
 
 def alignment_loss(found: Alignment, T_true: Tensor) -> Tensor:
-    """As published: ||T_found T_true^-1 - I|| and the mean square of what is left of the features; each cloud's (B)."""
+    """Compute the published loss (B,): ||T_found T_true^-1 - I|| and the mean square of the feature difference.
+
+    Args:
+        found: result of the alignment.
+        T_true: ground-truth motions (B, 4, 4).
+    """
     identity = torch.eye(4, dtype=T_true.dtype)
     apart = (found.T_template_source @ torch.linalg.inv(T_true) - identity).square().sum(dim=(1, 2))
     loss: Tensor = apart + found.residual.square().mean(dim=1)

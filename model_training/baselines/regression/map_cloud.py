@@ -1,4 +1,4 @@
-"""The map as points: the survey's scans in one cloud, thinned, for registration."""
+"""The map as points: the survey's scans in one thinned cloud for registration."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,22 +14,35 @@ from model_training.mapping.voxel_map import VoxelMap
 from service.errors import ExtraMissingError, how_to_install
 
 VOXEL_M = 0.3
-EVERY_M = 1.0  # of the drive a scan is taken; those between see the same walls
-REACH_M = 60.0  # beyond, a scan's rings are metres apart
+#: Distance along the traversal between used scans, metres. Scans in between see the same walls.
+EVERY_M = 1.0
+#: Largest range of a scan's points, metres. Beyond it, the rings of a scan are metres apart.
+REACH_M = 60.0
 TILE_M = 10.0
-NEIGHBOURS = 12  # that a normal is computed of
+#: Number of neighbours of a normal.
+NEIGHBOURS = 12
 
 PointsF64 = NDArray[np.float64]  # (n, 3)
 
 
 @dataclass(frozen=True)
 class MapCloud:
-    """``points_map`` (n, 3): means of the voxels, metres, map frame."""
+    """Map cloud.
+
+    Attributes:
+        points_map: means of the voxels (n, 3), metres, map frame.
+    """
 
     points_map: PointsF64
 
     def around(self, xyz: NDArray[np.float64], reach_m: float, *, every: int = 1) -> PointsF64:
-        """Points in a ball about a position (3): each tile's ``every``-th, so that the whole is thinned evenly."""
+        """Return points (n, 3) in a ball around a position, each tile thinned evenly.
+
+        Args:
+            xyz: position (3,), metres, map frame.
+            reach_m: radius, metres.
+            every: take each n-th point of each tile.
+        """
         low = np.floor((xyz[:2] - reach_m) / TILE_M).astype(int)
         high = np.floor((xyz[:2] + reach_m) / TILE_M).astype(int)
         tiles = [(x, y) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1)]
@@ -41,7 +54,7 @@ class MapCloud:
 
     @cached_property
     def _tiles(self) -> dict[tuple[int, int], PointsF64]:
-        """The points of each square of ground, in no order."""
+        """Points of each square of ground, in random order."""
         shuffled = np.random.default_rng(0).permutation(self.points_map)
         cell = np.floor(shuffled[:, :2] / TILE_M).astype(np.int64)
         order = np.lexsort((cell[:, 1], cell[:, 0]))
@@ -52,7 +65,7 @@ class MapCloud:
 
     @cached_property
     def target(self) -> tuple[Any, Any]:
-        """The cloud with its normals, and its k-d tree, as small_gicp registers to them.
+        """The cloud with its normals, and its k-d tree, as targets of small_gicp.
 
         Raises:
             ExtraMissingError: small_gicp is not installed.
@@ -65,7 +78,7 @@ class MapCloud:
 
 
 def small_gicp_package() -> Any:
-    """The package that registers.
+    """Import small_gicp.
 
     Raises:
         ExtraMissingError: it is not installed.
@@ -78,7 +91,13 @@ def small_gicp_package() -> Any:
 
 
 def make_map_cloud(dataset: Dataset, cache: Path, *, report: Report = lambda *_: None) -> MapCloud:
-    """Put the survey's scans together by their written poses, or read what an earlier call kept in ``cache`` (.npy)."""
+    """Join the survey's scans by their recorded poses, or load an earlier result.
+
+    Args:
+        dataset: dataset of the survey.
+        cache: file (.npy) of the result.
+        report: receives a label, the number of scans done and their total.
+    """
     if not cache.exists():
         T_map_lidar = dataset.survey_poses()
         chosen = _spread(T_map_lidar[:, :3, 3])
@@ -97,7 +116,7 @@ def make_map_cloud(dataset: Dataset, cache: Path, *, report: Report = lambda *_:
 
 
 def _spread(xyz: PointsF64) -> list[int]:
-    """Rows of a drive, each at least ``EVERY_M`` from the one before."""
+    """Choose rows of a traversal, each at least ``EVERY_M`` from the previous one."""
     chosen: list[int] = []
     for number, here in enumerate(xyz):
         if not chosen or np.linalg.norm(here - xyz[chosen[-1]]) >= EVERY_M:

@@ -1,4 +1,4 @@
-"""RGB-D pairs as GoogLeNet takes them, and the pairs that are kept back to watch a training."""
+"""RGB-D pairs as inputs of GoogLeNet, and the held-out pairs of a training."""
 
 from dataclasses import dataclass
 
@@ -13,52 +13,83 @@ from model_training.baselines.regression.googlenet import PLANES, Pose
 from service.errors import DatasetError
 from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_from
 
-GREY, SPREAD = 0.45, 0.25  # of sRGB in 0..1, subtracted and divided by
+#: Mean and scale of sRGB in 0..1 for the normalisation.
+GREY, SPREAD = 0.45, 0.25
 DEPTH_UNIT_M = 20.0
 WATCHED_SHARE, BLOCK_M = 0.05, 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Jitter:
-    """What a training picture may look like; shares. No flips: a mirrored street is another place."""
+    """Random changes of a training image, as shares. There are no flips: a mirrored street is another place.
 
-    gain: float = 0.25  # of all colours
-    tint: float = 0.08  # of each colour
-    offset: float = 0.1  # of full scale
+    Attributes:
+        gain: standard deviation of the log gain of all colours.
+        tint: standard deviation of the log gain of each colour.
+        offset: largest offset of the colours, of full scale.
+        depth_gain: standard deviation of the log gain of depth.
+        depth_lost: share of images that lose depth in a rectangle.
+        lost_side: largest side of that rectangle, as a share of the image's side.
+    """
+
+    gain: float = 0.25
+    tint: float = 0.08
+    offset: float = 0.1
     depth_gain: float = 0.02
-    depth_lost: float = 0.5  # of the pictures lose depth in a rectangle of up to so large a share of each side:
+    depth_lost: float = 0.5
     lost_side: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class MapFrame:
-    """Normalised map coordinates: metres about ``centre_m``, divided by ``scale_m``, the same along all axes."""
+    """Normalised map coordinates, with the same scale along all axes.
+
+    Attributes:
+        centre_m: origin, metres, map frame.
+        scale_m: unit of length, metres.
+    """
 
     centre_m: tuple[float, float, float]
     scale_m: float
 
     @staticmethod
     def of(xyz: NDArray[np.float64]) -> "MapFrame":
-        """About the mean of positions (n, 3), in units of their standard deviation along the wider of x and y."""
+        """Centre on the mean of positions; the unit is their standard deviation along the wider of x and y.
+
+        Args:
+            xyz: positions (n, 3), metres, map frame.
+        """
         x, y, z = xyz.mean(axis=0)
         return MapFrame((float(x), float(y), float(z)), max(float(xyz[:, :2].std(axis=0).max()), 1.0))
 
     def normalised(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Metres (n, 3) to normalised."""
+        """Convert metres to normalised coordinates (n, 3).
+
+        Args:
+            xyz: positions (n, 3), metres, map frame.
+        """
         return np.asarray((xyz - np.array(self.centre_m)) / self.scale_m)
 
     def metres(self, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Normalised (n, 3) to metres."""
+        """Convert normalised coordinates to metres (n, 3).
+
+        Args:
+            normalised: positions (n, 3), normalised.
+        """
         return np.asarray(normalised * self.scale_m + np.array(self.centre_m))
 
 
 def watched_rows(pairs: Pairs) -> NDArray[np.bool_]:
-    """A flag for each pair: kept back, a twentieth of all, in whole squares of 10 m of ground (pairs of both drives).
+    """Return which pairs (n,) are held out: a twentieth of all, in whole 10 m squares of ground over both traversals.
 
-    The rows of a query set are in no order along the drive, so blocks of rows would be no places of their own.
+    The rows of a query set are not in the order of the traversal. Blocks of rows would therefore not be separate
+    places.
+
+    Args:
+        pairs: RGB-D pairs.
 
     Raises:
-        DatasetError: all stand in one square.
+        DatasetError: all pairs are in one square.
     """
     cell = np.floor(pairs.T_map_camera[:, :2, 3] / BLOCK_M).astype(np.int64)
     _, block, sizes = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
@@ -75,10 +106,17 @@ def watched_rows(pairs: Pairs) -> NDArray[np.bool_]:
 def planes_of(
     pairs: Pairs, rows: NDArray[np.int64], side: int, *, jitter: Jitter | None = None, rng: np.random.Generator | None = None
 ) -> Tensor:  # fmt: skip
-    """Pictures (B, 4, side, side) of some rows, jittered where both ``jitter`` and ``rng`` are given.
+    """Return images (B, 4, side, side), with random changes if both ``jitter`` and ``rng`` are given.
 
-    Normalised colours are averaged over the pixels that become one; depth is that of the nearest pixel, in units of 20 m, 0 where
-    nothing was measured.
+    Colours are averaged over the pixels that become one, then normalised. Depth is that of the nearest pixel, in units
+    of 20 m, 0 for no measurement.
+
+    Args:
+        pairs: RGB-D pairs.
+        rows: rows of the pairs (B,).
+        side: side of the images, pixels.
+        jitter: random changes; None for none.
+        rng: source of randomness; None for no changes.
     """
     found = np.empty((len(rows), PLANES, side, side), np.float32)
     for picture, row in zip(found, rows, strict=True):
@@ -93,7 +131,7 @@ def planes_of(
 
 
 def _jitter(picture: NDArray[np.float32], jitter: Jitter, rng: np.random.Generator) -> None:
-    """In place: exposure, white balance and offset of the colours; scale of the depth, and a hole in it."""
+    """Change an image in place: exposure, white balance and offset of the colours; scale of the depth, and a hole in it."""
     gains = np.exp(rng.normal(0, jitter.gain) + rng.normal(0, jitter.tint, 3))
     picture[:3] = np.clip(picture[:3] * gains[:, None, None] + rng.uniform(-jitter.offset, jitter.offset), 0, 1)
     picture[3] *= np.float32(np.exp(rng.normal(0, jitter.depth_gain)))
@@ -105,14 +143,24 @@ def _jitter(picture: NDArray[np.float32], jitter: Jitter, rng: np.random.Generat
 
 
 def poses_of(T_map_camera: NDArray[np.float64], frame: MapFrame) -> Pose:
-    """What a network is to answer for transforms (n, 4, 4)."""
+    """Convert transforms to the network's target poses.
+
+    Args:
+        T_map_camera: transforms (n, 4, 4).
+        frame: normalised map coordinates.
+    """
     position = frame.normalised(T_map_camera[:, :3, 3])
     quaternion = np.array([quaternion_xyzw_from(T[:3, :3]) for T in T_map_camera]).reshape(-1, 4)
     return Pose(torch.from_numpy(position.astype(np.float32)), torch.from_numpy(quaternion.astype(np.float32)))
 
 
 def transforms_of(pose: Pose, frame: MapFrame) -> NDArray[np.float64]:
-    """T_map_camera (n, 4, 4) of what a network answered."""
+    """Convert a network's poses to T_map_camera (n, 4, 4).
+
+    Args:
+        pose: output of the network.
+        frame: normalised map coordinates.
+    """
     positions = frame.metres(pose.position.double().numpy())
     rotations = [rotation_from_quaternion_xyzw(q) for q in pose.quaternion.double().numpy()]
     both = [transform_from(R, xyz) for R, xyz in zip(rotations, positions, strict=True)]

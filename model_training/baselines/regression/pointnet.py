@@ -1,4 +1,4 @@
-"""PointNet's global feature of a cloud (Qi et al., CVPR 2017), without the T-nets, as PointNetLK has it."""
+"""PointNet's global feature of a cloud (Qi et al., CVPR 2017) without the T-nets, as in PointNetLK."""
 
 import torch
 from torch import Tensor, nn
@@ -7,10 +7,14 @@ WIDTHS = (64, 64, 64, 128, 512)
 
 
 class PointNet(nn.Module):
-    """The same layers for every point, then the largest value of each feature over the cloud.
+    """The same layers for every point, then the maximum of each feature over the cloud.
 
-    Published with 1,024 features and batch normalisation; ours has 512, for twice the clouds in the same budget, and none: Lucas
-    and Kanade compare two passes, and statistics that differ between them are a motion that is not there.
+    The published network has 1,024 features and batch normalisation. Ours has 512 features, for twice the clouds in the
+    same budget, and no normalisation. Lucas and Kanade compare two passes, and different statistics of the passes would
+    look like a motion.
+
+    Args:
+        widths: sizes of the layers.
     """
 
     def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
@@ -24,6 +28,10 @@ class PointNet(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, points: Tensor) -> Tensor:
-        """Clouds (B, N, 3) of a size near 1 to features (B, F); the order of the points does not matter."""
+        """Compute features (B, F); the order of the points does not matter.
+
+        Args:
+            points: clouds (B, N, 3) of a size near 1.
+        """
         largest: Tensor = torch.amax(self.layers(points), dim=1)
         return largest

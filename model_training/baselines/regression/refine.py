@@ -1,8 +1,8 @@
-"""Registration of a query whose pose a network has guessed: PointNetLK, then ICP, against the map cloud.
+"""Registration of a query whose pose a network has estimated: PointNetLK, then ICP, against the map cloud.
 
-Either keeps the estimate before it where it cannot register: too few points, no convergence, too few inliers, fewer points on the
-map than before, or further away than it can have seen.
-ICP's reaches are no matter of much: (8, 2.5, 1) and (15, 5, 1) m found no more of poses 3, 8 and 15 m off (2026-11-22).
+Each step keeps the previous estimate if it cannot register. The reasons are too few points, no convergence, too few
+inliers, fewer points on the map than before, or a motion beyond the limit. The reach of ICP matters little: (8, 2.5, 1)
+and (15, 5, 1) m found no more of poses that were 3, 8 and 15 m off (2026-11-22).
 """
 
 from dataclasses import dataclass
@@ -21,11 +21,14 @@ from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternio
 LK_POINTS, LK_ITERATIONS = 1024, 20
 LK_MOST_M = 15.0
 NEAR_M = 1.0
-#: Point to plane: the map's points are means of voxels and no point that the camera measured, but they lie on its surfaces.
+#: Point-to-plane: the map's points are voxel means. They are not the points that the camera measures, but lie on the
+#: same surfaces.
 ICP_KIND = "PLANE_ICP"
-ICP_REACHES_M = (4.0, 1.0)  # how far a point's partner may be, coarse then fine
+#: Largest distance of a correspondence, metres: coarse, then fine.
+ICP_REACHES_M = (4.0, 1.0)
 ICP_ITERATIONS = 40
-ICP_LEAST_INLIERS = 0.6  # of the points, within the fine reach
+#: Smallest share of the points that must be inliers within the fine reach.
+ICP_LEAST_INLIERS = 0.6
 ICP_MOST_M = 10.0
 
 PointsF64 = NDArray[np.float64]  # (n, 3)
@@ -34,7 +37,12 @@ Transform = NDArray[np.float64]  # (4, 4)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refined:
-    """``T_map_camera``, and whether it is the registration's own; else it is what was given."""
+    """Result of a registration.
+
+    Attributes:
+        T_map_camera: pose (4, 4).
+        registered: whether the pose is the registration's own; otherwise it is the given one.
+    """
 
     T_map_camera: Transform
     registered: bool
@@ -43,7 +51,14 @@ class Refined:
 def by_pointnet_lk(
     net: PointNet, cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform, camera: PinholeCamera
 ) -> Refined:  # fmt: skip
-    """Align a query's points (n, 3) to what the map shows from its estimated pose.
+    """Align a query's points by PointNetLK to the map points visible from its estimated pose.
+
+    Args:
+        net: trained PointNet.
+        cloud: map cloud.
+        points_camera: points of the query (n, 3), metres, camera frame.
+        T_map_camera: estimated pose (4, 4).
+        camera: camera of the query.
 
     Raises:
         ExtraMissingError: small_gicp is not installed.
@@ -67,14 +82,25 @@ def by_pointnet_lk(
 
 
 def share_on_map(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -> float:
-    """Share of a query's points (n, 3) that have a point of the map within a metre."""
+    """Return the share of a query's points with a map point within a metre.
+
+    Args:
+        cloud: map cloud.
+        points_camera: points of the query (n, 3), metres, camera frame.
+        T_map_camera: pose (4, 4).
+    """
     _, tree = cloud.target
     _, squares = tree.batch_nearest_neighbor_search(transform_points(T_map_camera, points_camera), num_threads=1)
     return float(np.mean(np.asarray(squares) < NEAR_M**2))
 
 
 def by_icp(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -> Refined:
-    """Register a query's points (n, 3) to the map cloud from an estimated pose.
+    """Register a query's points to the map cloud by ICP from an estimated pose.
+
+    Args:
+        cloud: map cloud.
+        points_camera: points of the query (n, 3), metres, camera frame.
+        T_map_camera: estimated pose (4, 4).
 
     Raises:
         ExtraMissingError: small_gicp is not installed.
@@ -99,7 +125,7 @@ def by_icp(cloud: MapCloud, points_camera: PointsF64, T_map_camera: Transform) -
 
 
 def _rigid(T: Transform) -> Transform:
-    """The same with a rotation that is one to the last digit: single precision is not."""
+    """Return the transform with an exact rotation; that of single precision is not exact."""
     exact = T.copy()
     exact[:3, :3] = rotation_from_quaternion_xyzw(quaternion_xyzw_from(T[:3, :3]))
     return exact

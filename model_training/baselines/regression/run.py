@@ -14,12 +14,20 @@ from model_training.datasets.dataset import Dataset
 from service.errors import DatasetError
 from service.maps.streets import Streets
 
-GOOGLENET_SHARE = 0.75  # of the budget; PointNetLK has the rest
+#: Share of the budget for GoogLeNet. PointNetLK has the rest.
+GOOGLENET_SHARE = 0.75
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingCost:
-    """Of one network: processor time (s), pictures or clouds shown, why it ended, and where its curve lies."""
+    """Cost of the training of one network.
+
+    Attributes:
+        processor_s: processor time, seconds.
+        images: images or clouds shown.
+        ended: why the training ended.
+        curve: file of the curve.
+    """
 
     processor_s: float
     images: int
@@ -29,14 +37,19 @@ class TrainingCost:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegressionResult:
-    """``answers``: by split, then by stage (``locate.STAGES``); ``trainings``: of ``googlenet`` and ``pointnet_lk``."""
+    """Answers and training costs.
+
+    Attributes:
+        answers: answers by split, then by stage (``locate.STAGES``).
+        trainings: costs of ``googlenet`` and ``pointnet_lk``.
+    """
 
     answers: Mapping[str, Mapping[str, StageAnswers]]
     trainings: Mapping[str, TrainingCost]
 
     @property
     def processor_s(self) -> float:
-        """Of both trainings."""
+        """Processor time of both trainings, seconds."""
         return sum(cost.processor_s for cost in self.trainings.values())
 
 
@@ -44,23 +57,23 @@ def run(
     pairs: Pairs, dataset_folder: Path, tests: Mapping[str, Pairs], work: Path, *, budget_s: float = 3600.0,
     report: Report = lambda *_: None, pose: PoseSettings | None = None, lk: LkSettings | None = None,
 ) -> RegressionResult:  # fmt: skip
-    """Train on pairs, or go on with what a stopped run left in ``work``, and locate the pairs of each test.
+    """Train on pairs, or resume a stopped run in ``work``, and locate the pairs of each test.
 
     Args:
-        pairs: to learn from.
-        dataset_folder: whose survey is the map, and whose streets are answered.
-        tests: by split.
-        work: keeps the map cloud, checkpoints and curves.
-        budget_s: processor time of both trainings.
-        report: stage, done, of.
-        pose: settings of GoogLeNet.
-        lk: settings of PointNetLK.
+        pairs: RGB-D training pairs.
+        dataset_folder: dataset whose survey is the map, with the streets to answer.
+        tests: RGB-D queries by split.
+        work: folder of the map cloud, checkpoints and curves.
+        budget_s: budget of both trainings, processor seconds.
+        report: receives stage, number done and total.
+        pose: settings of GoogLeNet; None for the defaults.
+        lk: settings of PointNetLK; None for the defaults.
 
     Raises:
         DatasetError: the dataset has no streets, or ``work`` belongs to other settings.
         ExtraMissingError: small_gicp is not installed.
     """
-    small_gicp_package()  # before an hour of training, not after it
+    small_gicp_package()  # fail before the training, not after an hour
     dataset = Dataset(dataset_folder)
     streets = dataset.streets()
     if streets is None:

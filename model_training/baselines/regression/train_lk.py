@@ -1,10 +1,10 @@
 """Training of PointNetLK: depth against the map, from poses that are off by a known motion.
 
-Published: ModelNet's objects, after learning to tell their classes. Here: the depth of the training pairs, simulated as a
-LiDAR's points are, against the crop of the map that a wrong pose shows, from the beginning.
-
-Short pilots (130 s of processor time, 2026-11-22) did not yet come nearer than the wrong pose they began with: 4.0 m at 3e-3, 4.4 m
-at 1e-3, where poses were some 3 m off. The two were of different pairs, so the learning rate is a guess more than a finding.
+The published training uses ModelNet's objects, after a training on their classes. Ours uses the depth of the training
+pairs against the part of the map that a wrong pose shows, from the beginning. Depth and LiDAR points are both
+simulated. Short pilots (130 s of processor time, 2026-11-22) did not improve on the wrong pose: 4.0 m at 3e-3 and 4.4 m
+at 1e-3, with poses some 3 m off. The two pilots used different pairs. The learning rate is therefore a guess, not a
+finding.
 """
 
 import json
@@ -32,18 +32,33 @@ NAME = "PointNetLK"
 
 @dataclass(frozen=True, slots=True)
 class LkSettings:
-    """Everything that decides what a run learns; metres, rad."""
+    """All settings that determine the result of a run.
+
+    Attributes:
+        batch: clouds per batch.
+        points: points per cloud.
+        iterations: steps of Lucas and Kanade in training.
+        learning_rate: largest learning rate of Adam.
+        gradient_norm: limit of the gradient norm.
+        level_m: standard deviation of a wrong pose along the ground, metres.
+        height_m: standard deviation of its height, metres.
+        yaw_rad: standard deviation of its yaw, radians.
+        tilt_rad: standard deviation of its tilt, radians.
+        point_every: clouds between two points of the curve.
+        watched: number of held-out pairs that the score uses.
+        seed: seed of weights and batches.
+    """
 
     batch: int = 16
     points: int = 256
     iterations: int = 5
     learning_rate: float = 3e-3
     gradient_norm: float = 1.0
-    level_m: float = 3.0  # standard deviations of a wrong pose: along the ground,
+    level_m: float = 3.0
     height_m: float = 0.3
-    yaw_rad: float = 0.15  # about the vertical,
+    yaw_rad: float = 0.15
     tilt_rad: float = 0.02
-    point_every: int = 1600  # clouds
+    point_every: int = 1600
     watched: int = 200
     seed: int = 0
 
@@ -51,7 +66,13 @@ class LkSettings:
 def wrong_poses(
     T_map_camera: NDArray[np.float64], settings: LkSettings, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """T_camera_wrong (n, 4, 4) for cameras (n, 4, 4) that are upright but for a few degrees."""
+    """Draw T_camera_wrong (n, 4, 4) for cameras that are upright within a few degrees.
+
+    Args:
+        T_map_camera: poses (n, 4, 4).
+        settings: settings of the run.
+        rng: source of randomness.
+    """
     spread = [
         settings.level_m,
         settings.height_m,
@@ -68,13 +89,21 @@ def train_lk(
     pairs: Pairs, cloud: MapCloud, folder: Path, settings: LkSettings | None = None, *, budget_s: float,
     report: Report = lambda *_: None,
 ) -> Training:  # fmt: skip
-    """Train until the budget of processor time is spent, or go on with the folder's last checkpoint.
+    """Train until the budget of processor time is spent, or resume from the folder's last checkpoint.
+
+    Args:
+        pairs: RGB-D training pairs.
+        cloud: map cloud.
+        folder: folder of the run.
+        settings: settings of the run; None for the defaults.
+        budget_s: budget, processor seconds.
+        report: receives a label and the progress per mille.
 
     Raises:
         DatasetError: the folder belongs to other settings.
     """
     settings = settings or LkSettings()
-    # The rate falls until the budget's end and gains most there, so a score that rests before it ends nothing.
+    # The rate falls until the budget's end and gains most there. A plateau before it must not end the run.
     training = Training(folder, asdict(settings) | {"pairs": len(pairs)}, budget_s=budget_s, patience=1_000_000)
     kept_back = watched_rows(pairs)
     shown = np.flatnonzero(~kept_back)
@@ -83,7 +112,7 @@ def train_lk(
         learner = _Learner(pairs, cloud, settings)
         if (state := training.checkpoint()) is not None:
             learner.restore(state)
-        while not training.curve or training.ended is None:  # a short budget buys a step too
+        while not training.curve or training.ended is None:  # even a short budget gets one step
             images, losses = 0, list[float]()
             while not losses or (images < settings.point_every and training.share_spent < 1.0):
                 losses.append(learner.step(learner.draw(shown), training.share_spent))
@@ -95,7 +124,10 @@ def train_lk(
 
 
 def load_lk(training: Training) -> PointNet:
-    """The best network of a run.
+    """Load the best network of a run.
+
+    Args:
+        training: the run.
 
     Raises:
         DatasetError: nothing was trained yet.
@@ -107,13 +139,13 @@ def load_lk(training: Training) -> PointNet:
 
 @dataclass(frozen=True, slots=True)
 class _Batch:
-    template: Tensor  # (B, N, 3), what the map shows from the wrong pose, in its camera's frame, unit REACH_M
+    template: Tensor  # (B, N, 3), map points visible from the wrong pose, in its camera's frame, unit REACH_M
     source: Tensor  # (B, N, 3), depth, in the true camera's frame
     T_template_source: Tensor  # (B, 4, 4)
 
 
 class _Learner:
-    """All that a checkpoint keeps."""
+    """A network in training, with all that a checkpoint keeps."""
 
     def __init__(self, pairs: Pairs, cloud: MapCloud, settings: LkSettings) -> None:
         torch.manual_seed(settings.seed)
@@ -123,14 +155,26 @@ class _Learner:
         self._optimiser = torch.optim.Adam(self._net.parameters(), lr=settings.learning_rate)
 
     def draw(self, shown: NDArray[np.int64]) -> _Batch:
-        """A batch of some rows, each from a wrong pose of its own."""
+        """Draw a batch of rows, each with its own wrong pose.
+
+        Args:
+            shown: rows of the training pairs (n,).
+
+        Raises:
+            DatasetError: no pair's depth matches the map.
+        """
         batch = self._batch(self._rng.choice(shown, self._settings.batch), self._rng)
         if batch is None:
             raise DatasetError("no pair's depth meets the map; are both of one city?", field="pairs")
         return batch
 
     def step(self, batch: _Batch, share_spent: float) -> float:
-        """Learn from a batch; the mean loss."""
+        """Train on a batch and return the mean loss.
+
+        Args:
+            batch: the batch.
+            share_spent: spent share of the budget.
+        """
         settings = self._settings
         set_rate(self._optimiser, settings.learning_rate * cosine_share(share_spent, warm_up=WARM_UP))
         found = aligned(self._net, batch.template, batch.source, iterations=settings.iterations)
@@ -138,12 +182,16 @@ class _Learner:
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped
         norm = torch.nn.utils.clip_grad_norm_(self._net.parameters(), settings.gradient_norm)
-        if torch.isfinite(norm):  # a step of Lucas and Kanade may fling a cloud away
+        if torch.isfinite(norm):  # a step of Lucas and Kanade may diverge
             self._optimiser.step()
         return float(loss.detach())
 
     def error_m(self, rows: NDArray[np.int64]) -> float:
-        """Median distance between answer and truth, for the same wrong poses every time."""
+        """Return the median position error in metres, for the same wrong poses every time.
+
+        Args:
+            rows: rows of the held-out pairs (n,).
+        """
         rng, apart = np.random.default_rng(11), []
         for part in np.split(rows, range(self._settings.batch, len(rows), self._settings.batch)):
             batch = self._batch(part, rng)
@@ -164,7 +212,7 @@ class _Learner:
         self._rng.bit_generator.state = json.loads(state["numpy"])
 
     def _batch(self, rows: NDArray[np.int64], rng: np.random.Generator) -> _Batch | None:
-        """Rows with wrong poses, but for those that have too few points on either side; None where all have."""
+        """Make a batch with wrong poses, without rows that have too few points on either side; None if no row remains."""
         T_map_camera = np.asarray(self._pairs.T_map_camera[rows])
         T_camera_wrong = wrong_poses(T_map_camera, self._settings, rng)
         templates, sources, motions = [], [], []
