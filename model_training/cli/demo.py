@@ -13,6 +13,7 @@ from model_training.cli.demo_samples import write_samples
 from model_training.cli.demo_service import serving
 from model_training.cli.progress import bars
 from model_training.stock import ENCODER
+from service.maps.manifest import read_manifest
 
 
 def command(
@@ -48,10 +49,10 @@ def command(
             demo = city_demo(plan, out or Path("out/demo"), encoder, report)
         else:
             demo = recorded_demo(real, out or Path("out/demo-real"), encoder, report)
-    samples = write_samples(demo.questions, demo.folder / "samples")
+    samples = write_samples(demo.questions, demo.folder / "samples", map_name=read_manifest(demo.bundle).name)
     with serving(demo.bundle, port, samples) as service:
         try:
-            _show(demo, service.url, console, began, goes_on=not once)
+            _show(demo, samples, service.url, console, began, goes_on=not once)
             if not once:
                 service.wait()
         except KeyboardInterrupt:  # also one that comes while the last lines are printed
@@ -60,9 +61,9 @@ def command(
             console.print("stopped")
 
 
-def _show(demo: DemoMap, url: str, console: Console, began: float, *, goes_on: bool) -> None:
+def _show(demo: DemoMap, samples: Path, url: str, console: Console, began: float, *, goes_on: bool) -> None:
     outcomes = [ask(question, url) for question in demo.questions]
     print_answers(outcomes, console, places=demo.place_names)
     minutes, seconds = divmod(round(time.monotonic() - began), 60)
     console.print(f"all of it took {minutes} min {seconds} s; map and pictures: {demo.folder}\n", soft_wrap=True)
-    print_next(outcomes, demo.bundle, url, console, goes_on=goes_on)
+    print_next(outcomes, demo.bundle, samples, url, console, goes_on=goes_on)

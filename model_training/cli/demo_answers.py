@@ -112,13 +112,24 @@ def print_answers(outcomes: list[Outcome], console: Console, *, places: tuple[st
     console.print(_summary(outcomes, "first places" if places else "streets"))
 
 
-def print_next(outcomes: list[Outcome], bundle: Path, url: str, console: Console, *, goes_on: bool) -> None:
-    """Print what the user can do next."""
+def print_next(
+    outcomes: list[Outcome], bundle: Path, samples: Path, url: str, console: Console, *, goes_on: bool
+) -> None:  # fmt: skip
+    """Print the user's next commands.
+
+    Args:
+        outcomes: one or more; the command asks the first one that was right.
+        bundle: the map.
+        samples: folder of the sample pairs, which the console shows.
+        url: address of the service.
+        console: where to.
+        goes_on: the service keeps running.
+    """
     sample = next((outcome.question for outcome in outcomes if outcome.right), outcomes[0].question)
     files = ["--rgb", str(sample.rgb), "--depth", str(sample.depth), "--camera", str(sample.camera)]
     if not goes_on:
         console.print("serve this map again, and ask it:", style="bold")
-        console.print(f"  {_shell('serve', str(bundle))}", soft_wrap=True)
+        console.print(f"  {_shell('serve', str(bundle), '--samples', str(samples))}", soft_wrap=True)
         console.print(f"  {_shell('localize', *files)}", soft_wrap=True)
         return
     console.print("ask yourself, in another terminal:", style="bold")

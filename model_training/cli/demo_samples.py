@@ -11,16 +11,22 @@ from model_training.cli.demo_map import Question
 from service.geometry.rigid import heading_of_camera
 
 
-def write_samples(questions: Sequence[Question], folder: Path) -> Path:
-    """Put pictures, request and truth of each question into a folder of its own; the folder that holds them all.
+def write_samples(questions: Sequence[Question], folder: Path, *, map_name: str) -> Path:
+    """Write pictures, request and truth of each question into a folder of its own, and return the folder of all.
 
-    Written anew each time, and renamed into place whole: a service that starts meanwhile sees the old ones or the new ones.
+    The folder is written anew each time and gets its name when it is complete. A service that starts meanwhile sees the old
+    samples or the new ones.
+
+    Args:
+        questions: of the demo.
+        folder: folder to write; an existing one is replaced.
+        map_name: name of the map. Each request names it, so that the console offers the samples for this map only.
     """
     part, old = folder.with_name(f".{folder.name}.part"), folder.with_name(f".{folder.name}.old")
     for left in (part, old):
         shutil.rmtree(left, ignore_errors=True)
     for number, question in enumerate(questions, 1):
-        _write_sample(question, part / f"{number:02d}")
+        _write_sample(question, part / f"{number:02d}", map_name)
     part.mkdir(parents=True, exist_ok=True)  # where there are no questions
     if folder.exists():
         folder.rename(old)
@@ -29,11 +35,12 @@ def write_samples(questions: Sequence[Question], folder: Path) -> Path:
     return folder
 
 
-def _write_sample(question: Question, folder: Path) -> None:
+def _write_sample(question: Question, folder: Path, map_name: str) -> None:
     folder.mkdir(parents=True)
     for source, name in ((question.rgb, "rgb"), (question.depth, "depth")):
         _link(source, folder / f"{name}{source.suffix}")
-    shutil.copyfile(question.camera, folder / "request.json")
+    request = {"map": map_name} | json.loads(question.camera.read_text())
+    (folder / "request.json").write_text(json.dumps(request, indent=1) + "\n")
     T = question.T_map_camera
     if T is not None and question.place is None:  # single frames have no distance that would mean anything
         x, y, z = T[:3, 3].tolist()

@@ -14,7 +14,7 @@ from model_training.baselines.raw_range import raw_best_views
 from model_training.cli.progress import bars
 from model_training.cli.queries_table import print_queries
 from model_training.cli.stages_table import print_stages
-from model_training.datasets.dataset import Dataset
+from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.evaluation.evaluate import evaluate, write_trajectory
 from model_training.evaluation.measures import recall_at
 from model_training.evaluation.predict import Predictions
@@ -93,6 +93,7 @@ def command(
       streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
       streetfix evaluate maps/paper-city data/paper --report reports/paper
     """
+    require_map_first(bundle, dataset, "evaluate")
     opened, data = MapBundle.open(bundle), Dataset(dataset)
     names = queries or data.query_sets(with_truth=True)
     if trajectory is not None and len(names) != 1:

@@ -32,7 +32,8 @@ def command(
         str,
         typer.Option(
             help="Depth of an image: recorded or stored beside the image, sgbm from the stereo pair, or lidar from "
-            "the scan nearest in time.  [default: recorded; kitti-object and kitti-360: sgbm]"
+            "the scan nearest in time. For kitti-raw and kitti-odometry recorded means stored.  [default: recorded; "
+            "kitti-object and kitti-360: sgbm]"
         ),
     ] = "",
     poses: Annotated[
@@ -75,12 +76,16 @@ def command(
     align: Annotated[
         bool | None,
         typer.Option(
-            help="Correct the recording's poses step by step by scan matching. The whole trajectory stays in place.  "
+            help="Correct the recording's poses step by step by scan matching. The whole trajectory stays in place. "
+            "Needs the extra odometry. Without the extra, the default keeps the recording's poses and says so.  "
             f"[default: on for {', '.join(sorted(ALIGNED_KINDS))} without --poses]"
         ),
     ] = None,
     odometry: Annotated[
-        bool, typer.Option(help="Find the poses by LiDAR odometry. The command ignores the recording's own poses.")
+        bool,
+        typer.Option(
+            help="Find the poses by LiDAR odometry. The command ignores the recording's own poses. Needs the extra odometry."
+        ),
     ] = False,
     loops: Annotated[
         bool, typer.Option(help="With --odometry: close loops at places that the vehicle visits again.")
@@ -141,7 +146,7 @@ def command(
         raise DatasetError("align: --odometry finds poses from the scans alone; give one of the two", field="align")
     recording = open_recording(kind, source, told)
     console = Console()
-    for line in recording.notes.lines:
+    for line in (*recording.notes.lines, *(recording.notes.picture_lines if pictures else ())):
         console.print(line, soft_wrap=True)
     if not odometry:
         trajectory = _trajectory(recording, source, poses)
@@ -152,9 +157,10 @@ def command(
         else:
             of_file = False if poses is not None and align is None else align
             trajectory, told_of_poses = usual_poses(recording, trajectory, align=of_file, report=report)
-        summary = take(recording, trajectory, out, settings, report=report)
     if told_of_poses:
         console.print(told_of_poses, soft_wrap=True)
+    with bars() as report:
+        summary = take(recording, trajectory, out, settings, report=report)
     _tell(console, out, summary)
 
 

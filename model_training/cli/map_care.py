@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from model_training.cli.progress import bars
-from model_training.datasets.dataset import Dataset
+from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.mapping.build import describe
 from model_training.mapping.diff import diff_of, difference_png
 from model_training.mapping.info import info_of
@@ -143,6 +143,7 @@ def update(
     """
     if replace and replace_area is not None:
         raise typer.BadParameter("give --replace or --replace-area, not both")
+    require_map_first(bundle, dataset, "map update")
     with bars() as report:
         made = update_map(
             bundle, Dataset(dataset), out, replace_covered=replace, replace_area=replace_area, passes_vote=passes_vote,

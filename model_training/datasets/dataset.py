@@ -22,6 +22,7 @@ from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
 from service.imaging.view_grid import ViewGrid
 from service.localization.decoding import DepthFormat, decoded_query
 from service.localization.query import Query
+from service.maps import manifest
 
 #: Version of the folder's format.
 FORMAT = 1
@@ -214,13 +215,18 @@ class Dataset:
         description: content of ``dataset.json``.
 
     Raises:
-        DatasetError: ``dataset.json`` is missing, damaged or of another format.
+        DatasetError: ``dataset.json`` is missing, damaged or of another format, or the folder is a map bundle.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         path = folder / "dataset.json"
         if not path.is_file():
+            if (folder / manifest.FILE).is_file():
+                raise DatasetError(
+                    f"{folder} is a map bundle, not a dataset: give the folder that `streetfix simulate` or `streetfix import` wrote",
+                    field="dataset.json",
+                )
             raise DatasetError(
                 f"{folder} is no finished dataset: dataset.json is missing; run `streetfix simulate` or `streetfix import` (again)",
                 field="dataset.json",
@@ -368,6 +374,24 @@ def _camera_names(folder: Path, count: int) -> list[str] | None:
     if len(names) != count:
         raise DatasetError(f"{path} has {len(names)} lines for {count} pictures", field="cameras.txt")
     return names
+
+
+def require_map_first(bundle: Path, dataset: Path, command: str) -> None:
+    """Refuse a dataset and a map bundle that a user gave in the wrong order.
+
+    Args:
+        bundle: folder given as the map bundle.
+        dataset: folder given as the dataset.
+        command: command of `streetfix` that takes both, for the message.
+
+    Raises:
+        DatasetError: the first folder is a dataset and the second one a map bundle.
+    """
+    if (bundle / manifest.DATASET_FILE).is_file() and (dataset / manifest.FILE).is_file():
+        raise DatasetError(
+            f"{bundle} is a dataset and {dataset} is a map bundle: give the map bundle first: streetfix {command} {dataset} {bundle}",
+            field="dataset.json",
+        )
 
 
 def scan_path(folder: Path, number: int) -> Path:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.files import read_bytes
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
+from model_training.importing.kitti_folders import above, below, wrong_folder
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
 from model_training.importing.kitti_times import stamps_of, turn_of
 from model_training.importing.trajectory import Trajectory
@@ -40,10 +41,8 @@ def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
     pictures = root / "data_2d_raw" / name
     scans = numbered(scans_of / "data", (".bin",))
     if not scans:
-        raise DatasetError(
-            f"{source}: a drive's folder in {', '.join(_PARTS)} is wanted, and {scans_of}/data has no scan",
-            field="source",
-        )
+        wanted, otherwise = f"a drive's folder in {', '.join(_PARTS)}", f"{scans_of}/data has no scan"
+        raise wrong_folder(source, wanted, _drives_near(source), otherwise)
     left, right = (numbered(pictures / f"image_{eye}" / "data_rect", _PICTURES) for eye in ("00", "01"))
     calibration = _calibration(root / "calibration")
     numbers = sorted(scans.keys() | left.keys())
@@ -52,6 +51,20 @@ def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
     frames = tuple(KittiFrame(f"{n:010d}", stamps[n], scans.get(n), left.get(n), right.get(n), None) for n in numbers)
     poses = _poses(root / "data_poses" / name / "poses.txt", stamps, root / "calibration")
     return KittiSequence("kitti-360", source, frames, calibration, depth, poses, turn_s=turn_of(times))
+
+
+def _drives_near(source: Path) -> list[Path]:
+    """Drives with scans below a folder, above it, or in the tree of scans beside it."""
+
+    def is_drive(folder: Path) -> bool:
+        return folder.parent.name == _PARTS[0] and (folder / "velodyne_points").is_dir()
+
+    beside = source.parent / _PARTS[0] if source.name in _PARTS else source
+    return (
+        below(source, "velodyne_points", is_drive)
+        or below(beside, "velodyne_points", is_drive)
+        or above(source, is_drive)
+    )
 
 
 def _calibration(folder: Path) -> KittiCalibration:

@@ -9,6 +9,7 @@ import numpy as np
 
 from model_training.datasets.files import read_bytes
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
+from model_training.importing.kitti_folders import above, below, wrong_folder
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
 from model_training.importing.spinning import KITTI_VERTICAL_DEG
 from model_training.importing.trajectory import Trajectory
@@ -32,9 +33,8 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float 
     """
     scans = numbered(source / "velodyne", (".bin",))
     if not scans:
-        raise DatasetError(
-            f"{source}: a folder sequences/NN with velodyne/*.bin in it is wanted; here is no scan", field="source"
-        )
+        sequences = below(source, "velodyne", _is_sequence) or above(source, _is_sequence)
+        raise wrong_folder(source, "a folder sequences/NN with velodyne/*.bin in it", sequences, "here is no scan")
     eyes = next((pair for pair in _PAIRS if (source / f"image_{pair[0]}").is_dir()), _PAIRS[0])
     left, right = (numbered(source / f"image_{eye}", (".png", ".jpg")) for eye in eyes)
     stored = numbered(source / f"depth_{eyes[0]}", (".png",))
@@ -44,6 +44,11 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float 
     frames = tuple(KittiFrame(f"{n:06d}", stamps[n], scans.get(n), left.get(n), right.get(n), stored.get(n)) for n in numbers)  # fmt: skip
     poses = _poses(source.parent.parent / "poses" / f"{source.name}.txt", stamps, T_lidar_cam0)
     return KittiSequence("kitti-odometry", source, frames, calibration, depth, poses, vertical_deg=vertical_deg)
+
+
+def _is_sequence(folder: Path) -> bool:
+    """Whether a folder is a sequence. KITTI's object layout also has a folder ``velodyne``, but no ``calib.txt``."""
+    return (folder / "velodyne").is_dir() and (folder.parent.name == "sequences" or (folder / "calib.txt").is_file())
 
 
 def _calibration(path: Path, left: str, right: str) -> tuple[KittiCalibration, np.ndarray]:

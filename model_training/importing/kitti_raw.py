@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from model_training.datasets.layouts import SCANS_AT_REST
 from model_training.importing.kitti_calibration import KittiCalibration, calibration_from, read_matrices
+from model_training.importing.kitti_folders import above, below, wrong_folder
 from model_training.importing.kitti_sequence import RATE_HZ, KittiDepth, KittiFrame, KittiSequence, numbered
 from model_training.importing.kitti_times import stamps_of, turn_of
 from model_training.importing.oxts import read_oxts
@@ -64,13 +65,11 @@ def open_kitti_raw(source: Path, *, depth: KittiDepth, vertical_deg: float = KIT
 def _drive(source: Path) -> Path:
     if (source / "velodyne_points").is_dir():
         return source
-    drives = sorted(path.parent for path in source.glob("*/velodyne_points")) if source.is_dir() else []
-    if len(drives) != 1:
-        found = ", ".join(path.name for path in drives) or "none"
-        raise DatasetError(
-            f"{source}: the folder of one drive is wanted, with velodyne_points in it; here: {found}", field="source"
-        )
-    return drives[0]
+    drives = below(source, "velodyne_points")
+    if len(drives) == 1 and drives[0].parent == source:
+        return drives[0]
+    drives = drives or above(source, lambda folder: (folder / "velodyne_points").is_dir())
+    raise wrong_folder(source, "the folder of one drive, with velodyne_points in it,", drives, "here: none")
 
 
 def _calibration(drive: Path, left: str, right: str) -> KittiCalibration:

@@ -103,7 +103,28 @@ class KittiSequence:
         )
         turned = f"; points turned up by {self.vertical_deg:g} degrees" if self.vertical_deg else ""
         counted = f"{len(self.frames)} moments: {scans} scans, {left} left and {right} right pictures"
-        return Notes((counted, times + turned), source)
+        needed = {"stored": "stored", "sgbm": "right"}.get(self.depth)
+        lacking = left > 0 and needed and not any(frame.left and getattr(frame, needed) for frame in self.frames)
+        what = "stored depth" if needed == "stored" else "a right picture"
+        hint = f"no picture has {what}, so no picture becomes a query: {self._depth_choices()}; --no-pictures leaves pictures out"
+        return Notes((counted, times + turned), source, (hint,) if lacking else ())
+
+    def _depth_choices(self) -> str:
+        """Which values of ``--depth`` serve this recording, and why the others do not."""
+        left = sum(frame.left is not None for frame in self.frames)
+        stored = sum(frame.left is not None and frame.stored is not None for frame in self.frames)
+        pairs = sum(frame.left is not None and frame.right is not None for frame in self.frames)
+        scans = sum(frame.scan is not None for frame in self.frames)
+        pictures = f"of {left} picture{'s' * (left != 1)}"
+        choices = []
+        if self.kind != "kitti-360":
+            choices.append(f"stored ({stored} {pictures} {'has' if stored == 1 else 'have'} it)")
+        if self.calibration.focal_baseline_px_m is None:
+            choices.append("sgbm (not possible: the calibration lacks the right camera)")
+        else:
+            choices.append(f"sgbm ({pairs} {pictures} {'has' if pairs == 1 else 'have'} a right one)")
+        choices.append(f"lidar ({scans} scan{'s' * (scans != 1)})")
+        return f"the choices of --depth are {', '.join(choices)}"
 
     def count(self) -> int:
         """Count the scans and the left images."""
@@ -128,19 +149,20 @@ class KittiSequence:
                 "add it, or take --depth lidar",
                 field="P3",
             )
+        choices = self._depth_choices()
         for frame in self.frames:
             if frame.scan is not None:
                 points = read_scan(frame.scan)
                 name = f"velodyne {frame.name}"
                 yield Unusable("scan", name, points) if isinstance(points, str) else self._scan(name, frame, points)
             if pictures and frame.left is not None:
-                yield self._picture(frame, frame.left)
+                yield self._picture(frame, frame.left, choices)
 
     def _scan(self, name: str, frame: KittiFrame, points: NDArray[np.float32]) -> RecordedScan:
         offsets = None if self.turn_s is None else times_by_azimuth(points, period_s=self.turn_s)
         return RecordedScan(name, frame.stamp_s, raised(points, self.vertical_deg), offsets)
 
-    def _picture(self, frame: KittiFrame, left: Path) -> RecordedPicture | Unusable:
+    def _picture(self, frame: KittiFrame, left: Path, choices: str) -> RecordedPicture | Unusable:
         name, calibration = f"image {frame.name}", self.calibration
         try:
             rgb = read_rgb(left)
@@ -150,11 +172,11 @@ class KittiSequence:
             )  # fmt: skip
             if self.depth == "stored":
                 if frame.stored is None:
-                    return Unusable("picture", name, "no stored depth beside it (--depth sgbm or lidar does without)")
+                    return Unusable("picture", name, f"no stored depth beside it; {choices}")
                 return replace(picture, depth=read_stored_depth(frame.stored, rgb.shape[:2]))
             if self.depth == "sgbm":
                 if frame.right is None:
-                    return Unusable("picture", name, "no right picture beside it")
+                    return Unusable("picture", name, f"no right picture beside it; {choices}")
                 return self._matched(picture, read_rgb(frame.right))
             return picture
         except DatasetError as error:

@@ -94,10 +94,12 @@ class Notes:
     Attributes:
         lines: for people.
         source: for ``dataset.json``.
+        picture_lines: for people who import images.
     """
 
     lines: tuple[str, ...] = ()
     source: dict[str, Any] = field(default_factory=dict)
+    picture_lines: tuple[str, ...] = ()
 
 
 class Recording(Protocol):

@@ -51,7 +51,13 @@ class RosBag:
         topics = self._content.topics
         names = {role: None if (topic := getattr(topics, role)) is None else topic.name for role in ROLES}
         lines = (*topics.lines(), *self._content.remarks)
-        return Notes(lines, {"path": self._path.name, "topics": names, "vehicle": self._content.vehicle})
+        lacking = self._settings.want_depth and topics.color is not None and topics.depth is None
+        hint = (
+            "no topic of depth, so no picture becomes a query: give --depth lidar (depth from the scans), "
+            "--topic depth=NAME, or --no-pictures"
+        )
+        source = {"path": self._path.name, "topics": names, "vehicle": self._content.vehicle}
+        return Notes(lines, source, (hint,) if lacking else ())
 
     def count(self) -> int:
         """Count scans and colour images."""

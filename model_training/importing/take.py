@@ -261,7 +261,9 @@ class _Taking:
         if self._settings.depth == "lidar" and scan is not None:
             pinhole = replace(pinhole, depth=self._lidar_depth(pinhole, *scan))
         if pinhole.depth is None:
-            self.dropped.add("picture", picture.name, "no depth")
+            self.dropped.add(
+                "picture", picture.name, "no depth in the recording; --depth lidar takes it from the scans"
+            )
             return
         if why := self._queries.add(pinhole, T_map_vehicle @ picture.T_vehicle_camera):
             self.dropped.add("picture", picture.name, why)

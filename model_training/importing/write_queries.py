@@ -16,6 +16,7 @@ from model_training.datasets.dataset import (
 from model_training.datasets.png import write_png
 from model_training.importing.recording import Depth, RecordedPicture
 from service.geometry.rigid import Transform
+from service.imaging.depth_unit_hint import MILLIMETRE_FACTOR, unit_factor
 
 #: Step for depth recorded in metres: 16 bits reach 65 m, and the step is finer than the resolution of our sensors.
 METRES_SCALE_M = 0.001
@@ -56,6 +57,8 @@ class QueryWriter:
             depth = None if picture.depth is None else picture.depth.shape
             return f"sizes differ: colour {picture.rgb.shape[:2]}, depth {depth}, camera {size}"
         values, scale_m = whole_steps(picture.depth, picture.depth_scale_m)
+        if picture.depth.dtype != np.uint16 and unit_factor(picture.depth) == MILLIMETRE_FACTOR:
+            return "its floating-point depth looks like millimetres, and metres are wanted: divide it by 1000, or record 16-bit integers"
         if not values.any():
             return "its depth is empty"
         number = f"{self.count:06d}"

@@ -138,7 +138,7 @@ def usual_poses(
     except ExtraMissingError as missing:
         if align:
             raise
-        return trajectory, f"poses are the recording's own, which may be off by decimetres: {missing}"
+        return trajectory, f"--align is off: poses are the recording's own, which may be off by decimetres: {missing}"
     if found is None:
         return trajectory, "poses are the recording's own: fewer than two scans have one"
     line = f"poses aligned with {found.scans} scans: a step from scan to scan changed by {found.step_m:.2f} m in the median"

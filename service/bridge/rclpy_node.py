@@ -1,6 +1,8 @@
 """The bridge as an rclpy node, for users with ROS 2. Its parameters, remappings and executors then apply."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from threading import Event
 from typing import Any
 
@@ -10,15 +12,53 @@ from service.bridge.pose import StampedPose
 from service.errors import ExtraMissingError
 from service.runtime.wakeup import Wakeup
 
+#: Name of the node.
+NODE = "streetfix_bridge"
 #: Seconds between two checks for images, and minimum seconds without a query until an idle diagnosis is published.
 _LOOK_S, _IDLE_S = 0.05, 1.0
+
+
+@contextmanager
+def ros_node(*, args: list[str] | None = None, domain: int | None = None) -> Iterator[Any]:
+    """Provide an rclpy node, and take it down at the end.
+
+    rclpy installs no signal handlers, because they would shut ROS down before the last result is published. The caller ends
+    ``spin`` by its own handler.
+
+    Args:
+        args: ROS arguments such as parameters and remappings; None takes those of the process.
+        domain: ``ROS_DOMAIN_ID`` of the robot; None takes that of the environment.
+
+    Raises:
+        ExtraMissingError: rclpy or a ROS message package is not installed.
+    """
+    try:
+        import rclpy
+        from rclpy.signals import SignalHandlerOptions
+
+        for messages in ("diagnostic_msgs.msg", "geometry_msgs.msg", "sensor_msgs.msg"):  # of `spin`
+            import_module(messages)
+    except ModuleNotFoundError as error:
+        raise ExtraMissingError(
+            f"--node rclpy needs the package {error.name!r}, which comes with ROS 2: source /opt/ros/DISTRIBUTION/setup.bash in an "
+            "environment with system packages, or say --node dds, which needs no ROS", field="node",
+        ) from error  # fmt: skip
+    rclpy.init(args=args, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node(NODE)
+        try:
+            yield node
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
 
 
 def run(
     bridge: Bridge, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None, *,
     domain: int = 0, reliable: bool = False, depth: int = 5,
 ) -> None:  # fmt: skip
-    """Process images and publish the results until ``over`` is set.
+    """Process images in a new node and publish the results until ``over`` is set.
 
     Args:
         bridge: that processes the messages.
@@ -31,19 +71,30 @@ def run(
     Raises:
         ExtraMissingError: rclpy or a ROS message package is not installed.
     """
-    try:
-        import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import PoseWithCovarianceStamped
-        from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-        from sensor_msgs.msg import CameraInfo, Image
-    except ModuleNotFoundError as error:
-        raise ExtraMissingError(
-            f"--node rclpy needs the package {error.name!r}, which comes with ROS 2: source /opt/ros/DISTRIBUTION/setup.bash in an "
-            "environment with system packages, or say --node dds, which needs no ROS", field="node",
-        ) from error  # fmt: skip
-    rclpy.init(domain_id=domain)
-    node = rclpy.create_node("streetfix_bridge")
+    with ros_node(domain=domain) as node:
+        spin(node, bridge, over, told, reliable=reliable, depth=depth)
+
+
+def spin(
+    node: Any, bridge: Bridge, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None, *,
+    reliable: bool = False, depth: int = 5,
+) -> None:  # fmt: skip
+    """Process images in a node and publish the results until ``over`` is set.
+
+    Args:
+        node: of ``ros_node``.
+        bridge: that processes the messages.
+        over: ends the loop; set from elsewhere, for example by a signal.
+        told: called with the result of every processed pair.
+        reliable: request lost images again; see ``DdsNode``.
+        depth: length of the image queue during a query; 0 keeps all.
+    """
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import CameraInfo, Image
+
     pictures = QoSProfile(
         depth=depth or 1000,
         history=HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL,
@@ -56,23 +107,19 @@ def run(
     poses = node.create_publisher(PoseWithCovarianceStamped, topics.pose, 10)
     diagnoses = node.create_publisher(DiagnosticArray, topics.diagnostics, 10)
     spoken_s = bridge.clock()
-    try:
-        while rclpy.ok() and not over.is_set():
-            rclpy.spin_once(node, timeout_sec=_LOOK_S)
-            now = node.get_clock().now().to_msg()
-            if (published := bridge.step()) is not None:
-                if published.pose is not None:
-                    poses.publish(filled_pose(PoseWithCovarianceStamped(), published.pose))
-                diagnoses.publish(filled_diagnostics(DiagnosticArray(), published.diagnosis, now))
-                told(published)
-            elif bridge.clock() - spoken_s < max(_IDLE_S, bridge.quiet_s()):
-                continue
-            else:
-                diagnoses.publish(filled_diagnostics(DiagnosticArray(), bridge.idle(), now))
-            spoken_s = bridge.clock()
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+    while rclpy.ok() and not over.is_set():
+        rclpy.spin_once(node, timeout_sec=_LOOK_S)
+        now = node.get_clock().now().to_msg()
+        if (published := bridge.step()) is not None:
+            if published.pose is not None:
+                poses.publish(filled_pose(PoseWithCovarianceStamped(), published.pose))
+            diagnoses.publish(filled_diagnostics(DiagnosticArray(), published.diagnosis, now))
+            told(published)
+        elif bridge.clock() - spoken_s < max(_IDLE_S, bridge.quiet_s()):
+            continue
+        else:
+            diagnoses.publish(filled_diagnostics(DiagnosticArray(), bridge.idle(), now))
+        spoken_s = bridge.clock()
 
 
 def filled_pose(message: Any, pose: StampedPose) -> Any:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from service.cli.tls_options import Ca, Cert, Key
-from service.errors import RequestError, StreetfixError
+from service.errors import BundleError, RefusedError, RequestError, StreetfixError
 
 _TIMEOUT_S = 60.0
 #: Exit code for an answer that is not LOCALIZED, so that a script does not take it for a pose. 1 and 2 are errors.
@@ -163,7 +163,8 @@ def localize(
         focal_factor: multiplies fx and fy of the camera file.
 
     Raises:
-        RequestError: a file cannot be read, the camera file is no JSON object, or the URL is invalid.
+        RequestError: a file cannot be read, the camera file is no JSON object, the URL is invalid, or the map's name is that of a
+            folder.
         KeysError: a TLS file cannot be used.
         UnreachableError: nothing answers at the address, or the answer is not from Streetfix.
         RefusedError: the service answered with a problem.
@@ -180,7 +181,28 @@ def localize(
     # No retries: the user of a command wants the result at once.
     patience = RetryPolicy(attempts=1)
     with Client(url, api_key=api_key, timeout_s=_TIMEOUT_S, retry=patience, ca=ca, cert=cert, key=key) as client:
-        return client.call(rest.Call("POST", "/v1/localize", _answer, files))
+        try:
+            return client.call(rest.Call("POST", "/v1/localize", _answer, files))
+        except RefusedError as error:
+            if error.field == "map" and map_name is not None and (wrong := _folder_for_a_name(map_name)):
+                raise RequestError(f"{wrong}\n  {error.detail}", field="map") from error
+            raise
+
+
+def _folder_for_a_name(map_name: str) -> str:
+    """What is wrong with a map's name that names a folder of this machine; empty if there is no such folder."""
+    from service.maps.manifest import DATASET_FILE, read_manifest
+
+    folder = Path(map_name)
+    if not folder.is_dir():
+        return ""
+    if (folder / DATASET_FILE).is_file():
+        return f"--map: {map_name} is a dataset, not a map: give the name of a map that the service has"
+    try:
+        name = read_manifest(folder).name
+    except BundleError:
+        return f"--map: {map_name} is a folder: give the name of a map that the service has"
+    return f"--map: {map_name} is the folder of a map bundle: give the map's name: --map {name}"
 
 
 def _answer(body: bytes) -> dict[str, Any]:

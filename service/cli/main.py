@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import ValidationError
 
-from service.cli import bridge, health, keys, localize, serve
+from service.cli import bridge, doctor, health, keys, localize, serve
 from service.errors import ExtraMissingError, StreetfixError, how_to_install
 
 GROUP = "streetfix.commands"
@@ -122,6 +122,7 @@ def app_for(arguments: Sequence[str]) -> typer.Typer:
     app.command("localize")(localize.command)
     app.command("keys")(keys.command)
     app.command("health")(health.command)
+    app.command("doctor")(doctor.command)
     app.add_typer(bridge.app, name="bridge")
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
         summary, extra = _KNOWN.get(point.name, (f"From the package {point.dist.name if point.dist else '?'}.", None))

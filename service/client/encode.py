@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import RequestError
+from service.imaging.depth_unit_hint import MILLIMETRE_FACTOR, unit_factor
 from service.imaging.raw16 import Codec, write_raw16
 
 #: Default JPEG quality. Images larger by 3 % of the PNG size do not change an answer.
@@ -105,7 +106,7 @@ def encode_depth(depth: NDArray[Any], *, scale_m: float | None = None, codec: Co
         codec: ``zstd`` or ``lz4``. lz4 needs a fifth more bytes, and two thirds of the time on either side.
 
     Raises:
-        RequestError: the array is no depth image, or the scale is not positive.
+        RequestError: the array is no depth image, its metres look like millimetres, or the scale is not positive.
     """
     if not isinstance(depth, np.ndarray) or depth.ndim != 2 or not depth.size or depth.dtype.str[1:] not in _DTYPES:
         raise RequestError(
@@ -129,6 +130,12 @@ _DTYPES = frozenset({"f2", "f4", "f8", "u2"})
 def _in_steps(depth_m: NDArray[Any]) -> tuple[NDArray[np.uint16], float]:
     """Round metres to the finest possible step. Return the (H, W) numbers of steps and the step, metres."""
     metres = depth_m.astype(np.float32, copy=False)
+    if (metres > FARTHEST_M).any() and unit_factor(metres) == MILLIMETRE_FACTOR:
+        median = float(np.median(metres[np.isfinite(metres) & (metres > 0)]))
+        raise RequestError(
+            f"depth: its median is {median:.4g} m, which looks like millimetres: give depth_scale_m=0.001, or divide by 1000",
+            field="depth",
+        )
     with np.errstate(invalid="ignore"):
         measured = (metres > 0) & (metres <= FARTHEST_M)
     metres = np.where(measured, metres, np.float32(0))

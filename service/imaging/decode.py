@@ -3,6 +3,8 @@
 Unchecked bytes enter here. Code behind this module relies on these checks and does not repeat them.
 """
 
+from typing import Any
+
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -22,7 +24,15 @@ from service.imaging.picture_headers import (
     require_pixels,
 )
 
-__all__ = ["DepthEncoding", "DepthKind", "ImageLimits", "decode_depth", "decode_rgb", "require_sizes"]
+__all__ = [
+    "DepthEncoding",
+    "DepthKind",
+    "ImageLimits",
+    "decode_depth",
+    "decode_rgb",
+    "default_scale_m",
+    "require_sizes",
+]
 
 Rgb = UInt8[NDArray[np.uint8], "H W 3"]
 Depth = Float32[NDArray[np.float32], "H W"]
@@ -113,11 +123,22 @@ def decode_depth(
     """
     values = read_depth_values(data, encoding=encoding, limits=limits)
     if scale_m is None:
-        integer_scale = CARLA_SCALE_M if encoding == "carla" else INTEGER_SCALE_M
-        scale_m = integer_scale if np.issubdtype(values.dtype, np.integer) else 1.0
+        scale_m = default_scale_m(values.dtype, encoding)
     return depth_from_values(
         values, scale_m=scale_m, kind=kind, camera=camera, baseline_m=baseline_m, max_range_m=max_range_m
     )
+
+
+def default_scale_m(stored: np.dtype[Any], encoding: DepthEncoding | None) -> float:
+    """Return the scale of a depth image if the request names none, metres (disparity: pixels) per stored unit.
+
+    Args:
+        stored: type of the stored values.
+        encoding: of the request.
+    """
+    if not np.issubdtype(stored, np.integer):
+        return 1.0
+    return CARLA_SCALE_M if encoding == "carla" else INTEGER_SCALE_M
 
 
 def require_sizes(

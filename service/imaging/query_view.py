@@ -10,6 +10,7 @@ from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, rotation_z
 from service.imaging.brightness import brightness
+from service.imaging.depth_unit_hint import unit_hint
 from service.imaging.fusion import fuse_and_keep
 from service.imaging.gather import gather
 from service.imaging.level import level_camera
@@ -130,11 +131,19 @@ def query_views(
         view[:5] = wide[:, :, cut]
         view[5] = brightness(intensity[:, cut], measured=view[0] > 0, seen=seen[:, cut])
     if not planes[:, 0].any():
-        raise NoDepthError(
-            "the depth picture has no measurement inside the view grid "
-            f"({grid.min_range_m:g}-{grid.max_range_m:g} m, {grid.elevation_bottom_deg:g} to "
-            f"{grid.elevation_top_deg:g} degrees of elevation): check scale, kind and the camera's intrinsics",
-            field="depth",
-        )
+        raise _no_depth(depth_m, grid)
     turns_rad = tuple(turn_rad + turn * grid.column_rad for turn in turns)
     return QueryViews(planes, turns_rad, level.R_level_camera, level.height_m, float(np.mean(planes[:, 0] > 0)))
+
+
+def _no_depth(depth_m: Float32[NDArray[np.float32], "h w"], grid: ViewGrid) -> NoDepthError:
+    if not depth_m.any():
+        why = "no pixel has a depth: check the depth picture, and max_range_m in depth if it was sent"
+    else:
+        why = unit_hint(depth_m) or "check scale, kind and the camera's intrinsics"
+    return NoDepthError(
+        "the depth picture has no measurement inside the view grid "
+        f"({grid.min_range_m:g}-{grid.max_range_m:g} m, {grid.elevation_bottom_deg:g} to "
+        f"{grid.elevation_top_deg:g} degrees of elevation): {why}",
+        field="depth",
+    )

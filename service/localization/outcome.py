@@ -66,7 +66,8 @@ def outcome_of(
         return Outcome(decision.status, decision.confidence, (), candidates, None)
     candidates = None if refined is None else refined.with_covariances()
     spread = _spread_over(candidates or (), frames, decision.confidence, extent)
-    return Outcome(decision.status, decision.confidence, reasons_of(calibration, evidence), candidates, spread)
+    reasons = reasons_of(calibration, evidence, query.depth_m)
+    return Outcome(decision.status, decision.confidence, reasons, candidates, spread)
 
 
 def require_promise(calibration: Calibration | None, query: Query) -> None:

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
+from service.imaging.depth_unit_hint import unit_hint
 from service.localization.scoring import SupportWeights
 from service.maps.calibration import FEATURES, Calibration
 
@@ -60,13 +61,26 @@ _TOO_LITTLE = Reason(
 )  # fmt: skip
 
 
-def reasons_of(calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None) -> tuple[Reason, ...]:
-    """List what to check, the likeliest cause first; empty if all confidence features are in range.
+def reasons_of(
+    calibration: Calibration,
+    evidence: Float64[NDArray[np.float64], " F"] | None,
+    depth_m: Float32[NDArray[np.float32], "h w"] | None = None,
+) -> tuple[Reason, ...]:
+    """List what to check, the likeliest cause first; empty if all confidence features are in range and the depth is plausible.
 
     Args:
         calibration: calibration of the map.
         evidence: confidence features of the answer; None if the images have too few points to register.
+        depth_m: depth image, metres, 0 where nothing was measured. If its unit looks wrong, this is the first reason. None does
+            not check the unit.
     """
+    hint = None if depth_m is None else unit_hint(depth_m)
+    unit = () if hint is None else (Reason("depth unit", (), hint),)
+    named = {each.check for each in unit}
+    return (*unit, *(each for each in _by_evidence(calibration, evidence) if each.check not in named))
+
+
+def _by_evidence(calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None) -> tuple[Reason, ...]:
     if evidence is None:
         return (_TOO_LITTLE,)
     away = (evidence - np.array(calibration.right.mean)) / np.array(calibration.right.spread)

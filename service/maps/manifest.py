@@ -15,6 +15,8 @@ from service.imaging.view_grid import ViewGrid
 #: Version of the bundle format that this program reads and writes.
 FORMAT = 3
 FILE = "manifest.json"
+#: File of a dataset folder. Users confuse the two kinds of folders.
+DATASET_FILE = "dataset.json"
 #: Fields that describe when and with which tools the bundle was built. They do not affect the version.
 _CIRCUMSTANCES = {"version", "made_at", "tool_versions"}
 
@@ -157,7 +159,7 @@ def read_manifest(directory: Path) -> Manifest:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise BundleError(
+        raise dataset_error(directory) or BundleError(
             f"{path}: there is no readable manifest ({error.strerror}): give the folder that build-map wrote",
             field=FILE,
         ) from error
@@ -170,6 +172,23 @@ def read_manifest(directory: Path) -> Manifest:
         raise BundleError(f"{path}: {where}: {first['msg']}; copy or build the bundle again", field=FILE) from error
     _require_consistent(path, manifest)
     return manifest
+
+
+def dataset_error(directory: Path) -> BundleError | None:
+    """Return the error for a dataset that was given as a map bundle; None if the folder is no dataset.
+
+    Args:
+        directory: a folder without a manifest.
+    """
+    try:
+        if not (directory / DATASET_FILE).is_file():
+            return None
+    except OSError:  # a folder that nobody may read; the caller reports it
+        return None
+    return BundleError(
+        f"{directory} is a dataset, not a map bundle: run `streetfix build-map {directory} --out BUNDLE`, and give BUNDLE",
+        field=FILE,
+    )
 
 
 def _require_format(path: Path, data: bytes) -> None:

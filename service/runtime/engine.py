@@ -218,7 +218,7 @@ class Engine:
             StreetfixError: as for ``localize``.
         """
         started = perf_counter()
-        query = replace(self._decode(encoded, localizer.bundle.grid), prior=_prior_in(encoded, localizer.bundle))
+        query = replace(self._decode(encoded, localizer.bundle.grid), prior=prior_in(encoded, localizer.bundle))
         decoded = perf_counter()
         return localizer.look_up(query), 1e3 * (decoded - started)
 
@@ -282,8 +282,16 @@ def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
     localizer.localize(Query(rgb=rgb, depth_m=depth_m, camera=camera, false_accept_rate=false_accept_rate))
 
 
-def _prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:
-    """Return the prior in the map frame."""
+def prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:
+    """Return the prior of a query in the map frame; None if there is none.
+
+    Args:
+        encoded: the query; its prior may have a position on the Earth.
+        bundle: the map.
+
+    Raises:
+        RequestError: the prior has a position on the Earth, and the map is not georeferenced.
+    """
     if encoded.prior is None or encoded.prior_wgs84 is None:
         return encoded.prior
     earth = bundle.earth

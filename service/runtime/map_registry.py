@@ -10,7 +10,7 @@ from service.errors import BundleError, NotReadyError, UnknownMapError
 from service.localization.encoder import Provider
 from service.localization.localizer import Localizer
 from service.maps.manifest import FILE as MANIFEST_FILE
-from service.maps.manifest import Manifest
+from service.maps.manifest import Manifest, dataset_error
 from service.maps.reader import MapBundle
 from service.runtime.serving_table import Key, MapVersion, ServingTable, Table
 
@@ -296,7 +296,7 @@ def bundle_paths(path: Path) -> list[Path]:
         raise BundleError(f"{path}: it cannot be read ({error.strerror}); let the service read it") from error
     found = [child for child in inside if _has_manifest(child)]
     if files and not found:
-        raise BundleError(f"{path}: {_NO_MANIFEST}")
+        raise dataset_error(path) or BundleError(f"{path}: {_NO_MANIFEST}")
     return found
 
 

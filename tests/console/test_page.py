@@ -1,6 +1,8 @@
 """The page for everybody: keyboard, keys, small screens, the accessibility checker, no other host."""
 
 import json
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 
 from benchmarks.console.browser import ANSWER_MS, AXE, DESKTOP, LAPTOP, PHONE, click_sample, open_console, serious
 from benchmarks.console.served import Demo, serving
+from service.maps.manifest import FILE, read_manifest
 from service.runtime.keys import hash_of
 
 Pages = Callable[..., Any]
@@ -96,6 +99,30 @@ def test_a_question_is_copied_as_curl_and_as_python(url: str, page_of: Pages) ->
     page.click("button:text-is('as Python')")
     page.wait_for_function("() => navigator.clipboard.readText().then(text => text.includes('import httpx'))")
     compile(page.evaluate("navigator.clipboard.readText()"), "copied.py", "exec")
+
+
+def test_only_the_samples_of_the_open_map_are_offered(demo_map: Demo, page_of: Pages, tmp_path: Path) -> None:
+    other = shutil.copytree(demo_map.bundle, tmp_path / "west", copy_function=os.link)
+    renamed = read_manifest(demo_map.bundle).model_copy(update={"name": "west"}).stamped()
+    (other / FILE).unlink()  # a hard link: keep the original
+    (other / FILE).write_bytes(renamed.to_bytes())
+    samples = shutil.copytree(demo_map.samples, tmp_path / "samples")
+    for folder in samples.iterdir():
+        request = json.loads((folder / "request.json").read_text())
+        name = "west" if folder.name == "01" else read_manifest(demo_map.bundle).name
+        (folder / "request.json").write_text(json.dumps(request | {"map": name}))
+    page = page_of()
+    with serving(demo_map.bundle, other, "--samples", samples) as (url, _):
+        open_console(page, url)
+        for name, offers in ((read_manifest(demo_map.bundle).name, False), ("west", True)):
+            page.select_option("select[aria-label='Map']", name)
+            page.wait_for_selector(f"[data-ready^='{name}@']")
+            assert (page.locator("[data-sample='01']").count(), page.locator("[data-sample='02']").count()) == (
+                offers,
+                not offers,
+            )
+        click_sample(page, "01")
+        assert page.inner_text(".verdict .status") == "LOCALIZED"
 
 
 def test_a_key_opens_what_it_may_and_no_more(demo_map: Demo, page_of: Pages, shoot: Shoot, tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_each_answer_is_shown_beside_the_truth(once: str) -> None:
 
 
 def test_with_once_it_says_how_to_serve_again(once: str) -> None:
-    assert re.search(r"streetfix serve \S+/out/map$", once, re.MULTILINE)
+    assert re.search(r"streetfix serve \S+/out/map --samples \S+/out/samples$", once, re.MULTILINE)
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
+import sys
 from collections.abc import Callable
-from types import SimpleNamespace
+from threading import Event
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -66,3 +68,95 @@ def answer_of(refused_of: Callable[..., dict[str, Any]]) -> Callable[..., Locali
         return LocalizeAnswer.model_validate(content | changed)
 
     return made
+
+
+class Ros:
+    """As much of ROS as the node calls; ``spin_once`` does the next of ``turns``, and after the last ``no_more``."""
+
+    def __init__(self) -> None:
+        self.subscriptions: dict[str, Any] = {}
+        self.published: dict[str, list[Any]] = {}
+        self.turns: list[Callable[[], object]] = []
+        self.over = Event()
+        self.no_more: Callable[[], object] = self.over.set
+        self.ended: list[str] = []
+        self.domain: int | None = None
+        self.args: list[str] | None = None
+        self.signals = ""
+        self.given: dict[str, object] = {}
+        self.declared: dict[str, Any] = {}
+        self.logged: list[tuple[str, str]] = []
+
+    def init(self, *, args: list[str] | None, domain_id: int | None, signal_handler_options: str) -> None:
+        self.args, self.domain, self.signals = args, domain_id, signal_handler_options
+
+    def create_node(self, name: str) -> "Ros":
+        assert name == "streetfix_bridge"
+        return self
+
+    def destroy_node(self) -> None:
+        self.ended.append("node")
+
+    def declare_parameter(self, name: str, default: object, descriptor: Any) -> Any:
+        """As rclpy: the type of the default is that of the value, so 1 is no value for 1.0."""
+        value = self.given.get(name, default)
+        assert type(value) is type(default), name
+        self.declared[name] = SimpleNamespace(default=default, descriptor=descriptor)
+        return SimpleNamespace(value=value)
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(
+            info=lambda text: self.logged.append(("info", text)), fatal=lambda text: self.logged.append(("fatal", text))
+        )
+
+    def create_subscription(self, kind: Any, topic: str, heard: Any, qos: Any) -> None:
+        self.subscriptions[topic] = SimpleNamespace(kind=kind, heard=heard, qos=qos)
+
+    def create_publisher(self, _kind: Any, topic: str, _depth: int) -> Any:
+        return SimpleNamespace(publish=self.published.setdefault(topic, []).append)
+
+    def spin_once(self, _node: Any, *, timeout_sec: float) -> None:
+        assert timeout_sec > 0
+        if self.turns:
+            self.turns.pop(0)()
+        else:
+            self.no_more()
+
+    def get_clock(self) -> Any:
+        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+
+
+def posed_message() -> Any:
+    empty = SimpleNamespace
+    header = empty(stamp=empty(), frame_id="")
+    return empty(header=header, pose=empty(pose=empty(position=empty(), orientation=empty()), covariance=None))
+
+
+@pytest.fixture
+def ros(monkeypatch: pytest.MonkeyPatch) -> Ros:
+    ros = Ros()
+    qos = SimpleNamespace(
+        HistoryPolicy=SimpleNamespace(KEEP_LAST="last", KEEP_ALL="all"),
+        ReliabilityPolicy=SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort"),
+        QoSProfile=SimpleNamespace,
+    )
+    modules: dict[str, Any] = {
+        "rclpy": SimpleNamespace(
+            init=ros.init, create_node=ros.create_node, ok=lambda: True, spin_once=ros.spin_once,
+            try_shutdown=lambda: ros.ended.append("shutdown"),
+        ),
+        "rclpy.qos": qos, "rclpy.signals": SimpleNamespace(SignalHandlerOptions=SimpleNamespace(NO="no handlers")),
+        "rcl_interfaces": SimpleNamespace(), "rcl_interfaces.msg": SimpleNamespace(ParameterDescriptor=SimpleNamespace),
+        "sensor_msgs": SimpleNamespace(), "sensor_msgs.msg": SimpleNamespace(Image="Image", CameraInfo="CameraInfo"),
+        "geometry_msgs": SimpleNamespace(), "geometry_msgs.msg": SimpleNamespace(PoseWithCovarianceStamped=posed_message),
+        "diagnostic_msgs": SimpleNamespace(),
+        "diagnostic_msgs.msg": SimpleNamespace(
+            DiagnosticArray=lambda: SimpleNamespace(header=SimpleNamespace(stamp=None), status=[]),
+            DiagnosticStatus=SimpleNamespace, KeyValue=SimpleNamespace,
+        ),
+    }  # fmt: skip
+    for name, content in modules.items():
+        module = ModuleType(name)
+        module.__dict__.update(vars(content))
+        monkeypatch.setitem(sys.modules, name, module)
+    return ros

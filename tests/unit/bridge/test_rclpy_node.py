@@ -1,9 +1,7 @@
 """The node of rclpy with rclpy's part played: what it subscribes to, publishes, and how it ends."""
 
-import sys
 from collections.abc import Callable
 from threading import Event
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,75 +16,8 @@ from service.errors import ExtraMissingError
 S = 10**9
 
 
-class Ros:
-    """As much of ROS as the node calls; ``spin_once`` does the next of ``turns``."""
-
-    def __init__(self) -> None:
-        self.subscriptions: dict[str, Any] = {}
-        self.published: dict[str, list[Any]] = {}
-        self.turns: list[Callable[[], object]] = []
-        self.over = Event()
-        self.ended: list[str] = []
-        self.domain: int | None = None
-
-    def init(self, *, domain_id: int) -> None:
-        self.domain = domain_id
-
-    def create_subscription(self, kind: Any, topic: str, heard: Any, qos: Any) -> None:
-        self.subscriptions[topic] = SimpleNamespace(kind=kind, heard=heard, qos=qos)
-
-    def create_publisher(self, _kind: Any, topic: str, _depth: int) -> Any:
-        return SimpleNamespace(publish=self.published.setdefault(topic, []).append)
-
-    def spin_once(self, _node: Any, *, timeout_sec: float) -> None:
-        assert timeout_sec > 0
-        if self.turns:
-            self.turns.pop(0)()
-        else:
-            self.over.set()
-
-    def get_clock(self) -> Any:
-        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
-
-
-def posed_message() -> Any:
-    empty = SimpleNamespace
-    header = empty(stamp=empty(), frame_id="")
-    return empty(header=header, pose=empty(pose=empty(position=empty(), orientation=empty()), covariance=None))
-
-
-@pytest.fixture
-def ros(monkeypatch: pytest.MonkeyPatch) -> Ros:
-    ros = Ros()
-    qos = SimpleNamespace(
-        HistoryPolicy=SimpleNamespace(KEEP_LAST="last", KEEP_ALL="all"),
-        ReliabilityPolicy=SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort"),
-        QoSProfile=SimpleNamespace,
-    )
-    modules: dict[str, Any] = {
-        "rclpy": SimpleNamespace(
-            init=ros.init, create_node=lambda _: ros, ok=lambda: True, spin_once=ros.spin_once,
-            try_shutdown=lambda: ros.ended.append("shutdown"),
-        ),
-        "rclpy.qos": qos,
-        "sensor_msgs": SimpleNamespace(), "sensor_msgs.msg": SimpleNamespace(Image="Image", CameraInfo="CameraInfo"),
-        "geometry_msgs": SimpleNamespace(), "geometry_msgs.msg": SimpleNamespace(PoseWithCovarianceStamped=posed_message),
-        "diagnostic_msgs": SimpleNamespace(),
-        "diagnostic_msgs.msg": SimpleNamespace(
-            DiagnosticArray=lambda: SimpleNamespace(header=SimpleNamespace(stamp=None), status=[]),
-            DiagnosticStatus=SimpleNamespace, KeyValue=SimpleNamespace,
-        ),
-    }  # fmt: skip
-    for name, content in modules.items():
-        module = ModuleType(name)
-        module.__dict__.update(vars(content))
-        monkeypatch.setitem(sys.modules, name, module)
-    ros.destroy_node = lambda: ros.ended.append("node")  # type: ignore[attr-defined]  # as a node has it
-    return ros
-
-
 def test_pictures_in_a_pose_and_a_diagnosis_out(
-    ros: Ros, image_of: Callable[..., Any], info_of: Callable[..., Any], answer_of: Callable[..., LocalizeAnswer]
+    ros: Any, image_of: Callable[..., Any], info_of: Callable[..., Any], answer_of: Callable[..., LocalizeAnswer]
 ) -> None:
     bridge = Bridge(localize=lambda *_: answer_of(), gate=Gate(rate_hz=0.0), clock=lambda: 0.0)
     topics, told = bridge.topics, list[Published]()
@@ -106,20 +37,20 @@ def test_pictures_in_a_pose_and_a_diagnosis_out(
     assert (array.header.stamp, array.status[0].level) == ("now", b"\x00")
     assert {"asked", "rate_hz"} < {value.key for value in array.status[0].values}
     assert len(told) == 1
-    assert (ros.domain, ros.ended) == (3, ["node", "shutdown"])
+    assert (ros.domain, ros.signals, ros.ended) == (3, "no handlers", ["node", "shutdown"])
 
 
 @pytest.mark.parametrize(
     ("reliable", "depth", "wanted"),
     [(True, 0, ("reliable", "all", 1000)), (False, 5, ("best effort", "last", 5))],
 )
-def test_pictures_are_subscribed_to_as_told(ros: Ros, reliable: bool, depth: int, wanted: tuple[str, str, int]) -> None:
+def test_pictures_are_subscribed_to_as_told(ros: Any, reliable: bool, depth: int, wanted: tuple[str, str, int]) -> None:
     rclpy_node.run(Bridge(localize=lambda *_: pytest.fail("asked")), ros.over, reliable=reliable, depth=depth)
     for subscription in ros.subscriptions.values():
         assert (subscription.qos.reliability, subscription.qos.history, subscription.qos.depth) == wanted
 
 
-def test_silence_is_told_once_a_second(ros: Ros) -> None:
+def test_silence_is_told_once_a_second(ros: Any) -> None:
     now_s = [0.0]
     bridge = Bridge(localize=lambda *_: pytest.fail("asked"), gate=Gate(rate_hz=0.0), clock=lambda: now_s[0])
 
@@ -131,7 +62,7 @@ def test_silence_is_told_once_a_second(ros: Ros) -> None:
     assert [array.status[0].level for array in ros.published["/diagnostics"]] == [b"\x01"] * 2
 
 
-def test_the_node_is_taken_down_when_something_breaks(ros: Ros) -> None:
+def test_the_node_is_taken_down_when_something_breaks(ros: Any) -> None:
     def broken() -> None:
         raise RuntimeError("spin")
 

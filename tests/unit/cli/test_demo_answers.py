@@ -114,6 +114,13 @@ def test_the_next_command_is_one_line_with_a_pair_that_was_right() -> None:
     stream = io.StringIO()
     wrong = replace(IN_STREET, rgb=Path("wrong.jpg"))
     outcomes = [outcome_of(wrong, street=None), outcome_of()]
-    print_next(outcomes, Path("map"), "http://127.0.0.1:81", Console(file=stream, width=30), goes_on=True)
+    console = Console(file=stream, width=30)
+    print_next(outcomes, Path("map"), Path("samples"), "http://127.0.0.1:81", console, goes_on=True)
     wanted = "localize --url http://127.0.0.1:81 --rgb a.jpg --depth a.png --camera front.json\n"
     assert wanted in stream.getvalue()
+
+
+def test_the_command_that_serves_the_map_again_shows_the_samples_too() -> None:
+    console = Console(file=(stream := io.StringIO()), width=30)
+    print_next([outcome_of()], Path("my map"), Path("samples"), "http://127.0.0.1:81", console, goes_on=False)
+    assert "serve 'my map' --samples samples\n" in stream.getvalue()

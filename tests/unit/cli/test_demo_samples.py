@@ -26,7 +26,10 @@ def question(folder: Path, **changed: Any) -> Question:
 
 
 def test_what_is_written_is_what_a_service_reads(tmp_path: Path) -> None:
-    (sample,) = Samples.open(write_samples([question(tmp_path)], tmp_path / "samples")).by_name.values()
+    (sample,) = Samples.open(
+        write_samples([question(tmp_path)], tmp_path / "samples", map_name="town")
+    ).by_name.values()
+    assert (sample.request.map, sample.request.camera.width) == ("town", 64)
     assert sample.pictures["rgb"].path.read_bytes() == b"000000.jpg"
     assert sample.truth is not None
     assert (sample.truth.position.z, sample.truth.heading_deg) == (3.0, pytest.approx(90))
@@ -34,17 +37,19 @@ def test_what_is_written_is_what_a_service_reads(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("changed", [{"T_map_camera": None}, {"place": 4}])
 def test_where_the_truth_says_nothing_none_is_written(tmp_path: Path, changed: dict[str, Any]) -> None:
-    (sample,) = Samples.open(write_samples([question(tmp_path, **changed)], tmp_path / "samples")).by_name.values()
+    (sample,) = Samples.open(
+        write_samples([question(tmp_path, **changed)], tmp_path / "samples", map_name="town")
+    ).by_name.values()
     assert sample.truth is None
 
 
 def test_written_again_the_old_ones_are_gone(tmp_path: Path) -> None:
     asked = question(tmp_path)
-    write_samples([asked, asked], tmp_path / "samples")
-    write_samples([asked], tmp_path / "samples")
+    write_samples([asked, asked], tmp_path / "samples", map_name="town")
+    write_samples([asked], tmp_path / "samples", map_name="town")
     assert os.listdir(tmp_path / "samples") == ["01"]
     assert not list(tmp_path.glob(".samples*"))
 
 
 def test_without_questions_the_folder_is_empty(tmp_path: Path) -> None:
-    assert Samples.open(write_samples([], tmp_path / "samples")).by_name == {}
+    assert Samples.open(write_samples([], tmp_path / "samples", map_name="town")).by_name == {}

@@ -89,3 +89,14 @@ def test_forced_figures_stand_beside_accepted_ones_and_every_error_has_its_statu
         assert label in told
     listed = told.split("the 2 worst of 5 queries")[1].splitlines()
     assert sum("LOCALIZED" in line and line.rstrip().endswith("°") for line in listed) == 2
+
+
+def test_a_dataset_in_the_place_of_the_map_is_named(
+    small_dataset: Dataset, small_map: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("evaluate", small_dataset.folder, small_map) == 1
+    assert (
+        f"give the map bundle first: streetfix evaluate {small_map} {small_dataset.folder}" in capsys.readouterr().err
+    )
+    assert run("map", "update", small_dataset.folder, small_map, "--out", small_map.parent / "no") == 1
+    assert f"streetfix map update {small_map} {small_dataset.folder}" in capsys.readouterr().err

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
+from model_training.importing.clouds import Clouds
+from model_training.importing.recording import Notes
 from service.cli.main import main
 
 
@@ -55,6 +57,22 @@ def test_import_says_what_came_in_and_what_did_not(scans, tmp_path, capsys):
     assert "left out: 1 points that are no numbers" in told
     assert "left out: 1 scan: its bytes are no rows of four float32: truncated (first: 3.bin)" in told
     assert len(Dataset(tmp_path / "out").survey_poses()) == 2
+
+
+def test_help_says_which_options_need_an_extra(capsys):
+    assert run("import", "--help") == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Needs the extra odometry. Without the extra, the default keeps the recording's poses and says so." in told
+    assert "The command ignores the recording's own poses. Needs the extra odometry." in told
+
+
+def test_lines_about_pictures_are_told_only_where_pictures_are_wanted(scans, tmp_path, capsys, monkeypatch):
+    lines = Notes(("a list",), {"path": "scans"}, ("no picture has stored depth",))
+    monkeypatch.setattr(Clouds, "notes", lines)
+    assert run("import", "clouds", scans, "--out", tmp_path / "with") == 0
+    assert "a list\nno picture has stored depth\n" in capsys.readouterr().out
+    assert run("import", "clouds", scans, "--no-pictures", "--out", tmp_path / "without") == 0
+    assert "no picture has stored depth" not in capsys.readouterr().out
 
 
 def test_import_takes_poses_of_another_file(scans, tmp_path):

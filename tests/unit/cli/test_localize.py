@@ -382,3 +382,23 @@ def test_people_read_one_standard_deviation_of_position_and_heading() -> None:
     assert "+- 0.30 m (one sigma)" in text
     assert "+- 0.57 degrees (one sigma)" in text
     assert "sigma" not in text_of()
+
+
+def test_a_folder_given_as_the_name_of_a_map_is_named(
+    files: dict[str, Path], answering: Callable[..., Any], bundle_path: Path, tmp_path: Path
+) -> None:
+    problem = {"title": "T.", "detail": "there is no such map; mounted: tiny", "code": "unknown-map", "field": "map"}
+    (dataset := tmp_path / "town").mkdir()
+    (dataset / "dataset.json").write_text("{}")
+    (other := tmp_path / "other").mkdir()
+    answering(httpx.Response(404, json=problem))
+    for folder, message in {
+        bundle_path: f"{bundle_path} is the folder of a map bundle: give the map's name: --map tiny",
+        dataset: f"{dataset} is a dataset, not a map: give the name of a map that the service has",
+        other: f"{other} is a folder: give the name of a map that the service has",
+    }.items():
+        with pytest.raises(RequestError) as caught:
+            localize("http://x", **files, map_name=str(folder))
+        assert caught.value.message == f"--map: {message}\n  there is no such map; mounted: tiny"
+    with pytest.raises(RefusedError, match="there is no such map"):
+        localize("http://x", **files, map_name="no-folder")

@@ -101,3 +101,18 @@ def test_what_is_no_depth_picture_is_named(depth: Any) -> None:
 def test_what_is_no_scale_is_refused(scale_m: float) -> None:
     with pytest.raises(RequestError, match=r"depth_scale_m: .* is no scale"):
         encode_depth(np.ones((2, 2), np.float32), scale_m=scale_m)
+
+
+def test_millimetres_given_as_metres_are_refused_with_the_scale() -> None:
+    millimetres = np.array([[4000.0, 5000.0, 9000.0, 0.0, np.nan]], np.float32)
+    with pytest.raises(RequestError) as caught:
+        encode_depth(millimetres)
+    assert caught.value.message == (
+        "depth: its median is 5000 m, which looks like millimetres: give depth_scale_m=0.001, or divide by 1000"
+    )
+    assert caught.value.field == "depth"
+    np.testing.assert_allclose(read(millimetres[:, :3], scale_m=0.001), [[4.0, 5.0, 9.0]])
+
+
+def test_a_sky_at_a_far_plane_is_left_out() -> None:
+    np.testing.assert_allclose(read(np.array([[1000.0, 1000.0, 1000.0, 8.0]], np.float32)), [[0, 0, 0, 8.0]])

@@ -9,6 +9,7 @@ from model_training.datasets.dataset import (
     DatasetDescription,
     Sensors,
     read_tum,
+    require_map_first,
     scan_path,
     write_description,
     write_tum,
@@ -157,3 +158,23 @@ def test_a_folder_that_fails_half_way_is_not_there(tmp_path):
     with pytest.raises(OSError, match="full"):
         write()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_map_bundle_given_as_a_dataset_is_named(bundle_path):
+    with pytest.raises(DatasetError) as caught:
+        Dataset(bundle_path)
+    assert caught.value.message == (
+        f"{bundle_path} is a map bundle, not a dataset: give the folder that `streetfix simulate` or `streetfix import` wrote"
+    )
+
+
+def test_a_dataset_before_its_map_is_named(folder, bundle_path, tmp_path):
+    require_map_first(bundle_path, folder, "evaluate")
+    for bundle, dataset in ((folder, folder), (bundle_path, bundle_path), (tmp_path, folder)):
+        require_map_first(bundle, dataset, "evaluate")  # the opening of each folder names these mistakes
+    with pytest.raises(DatasetError) as caught:
+        require_map_first(folder, bundle_path, "map update")
+    assert caught.value.message == (
+        f"{folder} is a dataset and {bundle_path} is a map bundle: give the map bundle first: "
+        f"streetfix map update {bundle_path} {folder}"
+    )

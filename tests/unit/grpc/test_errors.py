@@ -1,5 +1,6 @@
 """What a gRPC client sees when something is wrong."""
 
+import io
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -95,6 +96,16 @@ def test_a_bad_request_is_told_in_details(
         assert violation.field == field
         assert violation.description == caught.value.details()
     assert "RetryInfo" not in found
+
+
+def test_a_depth_in_millimetres_is_told_with_its_scale(
+    stub: LocalizationServiceStub, request_of: Any, pictures: Any
+) -> None:
+    np.save(file := io.BytesIO(), pictures[1] * np.float32(1000))
+    with pytest.raises(grpc.RpcError) as caught:
+        stub.Localize(request_of(depth=file.getvalue()), timeout=10)
+    assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
+    assert "which looks like millimetres: send scale_m 0.001" in caught.value.details()
 
 
 def test_a_message_beyond_the_limit_is_refused(stub: LocalizationServiceStub, request_of: Any) -> None:

@@ -1,3 +1,4 @@
+import io
 import json
 import threading
 from collections.abc import Callable, Iterator
@@ -191,6 +192,22 @@ def test_every_limit_of_the_settings_refuses_what_is_beyond_it(
 
 def test_no_depth_is_a_problem_of_its_own(client: httpx.Client, parts_of: Parts) -> None:
     require_problem(post(client, parts_of(depth={"scale_m": 0.001, "max_range_m": 0.01})), 422, "no-depth", "depth")
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [
+        (1000.0, "which looks like millimetres: send scale_m 0.001"),
+        (0.001, "which looks like metres that were taken for millimetres: send scale_m 1"),
+    ],
+)
+def test_a_depth_in_another_unit_is_told_with_its_scale(
+    client: httpx.Client, parts_of: Parts, pictures: Any, factor: float, told: str
+) -> None:
+    np.save(file := io.BytesIO(), pictures[1] * np.float32(factor))
+    for depth in ({"scale_m": 1}, {}):
+        sent = parts_of(depth=depth) | {"depth": file.getvalue()}
+        assert told in require_problem(post(client, sent), 422, "no-depth", "depth")["detail"]
 
 
 ORIGIN = {"x": 0, "y": 0, "z": 0}

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from service.errors import DecodeError, RequestError, StreetfixError, TooLargeError, UnsupportedFormatError
 from service.geometry.camera import PinholeCamera
-from service.imaging.decode import ImageLimits, decode_depth
+from service.imaging.decode import ImageLimits, decode_depth, default_scale_m
 from service.imaging.raw16 import write_raw16
 
 CAMERA = PinholeCamera(6, 4, 5.0, 5.0, 2.5, 1.5)
@@ -358,3 +358,11 @@ def test_damaged_bytes_give_a_depth_or_an_error_of_ours(data, changes):
         depth = decode_depth(bytes(damaged), camera=CAMERA, limits=ImageLimits(max_pixels=10_000))
         assert np.isfinite(depth).all()
         assert (depth >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("stored", "encoding", "scale_m"),
+    [("uint16", None, 0.001), ("uint32", "carla", 1000 / (2**24 - 1)), ("float32", "auto", 1.0), ("float32", "compressed_depth", 1.0)],
+)  # fmt: skip
+def test_the_scale_without_a_request_for_one_follows_from_the_stored_numbers(stored, encoding, scale_m):
+    assert default_scale_m(np.dtype(stored), encoding) == scale_m

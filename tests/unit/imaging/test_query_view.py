@@ -142,6 +142,24 @@ def test_a_picture_without_a_usable_depth_is_refused_with_the_limits(depth_m):
         view_of(depth_m=np.full((240, 320), depth_m, np.float32))
 
 
+@pytest.mark.parametrize(
+    ("depth_m", "why"),
+    [
+        (5000.0, "the median depth is 5000 m, which looks like millimetres: send scale_m 0.001 in depth"),
+        (
+            0.005,
+            "the median depth is 0.005 m, which looks like metres that were taken for millimetres: send scale_m 1 in depth",
+        ),
+        (70.0, "check scale, kind and the camera's intrinsics"),
+        (0.0, "no pixel has a depth: check the depth picture, and max_range_m in depth if it was sent"),
+    ],
+)
+def test_a_refused_depth_says_which_unit_it_looks_like(depth_m, why):
+    with pytest.raises(NoDepthError) as caught:
+        view_of(depth_m=np.full((240, 320), depth_m, np.float32))
+    assert f"degrees of elevation): {why}" in caught.value.message
+
+
 def test_the_measured_share_is_that_of_the_cells():
     view = view_of()
     assert view.measured_share == pytest.approx(np.mean(plane(view, "range_m") > 0))

@@ -135,6 +135,15 @@ def test_without_scans_or_poses(root):
         open_recording("kitti-360", root / "data_poses" / "nowhere", OpenSettings(depth="sgbm"))
 
 
+def test_the_root_or_a_tree_names_the_drives(root):
+    drive = root / "data_3d_raw" / NAME
+    wanted = "a drive's folder in data_3d_raw, data_2d_raw, data_poses is wanted; give"
+    for source in (root, root / "data_3d_raw", root / "data_poses", drive / "velodyne_points" / "data"):
+        with pytest.raises(DatasetError) as caught:
+            open_recording("kitti-360", source, OpenSettings())
+        assert caught.value.message == f"{source}: {wanted} this one: {drive}"
+
+
 def test_depth_that_the_layout_lacks_is_refused(root):
     with pytest.raises(DatasetError, match="sgbm, lidar"):
         opened(root, depth="stored")

@@ -172,8 +172,12 @@ def test_frames_that_lack_a_picture_or_a_whole_scan_are_counted(drive):
     (scan,) = drive.glob("velodyne*/**/*2.bin")
     scan.write_bytes(scan.read_bytes()[:-1])
     bad = events_of(drive, Unusable, "sgbm")
+    without_right = (
+        "no right picture beside it; the choices of --depth are stored (3 of 3 pictures have it), "
+        "sgbm (2 of 3 pictures have a right one), lidar (3 scans)"
+    )
     assert [(b.kind, b.why) for b in bad] == [
-        ("picture", "no right picture beside it"), ("scan", "its bytes are no rows of four float32: truncated")
+        ("picture", without_right), ("scan", "its bytes are no rows of four float32: truncated")
     ]  # fmt: skip
     assert bad[1].name.startswith("velodyne 0000")
 
@@ -277,8 +281,76 @@ def test_a_packet_that_is_none_is_named(raw, text):
 def test_the_days_folder_will_do_where_it_holds_one_drive(raw):
     assert open_recording("kitti-raw", raw.parent, OpenSettings()).count() == 6
     (raw.parent / "2011_09_26_drive_0006_sync" / "velodyne_points").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"the folder of one drive is wanted.*drive_0005_sync, .*drive_0006_sync"):
+    with pytest.raises(DatasetError, match=r"the folder of one drive.*is wanted.*drive_0005_sync, .*drive_0006_sync"):
         open_recording("kitti-raw", raw.parent, OpenSettings())
+
+
+def refusal_of(kind, source):
+    with pytest.raises(DatasetError) as caught:
+        open_recording(kind, source, OpenSettings())
+    assert caught.value.field == "source"
+    return caught.value.message
+
+
+def test_a_raw_recordings_root_names_its_drives(raw):
+    root, wanted = raw.parent.parent, "the folder of one drive, with velodyne_points in it, is wanted; give"
+    assert refusal_of("kitti-raw", root) == f"{root}: {wanted} this one: {raw}"
+    other = root / "raw" / "2011_09_28" / "2011_09_28_drive_0001_sync"
+    (other / "velodyne_points").mkdir(parents=True)
+    assert refusal_of("kitti-raw", root) == f"{root}: {wanted} one of these: {raw}, {other}"
+    inside = raw / "velodyne_points" / "data"
+    assert refusal_of("kitti-raw", inside) == f"{inside}: {wanted} this one: {raw}"
+    for number in range(20):
+        (raw.parent / f"drive_{number:02d}" / "velodyne_points").mkdir(parents=True)
+    told = refusal_of("kitti-raw", raw.parent)
+    assert told.count("drive_") == 20
+    assert told.endswith("drive_18 and 1 more")
+
+
+def test_an_odometry_root_names_its_sequences(odometry, kitti):
+    wanted = "a folder sequences/NN with velodyne/*.bin in it is wanted; give"
+    for source in (odometry.parent, odometry.parent.parent, odometry / "velodyne"):
+        assert refusal_of("kitti-odometry", source) == f"{source}: {wanted} this one: {odometry}"
+    other = odometry.parent / "08"
+    (other / "velodyne").mkdir(parents=True)
+    assert (
+        refusal_of("kitti-odometry", odometry.parent)
+        == f"{odometry.parent}: {wanted} one of these: {odometry}, {other}"
+    )
+    assert "here is no scan" in refusal_of("kitti-odometry", kitti.parent)  # KITTI's object layout
+
+
+def test_a_drive_without_stored_depth_lists_what_serves_it(drive):
+    for folder in ("depth_2", "proj_depth/groundtruth/image_02"):
+        for path in (drive / folder).glob("*.png"):
+            path.unlink()
+    choices = "the choices of --depth are stored (0 of 3 pictures have it), sgbm (3 of 3 pictures have a right one), lidar (3 scans)"
+    assert opened(drive).notes.picture_lines == (
+        f"no picture has stored depth, so no picture becomes a query: {choices}; --no-pictures leaves pictures out",
+    )
+    assert {event.why for event in events_of(drive, Unusable)} == {f"no stored depth beside it; {choices}"}
+    for depth in ("sgbm", "lidar"):
+        assert opened(drive, depth).notes.picture_lines == ()
+
+
+def test_a_drive_with_one_camera_says_that_stereo_does_not_serve_it(drive):
+    for folder in ("image_3", "image_03/data", "depth_2", "proj_depth/groundtruth/image_02"):
+        for path in (drive / folder).glob("*.png"):
+            path.unlink()
+    (line,) = opened(drive, "sgbm").notes.picture_lines
+    assert line.startswith("no picture has a right picture, so no picture becomes a query: ")
+    assert "sgbm (0 of 3 pictures have a right one), lidar (3 scans)" in line
+    for file in (drive / "calib.txt", drive.parent / "calib_cam_to_cam.txt"):
+        if file.is_file():
+            file.write_text(
+                "".join(row for row in file.read_text().splitlines(True) if not row.startswith(("P3", "P_rect_03")))
+            )
+    (line,) = opened(drive).notes.picture_lines
+    assert "sgbm (not possible: the calibration lacks the right camera)" in line
+
+
+def test_a_drive_with_depth_has_no_line_about_it(drive):
+    assert opened(drive).notes.picture_lines == ()
 
 
 @pytest.mark.parametrize(("kind", "why"), [("kitti-raw", "here: none"), ("kitti-odometry", "here is no scan")])

@@ -80,6 +80,17 @@ def test_a_bags_file_alone_is_as_good_as_its_folder(ros, drive, tmp_path, storag
     assert alone.notes.lines == whole.notes.lines
 
 
+def test_a_bag_without_a_topic_of_depth_says_what_serves_its_pictures(ros, drive, tmp_path):
+    path = ros.write(tmp_path / "bag", drive(without={"/camera/depth/image_raw"}, count=2))
+    (line,) = opened(path).notes.picture_lines
+    assert line == (
+        "no topic of depth, so no picture becomes a query: give --depth lidar (depth from the scans), --topic depth=NAME, "
+        "or --no-pictures"
+    )
+    assert opened(path, want_depth=False).notes.picture_lines == ()
+    assert opened(ros.write(tmp_path / "whole", drive(count=2))).notes.picture_lines == ()
+
+
 def test_a_bag_without_a_point_cloud_is_refused(ros, drive, tmp_path):
     with pytest.raises(DatasetError, match="bag has no sensor_msgs/PointCloud2"):
         opened(ros.write(tmp_path / "bag", drive(without={"/points"})))

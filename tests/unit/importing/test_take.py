@@ -60,7 +60,7 @@ def test_what_cannot_be_used_is_counted_by_reason_with_the_first_name(taken, sca
     assert set(summary.dropped[2:]) == {
         "1 scan: no finite points (first: scan at 0.6)",
         "1 scan: it lies after the last pose (first: scan at 99)",
-        "1 picture: no depth (first: picture at 0.7)",
+        "1 picture: no depth in the recording; --depth lidar takes it from the scans (first: picture at 0.7)",
         "1 picture: its depth is empty (first: picture at 0.8)",
         "1 picture: sizes differ: colour (6, 8), depth (3, 4), camera (6, 8) (first: picture at 0.9)",
         "1 picture: it lies after the last pose (first: picture at 99)",
@@ -215,6 +215,16 @@ def test_a_folder_that_is_taken_is_refused_untouched(recording_of, straight, sca
 def test_settings_that_make_no_sense_are_refused_by_name(settings, field):
     with pytest.raises(DatasetError, match=f"^{field}: "):
         TakeSettings(**settings)
+
+
+def test_millimetres_as_floats_are_left_out_with_the_unit(taken, scan_at, picture_at):
+    summary, _ = taken([scan_at(0.4), picture_at(0.5, depth=np.full((6, 8), 2500, np.float32)), picture_at(0.6)])
+    assert summary.pictures == 1
+    (line,) = summary.dropped
+    assert line == (
+        "1 picture: its floating-point depth looks like millimetres, and metres are wanted: divide it by 1000, or record "
+        "16-bit integers (first: picture at 0.5)"
+    )
 
 
 def test_progress_is_told_after_every_frame(recording_of, straight, scan_at, tmp_path):

@@ -65,3 +65,13 @@ def test_pictures_that_hold_too_little_to_register_speak_of_depth(calibration):
 def test_support_is_what_the_judge_gives_for_inliers_and_similarity():
     weights = SupportWeights()
     assert support_of(0.5, 0.75) == 0.5 * weights.inliers + 0.75 * weights.similarity == 61.0
+
+
+def test_a_depth_in_another_unit_is_the_first_reason_and_is_told_once(calibration):
+    evidence = evidence_of(facings=-10, scale=6)
+    depth_m = np.full((4, 4), 5000, np.float32)
+    unit, intrinsics = reasons_of(calibration, evidence, depth_m)
+    assert (unit.check, unit.evidence, intrinsics.check) == ("depth unit", (), "intrinsics")
+    assert "looks like millimetres: send scale_m 0.001" in unit.remedy
+    assert told(reasons_of(calibration, None, depth_m)) == [("depth unit", ()), ("depth", ())]
+    assert reasons_of(calibration, evidence, depth_m / 1000) == reasons_of(calibration, evidence)

@@ -303,3 +303,12 @@ def test_an_array_whose_header_is_no_text_is_refused(bundle_copy: Path, name: st
     replace_file(bundle_copy, name, bytes(data))
     with pytest.raises(BundleError, match=f"{name}"):
         MapBundle.open(bundle_copy)
+
+
+def test_a_dataset_given_as_a_bundle_is_named(tmp_path: Path) -> None:
+    (tmp_path / "dataset.json").write_text("{}")
+    with pytest.raises(BundleError) as caught:
+        MapBundle.open(tmp_path)
+    assert caught.value.message == (
+        f"{tmp_path} is a dataset, not a map bundle: run `streetfix build-map {tmp_path} --out BUNDLE`, and give BUNDLE"
+    )

@@ -116,6 +116,7 @@ def test_without_the_packages_poses_stay_and_a_line_says_so_unless_it_was_asked_
     assert poses is wrong
     assert line is not None
     assert "pip install" in line
+    assert line.startswith("--align is off: poses are the recording's own, which may be off by decimetres")
     with pytest.raises(ExtraMissingError, match="--no-align") as missing:
         usual_poses(Raw(), wrong, align=True)
     assert missing.value.field == "align"

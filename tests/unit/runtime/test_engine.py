@@ -21,7 +21,7 @@ from service.geometry.camera import PinholeCamera
 from service.localization.prior import Prior
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
-from service.runtime.engine import EncodedQuery, Engine, _prior_in
+from service.runtime.engine import EncodedQuery, Engine, prior_in
 from service.runtime.settings import Limits, Settings
 
 Parts = Callable[..., dict[str, bytes]]
@@ -108,12 +108,12 @@ def test_a_prior_in_degrees_keeps_what_else_is_known(twins: Engine, encoded: Enc
     """A hundredth of a degree north and east of Berlin's middle: 1112.7 m and 678.6 m."""
     prior = Prior(position_std_m=7.0, heading_rad=1.25, heading_std_rad=0.5)
     bundle = twins.registry.get(None).bundle
-    found = _prior_in(replace(encoded, prior=prior, prior_wgs84=(52.53, 13.415)), bundle)
+    found = prior_in(replace(encoded, prior=prior, prior_wgs84=(52.53, 13.415)), bundle)
     assert found is not None
     np.testing.assert_allclose(found.position_m, [678.6, 1112.7], atol=0.3)
     assert (found.position_std_m, found.heading_rad, found.heading_std_rad) == (7.0, 1.25, 0.5)
-    assert _prior_in(replace(encoded, prior=prior), bundle) is prior
-    assert _prior_in(encoded, bundle) is None
+    assert prior_in(replace(encoded, prior=prior), bundle) is prior
+    assert prior_in(encoded, bundle) is None
 
 
 def test_a_prior_in_degrees_is_refused_where_the_map_does_not_know_where_it_lies(

@@ -152,3 +152,9 @@ def test_an_encoder_that_is_none_stops_the_start(content_of: Callable[..., Bundl
     write_bundle(tmp_path / "m", content_of(encoder=b"not an encoder"))
     with pytest.raises(EncoderError):
         MapRegistry.open([tmp_path / "m"])
+
+
+def test_a_dataset_given_as_a_bundle_is_named(tmp_path: Path) -> None:
+    (tmp_path / "dataset.json").write_text("{}")
+    with pytest.raises(BundleError, match="is a dataset, not a map bundle: run `streetfix build-map"):
+        MapRegistry.open([tmp_path])

@@ -2,8 +2,9 @@
 import { AnswerPanel } from './answer/answer_panel';
 import { AskPanel } from './ask/ask_panel';
 import { bodyFrom, requestFrom, type Question } from './ask/question';
+import { samplesOfMap } from './ask/samples_of_map';
 import { cloudFrom, placesFrom, queryPointsFrom } from './binary';
-import type { MapEntry } from './contract';
+import type { MapEntry, SamplePair } from './contract';
 import { button, element } from './element';
 import iconAddress from './icon.svg';
 import { Legend } from './map/legend';
@@ -34,6 +35,7 @@ export class ConsolePage {
   readonly #turn: HTMLButtonElement;
   readonly #all: HTMLButtonElement;
   #entries: MapEntry[] = [];
+  #samples: SamplePair[] = [];
   #shown: MapEntry | null = null;
   #asking = 0;
 
@@ -164,8 +166,10 @@ export class ConsolePage {
   async #showMap(name: string): Promise<void> {
     const entry = this.#entries.find((each) => each.name === name);
     if (entry === undefined) return;
+    const isOther = this.#shown?.name !== name;
     this.#shown = entry;
     this.#choice.value = name;
+    if (isOther) this.#offerSamples();
     const version = `${entry.name}@${entry.version}`;
     try {
       this.#loading.textContent = 'Loading the map…';
@@ -188,13 +192,16 @@ export class ConsolePage {
 
   async #showSamples(): Promise<void> {
     try {
-      const samples = await this.#service.samples();
-      this.#ask.sampleCount = samples.length;
-      this.#ask.strip.show(samples);
+      this.#samples = await this.#service.samples();
+      this.#offerSamples();
     } catch (error) {
-      this.#ask.sampleCount = 0;
+      this.#ask.offer({ samples: [], otherMaps: [] });
       if (!(error instanceof ServiceError)) throw error; // why a service answers nothing is told once, above
     }
+  }
+
+  #offerSamples(): void {
+    if (this.#shown !== null) this.#ask.offer(samplesOfMap(this.#samples, this.#shown.name));
   }
 
   async #showCoverage(shows: boolean): Promise<void> {

@@ -6,6 +6,7 @@ import { asCurl, asPython } from './copy_as';
 import { sorted } from './files';
 import { PriorFields } from './prior_fields';
 import { NO_QUESTION, requestFrom, type NamedBlob, type Question } from './question';
+import type { Offer } from './samples_of_map';
 import { SampleStrip } from './sample_strip';
 
 export interface Asked {
@@ -28,10 +29,13 @@ export class AskPanel {
   readonly #ask: HTMLButtonElement;
   readonly #copied = element('span', { class: 'hint', role: 'status' });
   #question: Question = NO_QUESTION;
+  /** Name of the sample that was chosen. */
+  #sample: string | null = null;
 
   constructor(service: Service, readonly asked: Asked) {
-    this.strip = new SampleStrip(service, (_, loading) => {
+    this.strip = new SampleStrip(service, (name, loading) => {
       loading.then((question) => {
+        this.#sample = name;
         this.#take(question);
         asked.ask(question);
       }, asked.failed);
@@ -61,9 +65,18 @@ export class AskPanel {
     this.#refresh();
   }
 
-  set sampleCount(samples: number) {
-    this.#samplesHead.textContent =
-      samples > 0 ? 'Click one: it is asked at once.' : 'None here. "streetfix demo" makes some; STREETFIX_SAMPLES names a folder of them.';
+  /** Show the sample pairs of the map that is shown, and name the other maps that have some. */
+  offer({ samples, otherMaps }: Offer): void {
+    const none = otherMaps.length > 0 ? 'None of this map.' : 'None here. "streetfix demo" makes some; STREETFIX_SAMPLES names a folder of them.';
+    const others = otherMaps.length > 0 ? ` Others belong to: ${otherMaps.join(', ')}.` : '';
+    this.#samplesHead.textContent = (samples.length > 0 ? 'Click one: it is asked at once.' : none) + others;
+    this.strip.show(samples);
+    if (this.#sample !== null && samples.some((each) => each.name === this.#sample)) {
+      this.strip.mark(this.#sample);
+    } else if (this.#sample !== null) { // it is of another map
+      this.#sample = null;
+      this.#take(NO_QUESTION);
+    }
   }
 
   set busy(busy: boolean) {
@@ -76,6 +89,7 @@ export class AskPanel {
     try {
       const { question, unknown } = await sorted(files);
       this.strip.mark(null);
+      this.#sample = null;
       this.#take({ ...this.#question, ...(question.rgb ? { truth: null } : {}), ...question });
       if (unknown.length > 0) throw new Error(`${unknown.join(', ')}: no picture, request or truth file. Drop RGB, depth and camera.json.`);
     } catch (error) {

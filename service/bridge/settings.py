@@ -1,0 +1,105 @@
+"""Settings of the bridge: options of ``streetfix bridge ros2``, and parameters of the ROS node in ``deploy/ros2``."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+#: Types of ROS parameters that the bridge has.
+Parameter = str | float | int | bool
+#: Settings that are files or folders.
+_PATHS = frozenset({"map", "ca", "cert", "key"})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BridgeSettings:
+    """Settings that do not depend on the middleware. ``about`` returns the meaning of each.
+
+    Attributes:
+        url: of the service.
+        map: folder of a map bundle to answer from in this process; None asks the service.
+        map_name: map to ask.
+        api_key: of the service.
+        ca: PEM file of the authorities of the service's certificate.
+        cert: PEM file of the client's certificate.
+        key: PEM file of the private key of ``cert``.
+        color_topic: see ``Topics``.
+        depth_topic: see ``Topics``.
+        info_topic: see ``Topics``.
+        pose_topic: see ``Topics``.
+        diagnostics_topic: see ``Topics``.
+        frame: of the poses.
+        mount: see ``mount_from``.
+        rectified: see ``camera_from``.
+        rate: see ``Gate``, Hz.
+        min_confidence: see ``Gate``.
+        tolerance: see ``Pairs``, seconds.
+        reliable: request lost images again.
+        queue: images that wait during a query.
+    """
+
+    url: Annotated[str, "URL of the service."] = "http://127.0.0.1:8000"
+    map: Annotated[Path | None, "Answer from this map bundle in this process. The bridge then asks no service."] = None
+    map_name: Annotated[str | None, "Map to ask. Required if the service has several."] = None
+    api_key: Annotated[str | None, "API key, if the service requires one."] = None
+    ca: Annotated[Path | None, "PEM file of the authorities that may sign the service's certificate."] = None
+    cert: Annotated[Path | None, "PEM file of this client's certificate, if the service requires one."] = None
+    key: Annotated[Path | None, "PEM file of the private key of the client's certificate."] = None
+    color_topic: Annotated[str, "sensor_msgs/Image: rgb8, bgr8, rgba8, bgra8, mono8."] = "/camera/color/image_raw"
+    depth_topic: Annotated[str, "sensor_msgs/Image, registered to colour: 16UC1 (mm) or 32FC1 (m)."] = (
+        "/camera/aligned_depth_to_color/image_raw"
+    )
+    info_topic: Annotated[str, "sensor_msgs/CameraInfo of the colour image."] = "/camera/color/camera_info"
+    pose_topic: Annotated[str, "geometry_msgs/PoseWithCovarianceStamped."] = "/initialpose"
+    diagnostics_topic: Annotated[str, "diagnostic_msgs/DiagnosticArray."] = "/diagnostics"
+    frame: Annotated[str, "frame_id of the poses."] = "map"
+    mount: Annotated[
+        str | None,
+        "Camera pose on the vehicle, X,Y,Z,QX,QY,QZ,QW as tf2_echo base_link OPTICAL_FRAME prints it. The bridge then "
+        "publishes the vehicle's pose. Otherwise it publishes the camera's pose as a body (x forward, z up).",
+    ] = None
+    rectified: Annotated[bool, "The images are rectified, whatever lens the CameraInfo describes."] = False
+    rate: Annotated[float, "Largest number of queries per second. 0 sends one for every pair."] = 1.0
+    min_confidence: Annotated[float, "Smallest confidence of a published pose. 0 passes every LOCALIZED answer."] = 0.9
+    tolerance: Annotated[float, "Largest difference between the stamps of colour and depth, seconds."] = 0.02
+    reliable: Annotated[bool, "Request lost images again. The bridge then hears no best-effort publishers."] = False
+    queue: Annotated[int, "Images that wait during a query. 0 keeps all."] = 5
+
+
+_ABOUT: dict[str, str] = {
+    name: hint.__metadata__[0] for name, hint in get_type_hints(BridgeSettings, include_extras=True).items()
+}
+_DEFAULTS: dict[str, Any] = {each.name: each.default for each in fields(BridgeSettings)}
+
+
+def about(name: str) -> str:
+    """Return the meaning of a setting.
+
+    Args:
+        name: of the attribute of ``BridgeSettings``.
+    """
+    return _ABOUT[name]
+
+
+def parameters() -> dict[str, Parameter]:
+    """Return every setting as a ROS parameter with its default. ROS has no None; an empty text stands for it."""
+    return {name: "" if default is None else default for name, default in _DEFAULTS.items()}
+
+
+def settings_from(values: Mapping[str, Parameter], environ: Mapping[str, str] | None = None) -> BridgeSettings:
+    """Convert ROS parameters to settings.
+
+    Args:
+        values: a value for each name of ``parameters``. An empty text leaves an optional setting unset. ``~`` in a path is the
+            home folder.
+        environ: environment variables; None reads those of the process. ``STREETFIX_API_KEY`` stands in for an unset ``api_key``.
+    """
+    known = os.environ if environ is None else environ
+    given: dict[str, Any] = {
+        name: value for name, value in values.items() if value != "" or _DEFAULTS[name] is not None
+    }
+    given |= {name: Path(given[name]).expanduser() for name in _PATHS & given.keys()}
+    if "api_key" not in given and (key := known.get("STREETFIX_API_KEY")):
+        given["api_key"] = key
+    return BridgeSettings(**given)

@@ -1,0 +1,100 @@
+"""Checks of a map bundle: files, encoder, calibration, cloud and streets."""
+
+from pathlib import Path
+
+from service.doctor.finding import Finding
+from service.errors import StreetfixError
+from service.localization.localizer import Localizer
+from service.maps.reader import MapBundle
+
+
+def check_bundle(path: Path) -> tuple[Finding, MapBundle | None]:
+    """Check that a bundle opens and that its files have the hashes of its manifest.
+
+    Args:
+        path: folder of the bundle.
+
+    Returns:
+        The finding, and the bundle if it opens.
+    """
+    try:
+        bundle = MapBundle.open(path, verify=True)
+    except StreetfixError as error:
+        return Finding.of_error("map", error), None
+    manifest = bundle.manifest
+    text = (
+        f"{manifest.name}, version {manifest.version}: the hashes of its {len(manifest.files)} files are right; "
+        f"{manifest.counts.places} places"
+    )
+    return Finding("map", "ok", text), bundle
+
+
+def check_encoder(bundle: MapBundle) -> tuple[Finding, Localizer | None]:
+    """Check that the encoder of a map runs, and that it belongs to the map's descriptors.
+
+    Args:
+        bundle: the map.
+
+    Returns:
+        The finding, and the localizer of the map if it can be made.
+    """
+    try:
+        localizer = Localizer.open(bundle)
+    except StreetfixError as error:
+        return Finding.of_error("encoder", error), None
+    encoder = localizer.encoder
+    text = (
+        f"reads views of {encoder.rows} x {encoder.columns} cells and gives descriptors of {encoder.dimension} numbers"
+    )
+    return Finding("encoder", "ok", text), localizer
+
+
+def check_calibration(bundle: MapBundle, false_accept_rate: float) -> Finding:
+    """Check that the map is calibrated, and that its calibration can promise the false-accept rate of the service.
+
+    Args:
+        bundle: the map.
+        false_accept_rate: setting of the service.
+    """
+    calibration = bundle.calibration
+    if calibration is None:
+        return Finding(
+            "calibration", "warning", "the map is not calibrated: answers have no confidence, and all of them are LOCALIZED",
+            "build the map with an encoder that has a calibration, or fit one (streetfix calibrate)",
+        )  # fmt: skip
+    least = calibration.least_false_accept_rate
+    if false_accept_rate < least:
+        return Finding(
+            "calibration", "problem", f"the setting false_accept_rate is {false_accept_rate:g}, and the map can promise {least:g}",
+            f"set STREETFIX_FALSE_ACCEPT_RATE to {least:g} or more",
+        )  # fmt: skip
+    site = "not corrected for this site" if calibration.site is None else "corrected for this site"
+    return Finding("calibration", "ok", f"the map is calibrated, {site}")
+
+
+def check_cloud(bundle: MapBundle) -> Finding:
+    """Check that the map has a cloud to register images on.
+
+    Args:
+        bundle: the map.
+    """
+    if bundle.cloud is None:
+        return Finding(
+            "cloud", "warning", "the map has no cloud: an answer is the pose of a place, without registration and confidence",
+            "build the map again with its cloud",
+        )  # fmt: skip
+    return Finding("cloud", "ok", f"{len(bundle.cloud.surfels)} surfels")
+
+
+def check_streets(bundle: MapBundle) -> Finding:
+    """Check that the map knows its streets.
+
+    Args:
+        bundle: the map.
+    """
+    if bundle.streets is None:
+        return Finding(
+            "streets", "warning", "the map has no streets: answers name none",
+            "make streets.geojson (streetfix streets) in the dataset and build the map again",
+        )  # fmt: skip
+    return Finding("streets", "ok", f"{len(bundle.streets)} streets or sections")

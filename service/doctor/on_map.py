@@ -1,0 +1,120 @@
+"""Checks of an image pair on a map: the rows that both sensors see, and the answer."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool
+from numpy.typing import NDArray
+
+from service.doctor.finding import Finding
+from service.doctor.ground import ASSUMED_HEIGHT_M
+from service.doctor.pair import Pair
+from service.errors import StreetfixError
+from service.imaging.gather import gather
+from service.imaging.level import level_camera
+from service.localization.answer import Answer
+from service.localization.decoding import DepthFormat, decoded_query
+from service.localization.localizer import Localizer
+from service.maps.reader import MapBundle
+from service.runtime.engine import prior_in
+
+#: Share of the camera's rows that the LiDAR must see.
+LEAST_OVERLAP = 0.5
+
+
+def rows_of_camera(pair: Pair, bundle: MapBundle) -> Bool[NDArray[np.bool_], " rows"]:
+    """Return the rows of the view grid that the camera sees in at least half of the columns that the camera sees at all.
+
+    Args:
+        pair: decoded images.
+        bundle: the map.
+    """
+    camera = pair.encoded.camera
+    level = level_camera(pair.depth_m, camera, down_camera=pair.encoded.down_camera, nominal_height_m=ASSUMED_HEIGHT_M)
+    _, _, seen = gather(pair.rgb, pair.depth_m, camera, level.R_level_camera.T, bundle.grid)
+    columns = int(seen.any(axis=0).sum())
+    rows: Bool[NDArray[np.bool_], " rows"] = (seen.sum(axis=1) * 2 >= columns) & (columns > 0)
+    return rows
+
+
+def check_rows(
+    camera_rows: Bool[NDArray[np.bool_], " rows"], lidar_rows: Bool[NDArray[np.bool_], " rows"], elevations_rad: NDArray[np.float64]
+) -> Finding:  # fmt: skip
+    """Check that the LiDAR of the survey saw the heights that the camera sees.
+
+    Args:
+        camera_rows: rows of the view grid that the camera sees.
+        lidar_rows: rows that the LiDAR saw.
+        elevations_rad: elevation of each row, radians.
+    """
+    check = "same heights"
+    if not camera_rows.any():
+        return Finding(
+            check, "warning", "the camera sees no row of the map's view grid", "level the camera, and check its intrinsics"
+        )  # fmt: skip
+    overlap = float(np.mean(lidar_rows[camera_rows]))
+    text = (
+        f"the LiDAR of the survey saw {overlap:.0%} of the rows that the camera sees (camera {_span(camera_rows, elevations_rad)}, "
+        f"LiDAR {_span(lidar_rows, elevations_rad)})"
+    )
+    if overlap >= LEAST_OVERLAP:
+        return Finding(check, "ok", text)
+    return Finding(
+        check, "warning", text, "level the camera so that both see the same heights, or survey with a LiDAR that sees them"
+    )  # fmt: skip
+
+
+def _span(rows: Bool[NDArray[np.bool_], " rows"], elevations_rad: NDArray[np.float64]) -> str:
+    if not rows.any():
+        return "none"
+    inside = np.rad2deg(elevations_rad[rows])
+    return f"{inside.min():.0f} to {inside.max():.0f} degrees"
+
+
+def answer_of(pair: Pair, localizer: Localizer, false_accept_rate: float) -> Answer:
+    """Localize the pair as a service does.
+
+    Args:
+        pair: decoded images; their encoded form is decoded again, as a service decodes it.
+        localizer: of the map.
+        false_accept_rate: setting of the service.
+
+    Raises:
+        StreetfixError: the service would refuse the query.
+    """
+    encoded, bundle = pair.encoded, localizer.bundle
+    form = DepthFormat(
+        encoding=encoded.depth_encoding, kind=encoded.depth_kind, scale_m=encoded.scale_m, baseline_m=encoded.baseline_m,
+        max_range_m=encoded.max_range_m,
+    )  # fmt: skip
+    query = decoded_query(encoded.rgb, encoded.depth, encoded.camera, form, grid=bundle.grid)
+    return localizer.localize(
+        replace(
+            query, down_camera=encoded.down_camera, T_vehicle_camera=encoded.T_vehicle_camera, neighbours=encoded.neighbours,
+            refine=encoded.refine, prior=prior_in(encoded, bundle), false_accept_rate=encoded.false_accept_rate or false_accept_rate,
+        )
+    )  # fmt: skip
+
+
+def check_answer(pair: Pair, localizer: Localizer, false_accept_rate: float) -> Finding:
+    """Localize the pair, and report status, confidence and reasons.
+
+    Args:
+        pair: decoded images.
+        localizer: of the map.
+        false_accept_rate: setting of the service.
+    """
+    try:
+        answer = answer_of(pair, localizer, false_accept_rate)
+    except StreetfixError as error:
+        return Finding.of_error("answer", error)
+    confidence = "no confidence" if answer.confidence is None else f"confidence {answer.confidence:.3f}"
+    text = f"{answer.status} ({confidence})"
+    if answer.status == "LOCALIZED":
+        return Finding("answer", "ok", text)
+    reasons = "; ".join(f"{each.check}: {each.remedy}" for each in answer.reasons)
+    remedy = (
+        reasons
+        or "all evidence is in the range of the calibration: the place may be outside the map, or look like another one"
+    )
+    return Finding("answer", "warning", text, remedy)

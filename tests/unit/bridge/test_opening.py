@@ -1,0 +1,66 @@
+"""The bridge of its settings, and the event that signals set."""
+
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.bridge.bridge import Topics
+from service.bridge.opening import opened, until_signalled
+from service.bridge.pose import CAMERA_AS_BODY
+from service.bridge.settings import BridgeSettings
+from service.errors import RequestError
+
+
+def test_every_setting_reaches_the_bridge() -> None:
+    settings = BridgeSettings(
+        color_topic="/c", depth_topic="/d", info_topic="/i", pose_topic="/p", diagnostics_topic="/g", frame="earth",
+        mount="1,2,3,0,0,0,1", rectified=True, rate=0.5, min_confidence=0.25, tolerance=0.125,
+    )  # fmt: skip
+    with opened(settings) as bridge:
+        assert bridge.topics == Topics("/c", "/d", "/i", "/p", "/g")
+        assert (bridge.frame_id, bridge.rectified) == ("earth", True)
+        assert (bridge.gate.rate_hz, bridge.gate.min_confidence) == (0.5, 0.25)
+        assert bridge.pairs._tolerance_ns == 125_000_000
+        np.testing.assert_array_equal(bridge.T_vehicle_camera[:3, 3], [1, 2, 3])
+
+
+def test_without_a_mounting_the_vehicle_is_the_camera() -> None:
+    with opened(BridgeSettings()) as bridge:
+        np.testing.assert_array_equal(bridge.T_vehicle_camera, CAMERA_AS_BODY)
+
+
+def test_a_map_answers_without_a_service(bundle_path: Path) -> None:
+    with opened(BridgeSettings(map=bundle_path, url="http://nowhere.invalid")) as bridge:
+        assert type(bridge.localize).__name__ == "InPlace"
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"rate": -1.0}, "--rate: -1.0 is no rate"),
+        ({"min_confidence": 2.0}, "--min-confidence: 2.0 is no probability"),
+        ({"tolerance": -1.0}, "tolerance: -1.0 is no time"),
+        ({"mount": "1,2"}, "--mount: '1,2' is not X,Y,Z"),
+        ({"queue": -1}, "--queue: -1 is no number of images; give 1 or more, or 0 to keep all"),
+        ({"url": "nowhere"}, "url: 'nowhere' is no address"),
+        ({"map": Path("m"), "map_name": "n"}, "--map has one map alone"),
+        ({"map": Path("m"), "cert": Path("c")}, "--cert is for a service"),
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_refused(changed: dict[str, object], words: str) -> None:
+    with pytest.raises(RequestError, match=words), opened(replace(BridgeSettings(), **changed)):  # type: ignore[arg-type]
+        pytest.fail("opened")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_sets_the_event_once_and_the_handlers_come_back(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with until_signalled() as over:
+        assert not over.is_set()
+        signal.raise_signal(number)
+        assert over.is_set()
+        assert signal.getsignal(number) == before
+    assert signal.getsignal(number) == before

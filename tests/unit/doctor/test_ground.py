@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+from service.doctor.ground import Ground, check_ground, ground_of
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, rotation_y
+
+CAMERA = PinholeCamera(160, 120, 80.0, 80.0, 79.5, 59.5)
+
+
+def plane(height_m, pitch_deg=0.0):
+    """z of an endless ground below a camera that is pitched down; 0 above the horizon and beyond 60 m."""
+    R = rotation_y(np.deg2rad(pitch_deg)) @ R_BODY_OPTICAL
+    down = -(CAMERA.rays_of_pixels() @ R.T)[..., 2]
+    z = np.where(down > 1e-6, height_m / np.maximum(down, 1e-6), 0.0)
+    return np.where(z < 60, z, 0.0).astype(np.float32)
+
+
+@pytest.mark.parametrize("height_m", [0.3, 0.7, 1.5, 2.2, 3.5])
+def test_the_height_is_found_also_far_from_what_the_service_assumes(height_m):
+    found = ground_of(plane(height_m), CAMERA, None)
+    assert found.height_m == pytest.approx(height_m, abs=0.1)
+    assert found.share > 0.9
+    assert check_ground(found).level == ("warning" if height_m in (0.3, 3.5) else "ok")
+
+
+@pytest.mark.parametrize(("pitch_deg", "level"), [(5.0, "ok"), (-4.0, "ok"), (24.0, "warning")])
+def test_the_pitch_is_found_without_gravity(pitch_deg, level):
+    found = ground_of(plane(1.5, pitch_deg), CAMERA, None)
+    assert found.pitch_deg == pytest.approx(pitch_deg, abs=1.5)
+    assert found.roll_deg == pytest.approx(0.0, abs=1.0)
+    assert check_ground(found).level == level
+
+
+def test_gravity_is_believed():
+    pitch = np.deg2rad(24.0)
+    found = ground_of(plane(1.5, 24.0), CAMERA, np.array([0.0, np.cos(pitch), np.sin(pitch)]))
+    assert found.pitch_deg == pytest.approx(24.0, abs=0.5)
+    assert found.found_by_service_m == pytest.approx(1.5, abs=0.05)
+
+
+def test_a_wall_shows_no_ground():
+    found = check_ground(ground_of(np.full((120, 160), 5.0, np.float32), CAMERA, None))
+    assert (found.level, found.text.startswith("no ground is seen")) == ("warning", True)
+
+
+def test_no_depth_shows_no_ground():
+    assert ground_of(np.zeros((120, 160), np.float32), CAMERA, None).share == 0.0
+
+
+def ground(**changed):
+    given = {"share": 0.5, "height_m": 1.5, "pitch_deg": 1.0, "roll_deg": 0.0, "found_by_service_m": 1.5}
+    return Ground(**(given | changed))
+
+
+@pytest.mark.parametrize(
+    ("changed", "text", "remedy"),
+    [
+        ({"share": 0.05}, "no ground is seen: 5% of the pixels", "level camera 1.5 m"),
+        ({"height_m": 0.5, "found_by_service_m": 1.5}, "but the service takes it for 1.50 m", "send gravity"),
+        ({"height_m": 0.4}, "0.40 m above the ground", "depth.scale_m is off by a factor of about 3.8"),
+        ({"height_m": 3.0}, "3.00 m above the ground", "off by a factor of about 0.5"),
+        ({"pitch_deg": -16.0}, "16 degrees up", "send gravity"),
+        ({"roll_deg": 20.0}, "rolled by 20 degrees", "send gravity"),
+    ],
+)
+def test_what_is_unusual_is_a_warning(changed, text, remedy):
+    found = check_ground(ground(**changed))
+    assert found.level == "warning"
+    assert text in found.text
+    assert remedy in found.remedy
+
+
+def test_what_is_usual_is_ok():
+    assert check_ground(ground()).level == "ok"

@@ -1,0 +1,60 @@
+import pytest
+
+from service.doctor import on_disk
+from service.maps.reader import MapBundle
+from service.maps.writer import write_bundle
+
+
+def test_a_good_bundle_opens_and_its_parts_are_told(bundle_path):
+    told, bundle = on_disk.check_bundle(bundle_path)
+    assert told.level == "ok"
+    assert told.text.startswith("tiny, version ")
+    assert told.text.endswith("12 places")
+    encoder, localizer = on_disk.check_encoder(bundle)
+    assert encoder.text == "reads views of 8 x 16 cells and gives descriptors of 16 numbers"
+    assert localizer.bundle is bundle
+    assert on_disk.check_streets(bundle).text == "3 streets or sections"
+    assert on_disk.check_cloud(bundle).text == f"{len(bundle.cloud.surfels)} surfels"
+    uncalibrated = on_disk.check_calibration(bundle, 0.02)
+    assert uncalibrated.level == "warning"
+    assert "all of them are LOCALIZED" in uncalibrated.text
+
+
+def test_a_changed_byte_is_a_problem_with_the_name_of_the_file(bundle_copy):
+    file = bundle_copy / "places.npy"
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(bytes(content))
+    told, bundle = on_disk.check_bundle(bundle_copy)
+    assert bundle is None
+    assert (told.level, told.text, told.remedy) == (
+        "problem", f"{file}: its content is not what the manifest says", "copy or build the bundle again",
+    )  # fmt: skip
+
+
+def test_a_folder_without_a_map_is_a_problem(tmp_path):
+    told, bundle = on_disk.check_bundle(tmp_path)
+    assert (told.level, bundle) == ("problem", None)
+    assert "there is no readable manifest" in told.text
+
+
+def test_an_encoder_that_does_not_run_is_a_problem(content_of, tmp_path):
+    write_bundle(tmp_path / "own", content_of(encoder=b"no network"))
+    told, localizer = on_disk.check_encoder(MapBundle.open(tmp_path / "own"))
+    assert (told.level, localizer) == ("problem", None)
+    assert told.text.startswith("the encoder is no ONNX model that runs here")
+
+
+@pytest.mark.parametrize(("rate", "level"), [(0.001, "ok"), (0.0005, "problem")])
+def test_a_calibration_must_promise_the_rate_of_the_service(content_of, calibration_json, tmp_path, rate, level):
+    write_bundle(tmp_path / "own", content_of(calibration=calibration_json()))
+    told = on_disk.check_calibration(MapBundle.open(tmp_path / "own"), rate)
+    assert told.level == level
+    assert told.remedy == ("" if level == "ok" else "set STREETFIX_FALSE_ACCEPT_RATE to 0.001 or more")
+
+
+def test_a_map_without_cloud_and_streets_gives_warnings(content_of, tmp_path):
+    write_bundle(tmp_path / "own", content_of(cloud=None, streets=None, place_street=content_of().place_street * 0 - 1))
+    bundle = MapBundle.open(tmp_path / "own")
+    assert on_disk.check_cloud(bundle).level == "warning"
+    assert on_disk.check_streets(bundle).level == "warning"
