@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import grpc
@@ -47,14 +46,13 @@ def test_a_native_librarys_exception_ends_its_own_request_alone(
     engine: Engine, client_of: Callable[[Engine], httpx.Client], parts_of: Parts, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:  # fmt: skip
     client, (asked,) = client_of(engine), engine.registry
-    encode = asked.encoder.encode
 
     def fails(*_: object, **__: object) -> None:
         raise error
 
-    asked.encoder = SimpleNamespace(encode=fails)
-    failed = post(client, parts_of())
-    asked.encoder = SimpleNamespace(encode=encode)
+    with monkeypatch.context() as patched:
+        patched.setattr(asked.encoder, "encode", fails)
+        failed = post(client, parts_of())
     assert (failed.status_code, failed.json()["code"]) == (500, "internal")
     assert str(error) not in failed.text or not str(error)
     assert post(client, parts_of()).status_code == 200
