@@ -7,6 +7,7 @@ TORCH ?= torch==2.13.0
 # Optimiser steps of the stock encoder, and of its second round at half the rate.
 STEPS ?= 6600
 SECOND_STEPS ?= 4000
+THIRD_STEPS ?= 1500
 # Further steps on the paper's city, for the encoder that stands beside it in the report.
 PAPER_STEPS ?= 400
 # Real stereo frames in KITTI's object layout.
@@ -173,14 +174,15 @@ pictures: .venv/.torch ## the pictures of README and docs
 encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS) --precision bfloat16
 	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --precision bfloat16 --start-from runs/stock
-	$(BIN)/streetfix export runs/second --out runs/second/encoder.onnx
-	$(BIN)/streetfix quantize runs/second/encoder.onnx --out model_training/stock/encoder.onnx
+	$(BIN)/streetfix train --recipe matched --run runs/third --turn 7.5 --steps $(THIRD_STEPS) --rate 6e-4 --seed 11 --start-from runs/second
+	$(BIN)/streetfix export runs/third --out runs/third/encoder.onnx
+	$(BIN)/streetfix quantize runs/third/encoder.onnx --out model_training/stock/encoder.onnx
 
 calibration: .venv/.torch ## ask calibration cities and fit confidence anew, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)
 
 paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there
-	$(BIN)/streetfix train --recipe paper --start-from runs/second --rate 5e-4 --steps $(PAPER_STEPS) --precision bfloat16 --run runs/paper
+	$(BIN)/streetfix train --recipe paper --start-from runs/third --rate 5e-4 --steps $(PAPER_STEPS) --precision bfloat16 --run runs/paper
 	$(BIN)/streetfix export runs/paper --out runs/paper/encoder.onnx
 
 install-demo: .venv/.mapping ## what the demo needs, and no more
