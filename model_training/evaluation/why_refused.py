@@ -21,7 +21,7 @@ from service.localization.reasons import FOCAL_FACTORS, GAIN, reasons_of, suppor
 from service.maps.calibration import FEATURES, Calibration
 
 #: A map accepts almost no answer if it accepts less than this share of the queries.
-FEW = 0.1
+FEW = 0.25
 #: Factors of depth to try.
 DEPTH_FACTORS = (0.001, 0.1, 10.0, 1000.0)
 #: Largest number of queries to try for each factor.

@@ -128,7 +128,7 @@ def test_no_encoder_and_no_source_of_c_is_there(installed: Path) -> None:
 def test_commands_that_are_not_there_are_not_listed(installed: Path, tmp_path: Path) -> None:
     told = run([str(installed / "bin" / "streetfix"), "--help"], tmp_path).stdout
     listed = re.findall(r"^  ([a-z-]+)  ", told.partition("Commands:")[2], re.MULTILINE)
-    assert sorted(listed) == ["bridge", "health", "keys", "localize", "serve"]
+    assert sorted(listed) == ["bridge", "doctor", "health", "keys", "localize", "serve"]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import ssl
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ import uvicorn
 
 from model_training.loadtest.payloads import Payload
 from model_training.loadtest.targets import Grpc, Rest
-from service.cli.bridge import _asking
+from service.bridge.opening import _asking
+from service.bridge.settings import BridgeSettings
 from service.cli.main import main
 from service.client import (
     AsyncClient,
@@ -303,15 +305,12 @@ def test_the_command_health(
 
 
 def test_the_bridge_asks_over_tls(faces: Faces, pem: Pem, pictures: Any, bundle_path: Path) -> None:
-    how: dict[str, Any] = {"map_name": None, "api_key": None, "cert": pem["robot.crt"], "key": pem["robot.key"]}
-    with _asking(faces["mutual"]["rest"], None, ca=pem["ca.crt"], **how) as localize:
+    right = BridgeSettings(url=faces["mutual"]["rest"], ca=pem["ca.crt"], cert=pem["robot.crt"], key=pem["robot.key"])
+    with _asking(right) as localize:
         assert localize(*pictures).status == "LOCALIZED"
-    with (
-        _asking(faces["mutual"]["rest"], None, ca=pem["other.crt"], **how) as localize,
-        pytest.raises(HandshakeError),
-    ):
+    with _asking(replace(right, ca=pem["other.crt"])) as localize, pytest.raises(HandshakeError):
         localize(*pictures)
-    with pytest.raises(RequestError, match="--ca is for a service"), _asking("", bundle_path, ca=pem["ca.crt"], **how):
+    with pytest.raises(RequestError, match="--ca is for a service"), _asking(replace(right, map=bundle_path)):
         pass
 
 

@@ -13,12 +13,12 @@ from service.compiled import compiled_layout, declared_layout, load
 from service.errors import StreetfixError
 from service.imaging import depth16, gather, level
 from service.imaging.as_c import CPicture
-from service.registration import kernel, points, rays, sight
+from service.registration import kernel, points, rays, visibility
 
-LIBRARIES = (gather.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, sight.LIBRARY)
+LIBRARIES = (gather.LIBRARY, level.LIBRARY, kernel.LIBRARY, points.LIBRARY, visibility.LIBRARY)
 
 
-@pytest.mark.parametrize("loaded", [gather._library, level._library, kernel._library, points._library, sight._library,
+@pytest.mark.parametrize("loaded", [gather._library, level._library, kernel._library, points._library, visibility._library,
                                     rays._library, depth16.library])  # fmt: skip
 def test_what_was_built_fits_what_python_declares(loaded):
     assert loaded() is not None

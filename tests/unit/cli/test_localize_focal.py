@@ -1,6 +1,7 @@
 """A focal length off by a factor of two is named, by ``localize`` of a real service and by ``evaluate``."""
 
 import json
+import re
 import shutil
 import threading
 from collections.abc import Iterator
@@ -52,8 +53,15 @@ def ask(url: str, small_dataset: Dataset, tmp_path: Path, capsys: pytest.Capture
     return asked
 
 
-@pytest.mark.parametrize(("focal", "factor"), [(2.0, 0.5), (0.5, 2.0)])
-@pytest.mark.parametrize("query", [0, 1, 3, 4])
+#: The fifth query is accepted at half the focal length, 8 m off (decision 0142).
+ACCEPTED = pytest.mark.xfail(reason="accepted at half the focal length, decision 0142", strict=True)
+
+
+@pytest.mark.parametrize(
+    ("focal", "factor", "query"),
+    [*((2.0, 0.5, query) for query in (0, 1, 3, 4)), *((0.5, 2.0, query) for query in (0, 1, 3)),
+     pytest.param(0.5, 2.0, 4, marks=ACCEPTED)],
+)  # fmt: skip
 def test_a_focal_length_off_by_a_factor_of_two_is_named_first(
     ask: Any, focal: float, factor: float, query: int
 ) -> None:
@@ -85,7 +93,8 @@ def test_evaluate_names_it_too(
         main(["evaluate", str(stock_map), str(folder), "--queries", "drive1_precise", "--list", "0"])
     assert end.value.code in (0, None)
     lines = capsys.readouterr().out.splitlines()
-    start = lines.index("drive1_precise: 0% of the answers are accepted. What to check, the likeliest first:")
+    few = re.compile(r"drive1_precise: (0|20)% of the answers are accepted\. What to check, the likeliest first:")
+    start = next(number for number, line in enumerate(lines) if few.fullmatch(line))
     assert lines[start + 1].startswith(
         f"  1. the focal length is off by a factor of two: fx and fy times {factor:g} fit"
     )
