@@ -36,7 +36,7 @@ def unit_hint(depth_m: NDArray[Any]) -> str | None:
     """Return what a request's depth looks like, and which ``depth.scale_m`` to send; None if its unit seems right.
 
     Args:
-        depth_m: as in ``unit_factor``.
+        depth_m: depth image (H, W), metres, as in ``unit_factor``.
     """
     factor = unit_factor(depth_m)
     if factor is None:
