@@ -46,8 +46,8 @@ demo: .venv/.mapping ## simulate streets, build their map, serve it, ask it over
 demo-real: .venv/.mapping ## the same with real stereo frames: make demo-real DATA=../shared/data/kitti_stereo
 	$(BIN)/streetfix demo --real $(DATA) $(ARGS)
 
-# A file's tests stay in one process, whose fixtures they share.
-TEST_PROCESSES = --numprocesses auto --maxprocesses 4 --dist loadfile
+# A file's tests stay in one process, whose fixtures they share. Files keep their order: the longest test, of one file, comes early.
+TEST_PROCESSES = --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: .venv/.torch ## all tests, in a process for each core
 	$(BIN)/python -m pytest $(TEST_PROCESSES) $(ARGS)

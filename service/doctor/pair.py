@@ -13,13 +13,10 @@ from service.errors import ImageSizeError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import ASPECT_TOLERANCE, decode_depth, decode_rgb, default_scale_m, require_sizes
 from service.imaging.depth_formats import read_depth_values
+from service.imaging.depth_unit_hint import FACTORS, USUAL_M
 from service.imaging.picture_headers import DEFAULT_LIMITS
 from service.runtime.engine import EncodedQuery
 
-#: Plausible median depth of a street view, metres.
-LEAST_MEDIAN_M, MOST_MEDIAN_M = 0.5, 40.0
-#: Factors of ``depth.scale_m`` that are tried: millimetres taken for metres, and the reverse.
-SCALE_FACTORS = (0.001, 1000.0)
 #: Share of pixels with a depth below which the images tell little.
 LEAST_SHARE = 0.1
 
@@ -140,25 +137,25 @@ def check_depth_unit(pair: Pair) -> tuple[Finding, Pair]:
     Returns:
         The finding, and the pair: with another scale if only that one gives a plausible depth.
     """
-    check = "depth unit"
+    check, (least_m, most_m) = "depth unit", USUAL_M
     median_m = _median_m(pair)
     if median_m is None:
         return Finding(
             check, "problem", "no pixel has a depth", "check the depth file, depth.scale_m and depth.kind"
         ), pair
-    if LEAST_MEDIAN_M <= median_m <= MOST_MEDIAN_M:
+    if least_m <= median_m <= most_m:
         return Finding(check, "ok", f"the median depth is {_plain(median_m)} m (depth.scale_m {pair.scale_m:g})"), pair
-    for factor in SCALE_FACTORS:
+    for factor in FACTORS:
         tried = pair.with_scale(pair.scale_m * factor)
         tried_m = _median_m(tried)
-        if tried_m is not None and LEAST_MEDIAN_M <= tried_m <= MOST_MEDIAN_M:
+        if tried_m is not None and least_m <= tried_m <= most_m:
             unit = _unit_told(pair, factor)
             return Finding(
                 check, "problem", f"the median depth is {_plain(median_m)} m with depth.scale_m {pair.scale_m:g}{unit}",
                 f"set depth.scale_m to {tried.scale_m:g}: the median is then {_plain(tried_m)} m, and the checks below use it",
             ), tried  # fmt: skip
     return Finding(
-        check, "warning", f"the median depth is {_plain(median_m)} m, and usual are {LEAST_MEDIAN_M:g} to {MOST_MEDIAN_M:g} m",
+        check, "warning", f"the median depth is {_plain(median_m)} m, and usual are {least_m:g} to {most_m:g} m",
         "check depth.scale_m and depth.kind (z, range or disparity)",
     ), pair  # fmt: skip
 

@@ -45,7 +45,7 @@ def unit_hint(depth_m: NDArray[Any]) -> str | None:
     unit, scale_m = ("millimetres", "0.001") if factor < 1 else ("metres that were taken for millimetres", "1")
     return (
         f"the median depth is {median_m:.4g} m, which looks like {unit}: send scale_m {scale_m} in depth, "
-        f"or {factor:g} times the scale that was sent"
+        f"or {factor:g} times the scale that was sent; if the depth is a disparity, divide the scale by {factor:g} instead"
     )
 
 

@@ -122,7 +122,7 @@ def test_a_depth_that_no_unit_explains_is_a_warning(encoded, depth_m):
     pair = pair_of(encoded(depth=npy(np.full((48, 64), 0.25, np.float32))))
     told, same = check_depth_unit(pair)
     assert (told.level, same) == ("warning", pair)
-    assert told.text == "the median depth is 0.25 m, and usual are 0.5 to 40 m"
+    assert told.text == "the median depth is 0.25 m, and usual are 0.3 to 60 m"
 
 
 def test_a_disparity_is_tried_in_its_own_unit(encoded, depth_m):
