@@ -19,10 +19,14 @@ from pathlib import Path
 from benchmarks.native.wheels import ROOT, build_wheel, python_in
 
 #: Unit tests of every module that calls C.
-TESTS = (
-    *(f"tests/unit/imaging/test_{name}.py" for name in ("decode_depth", "gather", "level", "png16", "ros_depth")),
-    *(f"tests/unit/registration/test_{name}.py" for name in ("align", "nearest_grid", "points", "pulls", "rays", "render", "sight")),
-)  # fmt: skip
+TESTS = tuple(
+    f"tests/unit/{folder}/test_{name}.py"
+    for folder, names in {
+        "imaging": ("decode_depth", "gather", "level", "png16", "ros_depth"),
+        "registration": ("align", "nearest_grid", "points", "pulls", "rays", "render", "visibility"),
+    }.items()
+    for name in names
+)
 ROUNDS = 70
 #: Marks of a report: the first line of AddressSanitizer, and each line of UndefinedBehaviorSanitizer.
 _REPORT = re.compile(r"ERROR: AddressSanitizer|: runtime error: ")

@@ -24,6 +24,11 @@ DEFECTS = {
 }
 
 
+@pytest.mark.parametrize("path", sanitizers.TESTS)
+def test_every_listed_test_file_exists(path: str) -> None:
+    assert (sanitizers.ROOT / path).is_file()
+
+
 @with_sanitizers
 @pytest.mark.parametrize("defect", DEFECTS)
 def test_a_defect_is_reported(tmp_path: Path, defect: str) -> None:
