@@ -14,7 +14,8 @@ PAPER_STEPS ?= 400
 DATA ?= ../shared/data/kitti_stereo
 
 # Compiled when the package is installed.
-KERNEL := native/CMakeLists.txt native/build_backend.py $(wildcard service/*.h service/*/*.c service/*/*.h)
+C_CODE := $(wildcard service/*.h service/*/*.c service/*/*.h)
+KERNEL := native/CMakeLists.txt native/build_backend.py $(C_CODE)
 
 # The console's page, and the browser's driver in its tests.
 WEB := service/console/web
@@ -60,6 +61,7 @@ test-service: .venv/.dev ## the tests of the service alone
 check: .venv/.torch ## lint, types, layers, and the contracts as the code says them
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/clang-format --dry-run --Werror $(C_CODE)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m service.http.openapi --check
@@ -103,6 +105,7 @@ $(WEB)/node_modules/.installed: $(WEB)/package-lock.json
 format: .venv/.torch ## put the code in shape
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+	$(BIN)/clang-format -i $(C_CODE)
 
 generate: .venv/.torch ## write openapi/openapi.json from the code, and the gRPC code from proto/
 	$(BIN)/python -m service.http.openapi
@@ -115,7 +118,7 @@ release-proto: .venv/.torch ## what later messages must stay compatible with: do
 lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
 	$(COMPILE) --extra dev --group oracle $(ARGS) --output-file locks/dev.txt
 	$(COMPILE) --extra mapping --constraint locks/dev.txt --output-file locks/mapping.txt
-	$(COMPILE) --constraint locks/dev.txt --output-file locks/service.txt
+	$(COMPILE) --extra server --constraint locks/dev.txt --output-file locks/service.txt
 	$(COMPILE_BUILD) --constraint locks/dev.txt $(ARGS) --output-file locks/build.txt
 
 evaluate: .venv/.torch ## measure accuracy -> reports/accuracy.json

@@ -13,6 +13,7 @@ from pathlib import Path
 from benchmarks.conditions import condition_rows
 from benchmarks.doubt import doubt_rows
 from benchmarks.full import full_paper_rows, full_unseen_rows
+from benchmarks.heights import height_rows
 from benchmarks.kitti_registration import kitti_registration_rows
 from benchmarks.kitti_retrieval import retrieve
 from benchmarks.plans import BOTH, large_plan, paper_plan, unseen_plan
@@ -26,7 +27,7 @@ from benchmarks.weather import weather_rows
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.simulation.plan import SimulationPlan
 from model_training.stock import ENCODER
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 #: Query sets of the unseen cities: the label of their rows, and the bar of R@1.
 UNSEEN = {
@@ -175,6 +176,7 @@ def main() -> None:
         "conditions": lambda: condition_rows(report, runs),
         "sequences": lambda: sequence_rows(report, runs),
         "priors": lambda: prior_rows(report, runs),
+        "heights": lambda: height_rows(report, runs),
         "unseen": lambda: unseen_rows(report, runs),
         "large": lambda: large_rows(report, runs),
         "paper": lambda: paper_rows(report, runs, "retrieval", barred=True),

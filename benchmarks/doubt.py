@@ -20,7 +20,7 @@ from model_training.simulation.hard import HARD
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
-from service.localization.query import Query
+from service.retrieval.query import Query
 
 RIGHT_M = 1.0
 #: Cities whose maps are built again without every second street.
@@ -142,9 +142,13 @@ def _hard(runs: Runs, count: int) -> tuple[NDArray[np.float64], NDArray[np.bool_
 
 
 def _false_rows(
-    report: Report, row: str, negative: Strangers, confidence: NDArray[np.float64], right: NDArray[np.bool_],
+    report: Report,
+    row: str,
+    negative: Strangers,
+    confidence: NDArray[np.float64],
+    right: NDArray[np.bool_],
     bar: float | None = None,
-) -> None:  # fmt: skip
+) -> None:
     level = float(np.quantile(confidence[right], 0.05))
     count = len(negative.confidence)
     report.share(f"{row}.false_accepts_at_95", negative.confidence >= level, bar=bar, better="lower")
@@ -235,7 +239,8 @@ def _box_depth(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[n
     rays = _rays()
     with np.errstate(divide="ignore"):
         reach = np.where(rays > 0, high / rays, low / rays)
-    return np.where(np.isfinite(reach), reach, np.inf).min(axis=2)
+    depth: NDArray[np.float64] = np.where(np.isfinite(reach), reach, np.inf).min(axis=2)
+    return depth
 
 
 def _room(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -277,7 +282,7 @@ def _sky(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.floa
 def _noise(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Draw depth without any surface."""
     coarse = rng.uniform(1.0, 40.0, (30, 40))
-    return np.kron(coarse, np.ones((16, 16))), rng.uniform(0, 255, (480, 640))
+    return coarse.repeat(16, axis=0).repeat(16, axis=1), rng.uniform(0, 255, (480, 640))
 
 
 def _reliability(report: Report, confidence: NDArray[np.float64], right: NDArray[np.bool_]) -> None:

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from benchmarks.provenance import ROOT
 from model_training.stock import CALIBRATION
-from service.localization.query import FALSE_ACCEPT_RATE
 from service.maps.calibration import Calibration, read_calibration
+from service.option_limits import FALSE_ACCEPT_RATE
 
 REPORTS = ROOT / "reports"
 _FIGURE = re.compile(r"(<!-- figure: (\S+) (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)

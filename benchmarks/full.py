@@ -135,7 +135,7 @@ def consistent(errors: NDArray[np.float64], covariances: NDArray[np.float64]) ->
         covariances: covariances (n, d, d) of the errors.
     """
     squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    low, high = chi2.ppf([0.025, 0.975], errors.shape[1])
+    low, high = (float(chi2.ppf(quantile, errors.shape[1])) for quantile in (0.025, 0.975))
     return float(((squared >= low) & (squared <= high)).mean())
 
 

@@ -1,6 +1,7 @@
 """Registration on real stereo frames by the protocol of the data folder's README: 7 frames, 20 disturbed starts each."""
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks.report import Report
 from benchmarks.runs import Runs
-from model_training.datasets.dataset import Dataset
+from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.importing.kitti_object import import_kitti_object
 from model_training.mapping.build import BuildSettings
 from service.geometry.rigid import rotation_z, transform_from, transform_points
@@ -78,8 +79,8 @@ def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.
     """
     refining = settings_for_rig(RefineSettings(), FOCAL_BASELINE_PX_M)
     found, prepared_s, aligned_s = list[float](), list[float](), list[float]()
-    for frame in dataset.queries("frames"):
-        depth_m, camera, truth = frame.depth_m(), frame.camera.pinhole(), frame.T_map_camera
+    for frame, truth in _with_truth(dataset):
+        depth_m, camera = frame.depth_m(), frame.camera.pinhole()
         level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.65)
         began = time.process_time()
         noise = inverse_depth_noise(depth_m, focal_baseline_px_m=FOCAL_BASELINE_PX_M).total
@@ -109,6 +110,13 @@ def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.
     return np.array(found), 1e3 * (median(prepared_s) + median(aligned_s))
 
 
+def _with_truth(dataset: Dataset) -> Iterator[tuple[QueryFrame, NDArray[np.float64]]]:
+    """Yield the frames with ground truth, and their poses (4, 4)."""
+    for frame in dataset.queries("frames"):
+        if frame.T_map_camera is not None:
+            yield frame, frame.T_map_camera
+
+
 def gicp_errors(dataset: Dataset) -> tuple[NDArray[np.float64], float]:
     """Return the same for small_gicp: all depth against the frame's own scan, unweighted, without the time of the scan's tree.
 
@@ -120,8 +128,7 @@ def gicp_errors(dataset: Dataset) -> tuple[NDArray[np.float64], float]:
     import small_gicp
 
     poses, found, prepared_s, aligned_s = dataset.survey_poses(), list[float](), list[float](), list[float]()
-    for frame in dataset.queries("frames"):
-        truth = frame.T_map_camera
+    for frame, truth in _with_truth(dataset):
         own = int(np.argmin(np.linalg.norm(poses[:, :3, 3] - truth[:3, 3], axis=1)))
         scan = transform_points(poses[own], dataset.scan(own)[:, :3].astype(np.float64))
         depth_m, rays = frame.depth_m(), frame.camera.pinhole().rays_of_pixels()

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.baselines.raw_range import similarities
 from model_training.datasets.dataset import Dataset
+from model_training.evaluation.raw_range import similarities
 from model_training.importing.kitti_object import import_kitti_object
 from model_training.mapping.build import BuildSettings, fan, levelled_scans
 from service.geometry.camera import PinholeCamera
 from service.imaging.query_view import query_view
 from service.imaging.view_grid import Planes, ViewGrid, panorama_from_points, survey_planes, view_from_panorama
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 HIGHEST_DEG = 2.5
 TURNS_DEG = (0.0, 6.0, -6.0)

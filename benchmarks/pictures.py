@@ -152,7 +152,7 @@ def draw_terminal(command: str, printed: str, path: Path) -> None:
 
 def _few_colours(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Reduce an image to four bits per channel: enough for a drawing, and its PNG is half as large."""
-    return (picture & 0xF0) | (picture >> 4)
+    return (picture & np.uint8(0xF0)) | (picture >> np.uint8(4))
 
 
 def _write(path: Path, bgr: NDArray[np.uint8]) -> None:

@@ -7,6 +7,8 @@ from model_training.training.recipe import EVALUATION_SEEDS
 BOTH = ("precise", "stereo")
 HARD_COUNT, SEQUENCES, SEQUENCE = 500, 300, 5
 LARGE_M = (600.0, 400.0)
+#: Heights of the camera, metres; queries of each (with each depth camera), and extent of their city.
+HEIGHTS_M, HEIGHT_COUNT, HEIGHT_CITY_M = (0.2, 0.4, 0.8, 1.5, 2.5, 3.5), 100, (300.0, 200.0)
 REPEATING_DRIVES = 4  # of 120 sequences each; a sixth of them pass a landmark
 
 
@@ -62,6 +64,22 @@ def hard_plan() -> SimulationPlan:
         )
     )
     return SimulationPlan(name="hard", seed=EVALUATION_SEEDS[1], queries=tuple(queries))
+
+
+def height_plan(height_m: float) -> SimulationPlan:
+    """Plan the queries of a camera at one height in a city that all heights share.
+
+    Args:
+        height_m: mean height of the camera above the ground, metres; each query deviates from it by 0.1 m (standard deviation).
+    """
+    queries = (
+        QueryPlan(name="level", traversal=60, count=HEIGHT_COUNT, depths=BOTH),
+        QueryPlan(name="pitched", traversal=61, count=HEIGHT_COUNT // 2, pitch_deg=5.0),
+    )
+    return SimulationPlan(
+        name=f"height-{height_m:g}", seed=EVALUATION_SEEDS[30], size_m=HEIGHT_CITY_M, camera_height_m=height_m,
+        queries=queries,
+    )  # fmt: skip
 
 
 def lidar_16_plan() -> SimulationPlan:

@@ -9,7 +9,7 @@ from benchmarks.sequences import between_landmarks, repeating_answers
 from model_training.evaluation.predict import Predictions, PriorOf
 from model_training.simulation.repeating import BLOCK_M
 from service.geometry.rigid import Transform
-from service.localization.prior import Prior
+from service.retrieval.prior import Prior
 
 STD_M = 5.0
 

@@ -69,6 +69,9 @@ _CORE = (
     "service/geometry",
     "service/maps",
     "service/registration",
+    "service/retrieval",
+    "service/scoring",
+    "service/confidence",
     "service/localization",
     "native",  # build of the C code
     "model_training/stock",
@@ -80,7 +83,6 @@ _ALL = ("streetfix", "service", "model_training", "native")
 MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "accuracy": {
         "": (*_CORE, *_DATA),
-        "raw.": (*_CORE, *_DATA, "model_training/baselines/raw_range.py"),
         "real.": (*_CORE, "model_training/importing", "model_training/datasets", "model_training/mapping"),
         "trained_on_paper_city.": (*_CORE, *_DATA, "model_training/training"),
     },
@@ -88,18 +90,18 @@ MEASURED: dict[str, dict[str, tuple[str, ...]]] = {
     "console": {"": ("service/console", "service/http"), "docs.": (*_ALL, "README.md", "docs")},
     "house": {"": (*_ALL, "pyproject.toml", "README.md", "docs")},
     "kitti": {"": (*_CORE, *_DATA, "model_training/importing")},
-    "paper": {"": (*_CORE, *_DATA, "model_training/baselines", "model_training/training")},
+    "paper": {"": (*_CORE, *_DATA, "research/baselines", "model_training/training")},
     "real_data": {"": (*_CORE, *_DATA, "model_training/importing", "model_training/odometry", "model_training/exporting"),
                   "real.matcher.": ("model_training/importing", "model_training/simulation",
                                     "model_training/evaluation/disparity_errors.py"),
-                  "real.peers.": (*_CORE, *_DATA, "model_training/importing", "model_training/baselines"),
+                  "real.peers.": (*_CORE, *_DATA, "model_training/importing", "research/baselines"),
                   "ros2.": (*_CORE, "service/bridge")},
     "serving": {"": ("service", "native"), "fuzz.": _ALL,
                 "native.": (*_CORE, "service/compiled.py", "service/layout.h", "native"),
                 "sanitizers.": ("service/imaging", "service/registration", "service/layout.h", "native",
                                 "tests/unit/imaging", "tests/unit/registration")},
     "training": {"": ("model_training/training", "model_training/simulation", "service/imaging", "service/geometry"),
-                 "demo.": _ALL, "test.": (*_ALL, "tests")},
+                 "demo.": _ALL, "test.": (*_ALL, "research", "tests")},
 }  # fmt: skip
 
 
@@ -173,7 +175,9 @@ def loaded_commit() -> str:
 
 def is_dirty() -> bool | None:
     """Return whether the code differs from the checked-out commit; None without Git."""
-    told = git("status", "--porcelain", "--", "streetfix", "service", "model_training", "benchmarks", "native")
+    told = git(
+        "status", "--porcelain", "--", "streetfix", "service", "model_training", "research", "benchmarks", "native"
+    )
     return None if told is None else bool(told)
 
 

@@ -6,8 +6,8 @@ from benchmarks.conditions import asked_of
 from benchmarks.plans import BOTH, paper_plan, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs
-from model_training.baselines.raw_range import STRAIGHT
 from model_training.evaluation.error_measures import wilson_interval
+from model_training.evaluation.raw_range import STRAIGHT
 from model_training.simulation.plan import SimulationPlan
 
 #: Query sets of the unseen cities: the label of their rows.

@@ -49,9 +49,17 @@ class Report:
     _runs: dict[str, Run | None] = field(default_factory=dict)  # value of ``_made_by`` by row
 
     def row(
-        self, row_id: str, value: float | None, unit: str, *, bar: float | tuple[float, float] | None = None,
-        better: Literal["higher", "lower"] = "higher", n: int | None = None, ci95: list[float] | None = None, why: str | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        row_id: str,
+        value: float | None,
+        unit: str,
+        *,
+        bar: float | tuple[float, float] | None = None,
+        better: Literal["higher", "lower"] = "higher",
+        n: int | None = None,
+        ci95: list[float] | None = None,
+        why: str | None = None,
+    ) -> None:
         """Add a row; ``holds`` follows from value and bar.
 
         ``benchmarks/why_missed.py`` holds the reasons that people found later.
@@ -85,8 +93,13 @@ class Report:
         print(f"{row_id:62} {shown:>10} {unit:8}{'' if bar is None else f' bar {bar}'}{mark}", flush=True)
 
     def share(
-        self, row_id: str, right: NDArray[np.bool_], *, bar: float | None = None, better: Literal["higher", "lower"] = "higher"
-    ) -> None:  # fmt: skip
+        self,
+        row_id: str,
+        right: NDArray[np.bool_],
+        *,
+        bar: float | None = None,
+        better: Literal["higher", "lower"] = "higher",
+    ) -> None:
         """Add a row of a share with its Wilson interval.
 
         Args:

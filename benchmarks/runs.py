@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import ROOT, Report
-from model_training.baselines.raw_range import raw_best_views
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.evaluation.measures import measure, recall_at
-from model_training.evaluation.predict import Predictions, PriorOf, joined, predict
+from model_training.evaluation.predict import Predictions, PriorOf, SeenBy, joined, predict
+from model_training.evaluation.raw_range import raw_best_views
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.plan import SimulationPlan
 from model_training.simulation.simulate import simulate
 from model_training.stock import CALIBRATION
-from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
 
 #: Only each third query of a set is given to the raw image. It is slow, and a third of the queries suffices to
 #: distinguish 0.3 from 0.4.
@@ -49,7 +49,10 @@ def code_hash(*names: str) -> str:
 
 
 SIMULATION = ("model_training/simulation", "service/geometry/camera.py", "service/geometry/rigid.py")
-ANSWERING = ("service/imaging", "service/geometry", "service/maps", "service/registration", "service/localization")
+ANSWERING = (
+    *("service/imaging", "service/geometry", "service/maps", "service/registration"),
+    *("service/retrieval", "service/scoring", "service/confidence", "service/localization"),
+)
 # includes the answering code: mapping queries its own map to check confidence
 MAPPING = ("model_training/mapping", "model_training/datasets", *ANSWERING)
 
@@ -113,9 +116,16 @@ class Runs:
         return measure(joined(list(found.values())), classes) | {"predictions": found}
 
     def predictions(
-        self, bundle: MapBundle, dataset: Dataset, name: str, *, refine: bool = True, frames_each: int = 1,
+        self,
+        bundle: MapBundle,
+        dataset: Dataset,
+        name: str,
+        *,
+        refine: bool = True,
+        frames_each: int = 1,
         prior: tuple[str, PriorOf] | None = None,
-    ) -> Predictions:  # fmt: skip
+        rig: tuple[str, SeenBy] | None = None,
+    ) -> Predictions:
         """Answer a query set or its sequences, or reuse the answers.
 
         Args:
@@ -125,9 +135,10 @@ class Runs:
             refine: whether to register.
             frames_each: frames per sequence; 1 for single queries.
             prior: name of a kind of prior, and its function; None for no prior.
+            rig: name of a change of the queries, and its function; None leaves them as they are.
         """
         mode = ("full" if refine else "retrieval") + (f"-{frames_each}" if frames_each > 1 else "")
-        mode += "" if prior is None else f"-{prior[0]}"
+        mode += "".join(f"-{changed[0]}" for changed in (prior, rig) if changed is not None)
         folder = self.work / "predictions" / f"{mode}-{code_hash(*ANSWERING)}" / bundle.path.name / dataset.folder.name
         folder.mkdir(parents=True, exist_ok=True)
         kept = folder / f"{name}.npz"
@@ -141,6 +152,7 @@ class Runs:
                     frames_each=frames_each,
                     report=report,
                     prior_of=None if prior is None else prior[1],
+                    seen_by=None if rig is None else rig[1],
                 )
             asked.save(kept)
         return Predictions.load(kept)
@@ -163,7 +175,7 @@ class Runs:
             dataset: dataset of the queries.
             name: name of the query set.
         """
-        code = code_hash(*MAPPING, "model_training/baselines")
+        code = code_hash(*MAPPING, "model_training/evaluation/raw_range.py")
         kept = self.work / "raw" / f"{dataset.folder.name}-{code}-{name}-every{RAW_EVERY}.json"
         if not kept.exists():
             kept.parent.mkdir(parents=True, exist_ok=True)

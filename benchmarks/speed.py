@@ -9,9 +9,9 @@ from threadpoolctl import threadpool_limits
 from benchmarks.plans import BOTH, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs
-from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
-from service.localization.query import Query
+from service.retrieval.encoder import Encoder
+from service.retrieval.query import Query
 
 QUERIES = 100
 BARS_MS = {"precise": 25.0, "stereo": 40.0}

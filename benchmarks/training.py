@@ -76,7 +76,8 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
         steps: training steps.
     """
     shape = EncoderShape(rows=224, columns=224)
-    net, grid, device = EncoderNet(shape).to(memory_format=torch.channels_last), ViewGrid(), torch.device("cpu")
+    net = EncoderNet(shape).to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch documents it, its stub does not
+    grid, device = ViewGrid(), torch.device("cpu")
     rng, city = np.random.default_rng(0), City(Pack.open(packs[0]), grid, turn_deg=TrainingConfig().turn_deg)
     augment = Augmenter(TrainingConfig().augmentation, grid, torch.Generator().manual_seed(0), device)
     optimiser = torch.optim.AdamW(net.parameters(), lr=1e-3)
@@ -96,7 +97,7 @@ def paper_size(report: Report, packs: list[Path], steps: int) -> None:
         sides = Side(descriptors[:count], batch.query_xy), Side(descriptors[count:], batch.survey_xy)
         loss = paired_info_nce(*sides, scale=torch.tensor(20.0))[0].mean()
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]  # torch's own stub leaves it untyped
         optimiser.step()
         images += batch.images if step else 0
     rate = images / (time.perf_counter() - began)

@@ -189,11 +189,6 @@ WHY_MISSED: dict[str, Reason] = {
         1.0082593,
         "the median of three rounds is less than 1 % above the best peer's; latencies of single rounds differ by more",
     ),
-    "wheel.client_dependencies": Reason(
-        24,
-        "the package holds the service and the client. A client that installs alone needs its own distribution, or the server as an "
-        "extra. Neither is done",
-    ),
     "request.files_before_engine": Reason(
         13,
         "these are the request id, traces, host check, route, queue, memory budget, body, parts, GeoPose, schema and conversion. Each has "

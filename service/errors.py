@@ -31,7 +31,7 @@ StreetfixError                     code            kind
 │   └── UnavailableError           unavailable     not_ready    it refused for now, and still did when patience ended
 ├── AddressError                   address         not_ready    the service cannot listen where it was told to
 ├── KeysError                      keys            not_ready    the file of API keys, or a certificate, cannot be used
-├── ExtraMissingError              extra-missing   unsupported  a command needs packages of an extra
+├── ExtraMissingError              extra-missing   unsupported  a command or a class needs packages of an extra
 └── UnsupportedPlatformError       platform        unsupported  the service does not run on this operating system or processor
 
 No number of HTTP or gRPC stands here: each face has one table over ``kind``.
@@ -260,8 +260,15 @@ class RefusedError(StreetfixError):
     code = "refused"
 
     def __init__(
-        self, message: str, *, field: str = "", problem: str = "", detail: str = "", status: str = "", request_id: str = ""
-    ) -> None:  # fmt: skip
+        self,
+        message: str,
+        *,
+        field: str = "",
+        problem: str = "",
+        detail: str = "",
+        status: str = "",
+        request_id: str = "",
+    ) -> None:
         super().__init__(message, field=field)
         self.problem = problem
         self.detail = detail
@@ -322,10 +329,27 @@ def how_to_install(extra: str | None) -> str:
 
 
 class ExtraMissingError(StreetfixError):
-    """A command needs packages of an extra that is not installed."""
+    """A command or a class needs packages of an extra that is not installed."""
 
     code = "extra-missing"
     kind = "unsupported"
+
+
+def extra_missing(needed_by: str, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
+    """The error for a package that is not installed.
+
+    Args:
+        needed_by: command, class or argument that needs the package.
+        extra: extra of ``pyproject.toml`` that brings the package; None if the package without extras does.
+        error: of the import.
+
+    Raises:
+        ModuleNotFoundError: the missing module is one of ours, so no extra brings it.
+    """
+    package = (error.name or "").partition(".")[0]
+    if package in ("", "service", "streetfix"):
+        raise error
+    return ExtraMissingError(f"{needed_by} needs the package {package!r}: {how_to_install(extra)}", field=needed_by)
 
 
 class UnsupportedPlatformError(StreetfixError):

@@ -17,10 +17,10 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
 from service.imaging.query_view import query_view
 from service.imaging.view_grid import ViewGrid
-from service.localization.encoder import Encoder
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.registration.surfel_map import SurfelMap
+from service.retrieval.encoder import Encoder
 
 GRID = ViewGrid(rows=8, columns=16)
 DESCRIPTOR_SIZE = 16

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import grpc
 import numpy as np
@@ -105,9 +106,16 @@ class Chaos:
     """
 
     def __init__(
-        self, disk: Disk, bundle: Path, pair: Pair, *, seed: int, workers: int, tell: Callable[[str], None],
+        self,
+        disk: Disk,
+        bundle: Path,
+        pair: Pair,
+        *,
+        seed: int,
+        workers: int,
+        tell: Callable[[str], None],
         log: Callable[[str], None] = lambda _: None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._random = Random(seed)  # noqa: S311  # replayable
         self._disk, self._workers, self._tell, self._record = disk, workers, tell, log
         self._shelf = Shelf(disk.folder, bundle, self._random)
@@ -622,7 +630,7 @@ class Chaos:
         except StreetfixError:  # already ended
             return set()
 
-    def _settings(self) -> dict[str, object]:
+    def _settings(self) -> dict[str, Any]:
         return {
             "workers": self._workers, "threads": 1, "watch_s": 0.5, "drain_s": 0.5, "grace_s": 10, "request_timeout_s": 120,
             "api_keys": self._keys_file,

@@ -20,8 +20,9 @@ from benchmarks.runs import Runs
 from model_training.cli.progress import bars
 from model_training.stock import ENCODER
 from service.imaging.view_grid import ViewGrid
-from service.localization.encoder import Encoder
-from service.localization.hypotheses import ClusterSettings, similarity_weights
+from service.retrieval.encoder import Encoder
+from service.retrieval.hypotheses import ClusterSettings
+from service.retrieval.knn import similarity_weights
 
 STEPS = 1000
 KS = (1, 3, 5, 9, 15, 21)

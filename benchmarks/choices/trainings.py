@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from model_training.baselines.learning import one_thread
 from model_training.training.export import export
 from model_training.training.loop import Progress, TrainingConfig, load_run, train
 from model_training.training.packs import make_packs
 from model_training.training.precision import native_precision
 from model_training.training.recipe import stock_plans
+from research.baselines.learning import one_thread
 from service.imaging.view_grid import ViewGrid
 
 CITIES = 26

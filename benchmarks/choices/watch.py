@@ -15,9 +15,9 @@ from model_training.training.recipe import WATCH_SEEDS
 from service.geometry.rigid import heading_of_body
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import PLANES, ViewGrid, survey_planes
-from service.localization.encoder import Encoder
-from service.localization.retrieval import turns_on
 from service.maps.streets import Streets
+from service.retrieval.encoder import Encoder
+from service.retrieval.retrieve import turns_on
 
 REACH_M = 5.0
 

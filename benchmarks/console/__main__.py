@@ -43,7 +43,7 @@ def axe_rows(report: Report, browser: object, url: str) -> None:
     found: list[str] = []
     for size in (DESKTOP, PHONE):
         for dark in (False, True):
-            page = open_page(browser, size=size, dark=dark)  # type: ignore[arg-type]
+            page = open_page(browser, size=size, dark=dark)
             open_console(page, url)
             found += serious(page)
             click_sample(page, "01")

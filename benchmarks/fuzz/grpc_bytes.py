@@ -1,7 +1,8 @@
 """Arbitrary bytes as messages of every gRPC call to a real server; no call may end in UNKNOWN or INTERNAL."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import grpc
 from grpc_reflection.v1alpha import reflection_pb2
@@ -39,7 +40,7 @@ class GrpcCalls:
         self._server = GrpcServer(self._engine, host="127.0.0.1", port=0)
         self._server.start()
         channel = grpc.insecure_channel(f"127.0.0.1:{self._server.port}")
-        self._calls = [channel.stream_stream(method) for method in METHODS]
+        self._calls = [channel.stream_stream(method, bytes, bytes) for method in METHODS]
 
     def take(self, data: bytes) -> None:
         """Send the bytes as the message of a call; a streaming call gets them twice.
@@ -59,7 +60,7 @@ class GrpcCalls:
             raise AssertionError(f"{METHODS[number]} ended in {code}")
 
 
-def _ended(call: Iterator[bytes]) -> grpc.StatusCode:
+def _ended(call: Iterable[bytes]) -> grpc.StatusCode:
     try:
         for _ in call:
             pass
@@ -70,15 +71,15 @@ def _ended(call: Iterator[bytes]) -> grpc.StatusCode:
 
 
 def _seeds() -> Iterator[bytes]:
-    frame = {
-        "rgb": b"1", "depth": b"2", "camera": pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5),
+    frame: dict[str, Any] = {
+        "rgb": b"1", "depth": b"2", "camera": pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5, height_m=0.3),
         "depth_format": pb.DepthFormat(scale_m=0.001, kind=pb.DEPTH_KIND_DISPARITY, baseline_m=0.1, max_range_m=40.0),
         "gravity": pb.Vector3(y=9.8),
     }  # fmt: skip
-    about = {
+    about: dict[str, Any] = {
         "map": "tiny", "options": pb.Options(refine=True, neighbours=5), "vehicle_from_camera": pb.RigidTransform(
-            position=pb.Vector3(z=-1), orientation=pb.Quaternion(w=1)
-        ),
+            position=pb.Vector3(z=1), orientation=pb.Quaternion(w=1)
+        ), "vehicle_base_on_ground": True,
         "prior": pb.Prior(position=pb.PriorPosition(x=1, y=2, std_m=3), heading_deg=10),
     }  # fmt: skip
     request = pb.LocalizeRequest(**frame, **about)

@@ -27,15 +27,17 @@ from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode
 from service.imaging.depth_units import depth_from_values
 from service.imaging.raw16 import write_raw16
 from service.localization.localizer import Localizer
-from service.localization.query import Query
 from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import Manifest, read_manifest
 from service.maps.reader import MapBundle
+from service.retrieval.query import Query
 
 LIMITS = ImageLimits(max_bytes=2**20, max_pixels=2**20)
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
 _DOCUMENT = {
-    "camera": {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [0, 0]},
+    "camera": {
+        "width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "distortion": [0, 0], "height_m": 0.3, "height_std_m": 0.02,
+    },
     "depth": {"scale_m": 0.001, "kind": "disparity", "encoding": "auto", "baseline_m": 0.12, "max_range_m": 40},
     "gravity": {"x": 0, "y": 9.8, "z": 0.1}, "map": "tiny@1", "options": {"neighbours": 5, "refine": True, "false_accept_rate": 0.01},
     "prior": {"position": {"x": 1, "y": 2, "std_m": 3}, "heading_deg": 10, "heading_std_deg": 20},
@@ -70,7 +72,8 @@ def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
     request = json.dumps(_DOCUMENT).encode()
     frame = {key: value for key, value in _DOCUMENT.items() if key in ("camera", "depth", "gravity")}
     T = {"position": {"x": 0, "y": 0, "z": -1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
-    sequence = json.dumps({"frames": [frame, frame | {"T_reference_camera": T}]}).encode()
+    vehicle = {"T_vehicle_camera": T | {"position": {"x": 0, "y": 0, "z": 1.5}}, "vehicle_base_on_ground": True}
+    sequence = json.dumps(vehicle | {"frames": [frame, frame | {"T_reference_camera": T}]}).encode()
     multipart = b"--b\r\n" + b"\r\n--b\r\n".join(
         f'Content-Disposition: form-data; name="{name}"; filename="x"\r\n\r\n'.encode() + data
         for name, data in (("rgb", b"123"), ("depth", b"456"), ("request", b"{}"))
@@ -88,7 +91,7 @@ def targets(bundle: Path, scratch: Path) -> dict[str, Target]:
         "bundle": Target(_bundle_of(bundle, scratch), (b"\x00\x00\x00\x00", b"\x05\x00\x00\x00"), 0.005),
         "pictures": Target(
             _pictures_of(bundle),
-            (struct.pack("<6d", 32, 32, 31.5, 23.5, 9.8, 0.1) + _tiny_query().depth_m.tobytes(),),
+            (struct.pack("<8d", 32, 32, 31.5, 23.5, 9.8, 0.1, 1.5, 0.1) + _tiny_query().depth_m.tobytes(),),
             0.015,
         ),
     }
@@ -130,7 +133,7 @@ def _depth(data: bytes) -> None:
     if not data:
         return
     how, data = data[0], data[1:]
-    kind: DepthKind = ("z", "range", "disparity")[how % 3]  # type: ignore[assignment]  # an index of three
+    kind: DepthKind = ("z", "range", "disparity")[how % 3]
     encoding: DepthEncoding = "carla" if how & 8 else "compressed_depth" if how & 64 else "auto"
     decode_depth(
         data, camera=CAMERA, encoding=encoding, scale_m=0.001 if how & 16 else None, kind=kind, baseline_m=0.1,
@@ -232,16 +235,17 @@ def _agree(own: Path, name: Path, content: bytes) -> None:
 
 
 def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
-    """Localize with arbitrary intrinsics, gravity and depth that pass validation."""
+    """Localize with arbitrary intrinsics, gravity, camera height and depth that pass validation."""
     localizer = Localizer.open(MapBundle.open(bundle))
     good = _tiny_query()
 
     def take(data: bytes) -> None:
-        if len(data) < 56:
+        if len(data) < 72:
             return
-        fx, fy, cx, cy, down, aside = struct.unpack("<6d", data[:48])
+        fx, fy, cx, cy, down, aside, height_m, height_std_m = struct.unpack("<8d", data[:64])
+        height = {"height_m": height_m, "height_std_m": height_std_m} if height_m > 0 else {}  # else it is found
         document = {
-            "camera": {"width": 64, "height": 48, "fx": fx, "fy": fy, "cx": cx, "cy": cy},
+            "camera": {"width": 64, "height": 48, "fx": fx, "fy": fy, "cx": cx, "cy": cy} | height,
             "gravity": {"x": aside, "y": down, "z": 0.0},
         }  # fmt: skip
         try:
@@ -249,11 +253,15 @@ def _pictures_of(bundle: Path) -> Callable[[bytes], None]:
         except ValidationError:
             return
         asked = query_from(request, rgb=b"", depth=b"")
-        raw = np.frombuffer(data[48 : 48 + (len(data) - 48) // 4 * 4], np.float32)
+        raw = np.frombuffer(data[64 : 64 + (len(data) - 64) // 4 * 4], np.float32)
         depth_m = depth_from_values(
             np.resize(raw, (48, 64)), scale_m=1.0, kind="z", camera=asked.camera, baseline_m=None, max_range_m=None
         )
-        localizer.localize(Query(rgb=good.rgb, depth_m=depth_m, camera=asked.camera, down_camera=asked.down_camera))
+        localizer.localize(
+            Query(
+                rgb=good.rgb, depth_m=depth_m, camera=asked.camera, down_camera=asked.down_camera, camera_height=asked.camera_height
+            )
+        )  # fmt: skip
 
     return take
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from benchmarks.docs_blocks import code_blocks_run
 from benchmarks.house.docstrings import all_lacking, code_lines
+from benchmarks.house.installation import distributions_of
 from benchmarks.house.prose import docstrings, pages, prose_of_markdown, reading_ease
 from benchmarks.house.request_path import trace_of_request
 from benchmarks.report import ROOT, Report
@@ -67,7 +68,7 @@ def _reading_rows(report: Report, documents: list[str]) -> None:
 
 
 def _docstring_rows(report: Report) -> None:
-    """Add the share of complete public docstrings, the length of the localizer, and the client's dependencies."""
+    """Add the share of complete public docstrings, the length of the localizer, and what the client alone installs."""
     found, count = all_lacking()
     for each in found:
         print(f"  {each.name}: {each.what}")
@@ -76,6 +77,7 @@ def _docstring_rows(report: Report) -> None:
     report.row("localizer.lines", localizer, "lines", bar=60, better="lower")
     core = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     report.row("wheel.client_dependencies", len(core), "packages", bar=6, better="lower")
+    report.row("wheel.client_distributions", len(distributions_of(core)), "packages")
 
 
 def _request_rows(report: Report) -> None:

@@ -9,7 +9,9 @@ from pathlib import Path
 from benchmarks.report import ROOT
 
 #: Packages that other code may call: the core and the client.
-PACKAGES = ("client", "geometry", "imaging", "localization", "maps", "registration")
+PACKAGES = (
+    *("client", "confidence", "geometry", "imaging", "localization", "maps", "registration", "retrieval", "scoring"),
+)
 _ARRAY = re.compile(r"NDArray|Float\d|Int\d|Bool\[")
 #: A shape such as "(N, 3)" or "(rows, columns)". With jaxtyping, the annotation gives the shape.
 _SHAPE = re.compile(r"\([A-Za-z0-9_ ]+,[A-Za-z0-9_, ]*\)")

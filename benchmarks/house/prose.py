@@ -8,7 +8,7 @@ from pathlib import Path
 from benchmarks.report import ROOT
 
 #: Packages whose docstrings count.
-PACKAGES = ("streetfix", "service", "model_training")
+PACKAGES = ("streetfix", "service", "model_training", "research")
 _FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _LINK = re.compile(r"!?\[([^\]]*)\]\([^)]*\)")

@@ -80,7 +80,7 @@ def trace_of_request(bundle: Path, parts: dict[str, tuple[str, bytes, str]]) -> 
             engine.close()
     finally:
         sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]  # documented to take None
+        threading.setprofile(None)
     return trace
 
 

@@ -108,9 +108,13 @@ def _told(stage: str, done: int, of: int) -> None:
 
 def _when_and_where(dataset: Dataset, bundle: MapBundle) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return positions and times of queries and of places; a place has the time of its scan."""
-    frames = [frame for frame in dataset.queries(QUERIES) if frame.T_map_camera is not None]
-    query_xy = np.array([frame.T_map_camera[:2, 3] for frame in frames])
-    query_s = np.array([frame.stamp_s for frame in frames], np.float64)
+    frames = [
+        (frame.T_map_camera[:2, 3], frame.stamp_s)
+        for frame in dataset.queries(QUERIES)
+        if frame.T_map_camera is not None
+    ]
+    query_xy = np.array([xy for xy, _ in frames])
+    query_s = np.array([stamp_s for _, stamp_s in frames], np.float64)
     stamps, poses = dataset.survey_trajectory()
     place_xy = np.array(bundle.T_map_place[:, :2, 3])
     # The map may have moved the survey's poses by centimetres. The nearest scan is the place's own.

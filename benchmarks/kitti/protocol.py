@@ -8,9 +8,9 @@ from model_training.datasets.dataset import Dataset
 from service.errors import NoDepthError
 from service.geometry.earth import Georeference
 from service.imaging.query_view import query_views
-from service.localization.encoder import Encoder
-from service.localization.retrieval import turns_on
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
+from service.retrieval.retrieve import turns_on
 
 RIGHT_M = 10.0
 #: Time around a query whose scan the published protocol leaves out: half of the period of KITTI's ten scans per second.
@@ -46,10 +46,14 @@ def place_similarities(bundle: MapBundle, dataset: Dataset, query_set: str) -> F
 
 
 def found_within(
-    similarity: Float32[NDArray[np.float32], "Q P"], query_xy: Float64[NDArray[np.float64], "Q 2"],
-    place_xy: Float64[NDArray[np.float64], "P 2"], *, query_s: Float64[NDArray[np.float64], " Q"],
-    place_s: Float64[NDArray[np.float64], " P"], left_out_s: float,
-) -> tuple[Bool[NDArray[np.bool_], " Q"], Bool[NDArray[np.bool_], " Q"]]:  # fmt: skip
+    similarity: Float32[NDArray[np.float32], "Q P"],
+    query_xy: Float64[NDArray[np.float64], "Q 2"],
+    place_xy: Float64[NDArray[np.float64], "P 2"],
+    *,
+    query_s: Float64[NDArray[np.float64], " Q"],
+    place_s: Float64[NDArray[np.float64], " P"],
+    left_out_s: float,
+) -> tuple[Bool[NDArray[np.bool_], " Q"], Bool[NDArray[np.bool_], " Q"]]:
     """Check whether the most similar place is within 10 m; places near in time are excluded.
 
     Args:

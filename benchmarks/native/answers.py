@@ -15,10 +15,10 @@ import numpy as np
 
 from model_training.datasets.dataset import Dataset
 from service.localization.answer import Timings
-from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
-from service.localization.query import Query
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
+from service.retrieval.query import Query
 
 
 def told(value: object) -> Iterator[str]:

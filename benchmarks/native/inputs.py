@@ -10,6 +10,7 @@ import argparse
 import ctypes
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -232,7 +233,7 @@ def _rays(rng: np.random.Generator, cloud: SurfelMap, height: int, width: int) -
     with np.errstate(all="ignore"):
         inverse = np.where((depth := depth_of(rng, height, width)) > 0, 1 / depth, 0).astype(np.float32)
     picture = RayPicture(
-        inverse, camera, T_level_camera, 1e-3, rng.choice([None, 80.0]), rng.random((height, width)) < 0.3
+        inverse, camera, T_level_camera, 1e-3, (None, 80.0)[rng.integers(2)], rng.random((height, width)) < 0.3
     )
     found = Registered(R, cloud.origin_m + t, 1.0, 0.0, 0.9, np.eye(8), 0)
     adjusted = adjust(sights, [picture], found, settings)
@@ -287,14 +288,14 @@ def rounds(seed: int, count: int) -> None:
         cloud = street(rng)
         height, width = SIZES[number % len(SIZES)]
         cases: dict[str, Callable[[], list[NDArray[Any]]]] = {
-            "gather": lambda h=height, w=width: _gather(rng, h, w),
-            "level": lambda h=height, w=width: _level(rng, h, w),
-            "points": lambda h=height, w=width: _points(rng, h, w),
-            "align": lambda c=cloud: _align(rng, c),
-            "render": lambda c=cloud, h=height, w=width: _render(rng, c, h, w),
-            "rays": lambda c=cloud, h=height, w=width: _rays(rng, c, h, w),
-            "codecs": lambda h=height, w=width: _codecs(rng, h, w),
-        }  # fmt: skip
+            "gather": partial(_gather, rng, height, width),
+            "level": partial(_level, rng, height, width),
+            "points": partial(_points, rng, height, width),
+            "align": partial(_align, rng, cloud),
+            "render": partial(_render, rng, cloud, height, width),
+            "rays": partial(_rays, rng, cloud, height, width),
+            "codecs": partial(_codecs, rng, height, width),
+        }
         for name, case in cases.items():
             try:
                 told = digest(case())

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.paper.tables import DRIVES, Figures, title
-from model_training.baselines.paper.knn import KS, PAPER_K
-from model_training.baselines.paper.variants import WHAT
-from model_training.baselines.paper_data.table_one import TEST_IMAGES
 from model_training.evaluation.error_measures import wilson_interval
+from research.baselines.paper.knn import KS, PAPER_K
+from research.baselines.paper.variants import WHAT
+from research.baselines.paper_data.table_one import TEST_IMAGES
 
 
 def claims(results: Mapping[str, MethodResult], figures: Figures) -> list[str]:

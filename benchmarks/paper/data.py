@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from model_training.baselines.paper_data.frames import Frames, make_frames, make_frames_at
-from model_training.baselines.paper_data.pairs import Pairs, make_pairs
-from model_training.baselines.paper_data.plan import SPLITS, TEST_TRAVERSAL, TRAINING_SETS, pairs_plan
-from model_training.baselines.paper_data.table_one import PAPER_FRAMES, PAPER_PAIRS
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.simulation.simulate import simulate
+from research.baselines.paper_data.frames import Frames, make_frames, make_frames_at
+from research.baselines.paper_data.pairs import Pairs, make_pairs
+from research.baselines.paper_data.plan import SPLITS, TEST_TRAVERSAL, TRAINING_SETS, pairs_plan
+from research.baselines.paper_data.table_one import PAPER_FRAMES, PAPER_PAIRS
 from service.geometry.rigid import R_BODY_OPTICAL
 
 LIDAR_ABOVE_CAMERA_M = 0.3

@@ -18,11 +18,11 @@ from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import errors_of
 from benchmarks.paper.table_figures import INK, OURS, THEIRS, clean, table_one, table_three, table_two
 from benchmarks.paper.tables import DRIVES, TITLES, Figures
-from model_training.baselines.learning import CurvePoint
-from model_training.baselines.paper.knn import KS
-from model_training.baselines.paper.pictures import LidarPictures, fused_pictures
-from model_training.baselines.regression.locate import STAGES
 from model_training.datasets.dataset import Dataset, QueryFrame
+from research.baselines.learning import CurvePoint
+from research.baselines.paper.knn import KS
+from research.baselines.paper.pictures import LidarPictures, fused_pictures
+from research.baselines.regression.locate import STAGES
 from service.imaging.fusion import fuse, picture_of
 from service.maps.streets import Streets
 

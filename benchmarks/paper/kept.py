@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.provenance import Run, this_process
-from model_training.baselines.answers import PlaceAnswers
-from model_training.baselines.learning import CurvePoint
+from research.baselines.answers import PlaceAnswers
+from research.baselines.learning import CurvePoint
 
 COMMAND = "make paper"
 SPLITS = ("same_drive", "other_drive")

@@ -11,19 +11,19 @@ import numpy as np
 from benchmarks.paper.data import PaperData, test_set
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.paper.ours import bundle_of, streetfix, streetfix_stock
-from model_training.baselines import dual
-from model_training.baselines.answers import PlaceAnswers
-from model_training.baselines.dual.learn import Kind
-from model_training.baselines.learning import read_curve
-from model_training.baselines.paper.knn import KS, PAPER_K
-from model_training.baselines.paper.variants import PLANS, Asked, Variant, run_variant, street_accuracy
-from model_training.baselines.raw_range import raw_best_views
-from model_training.baselines.regression.locate import STAGES
-from model_training.baselines.regression.run import run as run_regression
-from model_training.baselines.scan_context import locate
 from model_training.cli.progress import bars
 from model_training.evaluation.error_measures import distance_errors
+from model_training.evaluation.raw_range import raw_best_views
 from model_training.stock import ENCODER
+from research.baselines import dual
+from research.baselines.answers import PlaceAnswers
+from research.baselines.dual.learn import Kind
+from research.baselines.learning import read_curve
+from research.baselines.paper.knn import KS, PAPER_K
+from research.baselines.paper.variants import PLANS, Asked, Variant, run_variant, street_accuracy
+from research.baselines.regression.locate import STAGES
+from research.baselines.regression.run import run as run_regression
+from research.baselines.scan_context import locate
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,14 @@ not.
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.paper.data import PaperData, Size, test_set
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.runs import MAPPING, code_hash
-from model_training.baselines.answers import PlaceAnswers
-from model_training.baselines.learning import CURVE, CurvePoint, one_thread, read_curve, write_curve
 from model_training.cli.progress import bars
 from model_training.evaluation.predict import predict
 from model_training.mapping.build import BuildSettings, build_map
@@ -26,10 +26,12 @@ from model_training.training.export import export
 from model_training.training.loop import Progress, TrainingConfig, load_run, train
 from model_training.training.packs import rows_seen_by
 from model_training.training.precision import native_precision
+from research.baselines.answers import PlaceAnswers
+from research.baselines.learning import CURVE, CurvePoint, one_thread, read_curve, write_curve
 from service.imaging.view_grid import ViewGrid
-from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
 
 PAPER_IMAGES_SHARE = 4 * 0.7  # four epochs over 70 % of the frames
 #: Half the stock encoder's columns, and narrower. One city needs less capacity, and a smaller network sees more images
@@ -103,7 +105,7 @@ def pack_of(data: PaperData, shape: EncoderShape) -> Path:
     frames, pairs = data.frames, data.pairs
     every = ViewGrid().columns // shape.columns
     part.mkdir(parents=True, exist_ok=True)
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "panoramas": frames.panoramas[..., ::every], "intensities": frames.intensities[..., ::every], "places": frames.places,
         "rows_seen": rows_seen_by(frames.panoramas), "ranges": pairs.ranges[..., ::every], "rgb": pairs.colours[:, :, ::every],
         "queries": pairs.views,

@@ -20,15 +20,15 @@ from benchmarks.paper.data import PaperData, Size
 from benchmarks.paper.kept import COMMAND
 from benchmarks.paper.ours import config_as_paper, pack_of, seconds_a_step
 from benchmarks.provenance import Run, this_process
-from model_training.baselines.dual import learn
-from model_training.baselines.dual.pictures import Sweeps, pictures_of
-from model_training.baselines.gallery import thinned
-from model_training.baselines.learning import one_thread
-from model_training.baselines.paper.train import CnnTrainer
-from model_training.baselines.paper.variants import PLANS
-from model_training.baselines.regression.pictures import MapFrame
-from model_training.baselines.regression.train_pose import PoseLearner, PoseSettings
 from model_training.training.encoder_net import EncoderShape
+from research.baselines.dual import learn
+from research.baselines.dual.pictures import Sweeps, pictures_of
+from research.baselines.gallery import thinned
+from research.baselines.learning import one_thread
+from research.baselines.paper.train import CnnTrainer
+from research.baselines.paper.variants import PLANS
+from research.baselines.regression.pictures import MapFrame
+from research.baselines.regression.train_pose import PoseLearner, PoseSettings
 from service.imaging.view_grid import ViewGrid
 
 #: Number of rounds, and the least processor time of each method in a round, seconds.

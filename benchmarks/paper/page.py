@@ -11,9 +11,9 @@ from benchmarks.paper.ours import MOST_STEPS, SHAPE
 from benchmarks.paper.pace import Pace
 from benchmarks.paper.tables import Figures, table_one, table_three, table_two
 from benchmarks.report import head_commit
-from model_training.baselines.paper.cnn import layer_table
-from model_training.baselines.paper.train import PATIENCE, CnnPlan
-from model_training.baselines.regression.train_pose import PoseSettings
+from research.baselines.paper.cnn import layer_table
+from research.baselines.paper.train import PATIENCE, CnnPlan
+from research.baselines.regression.train_pose import PoseSettings
 
 #: Rows of the report.
 Rows = Sequence[Mapping[str, Any]]

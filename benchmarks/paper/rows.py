@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.paper.pace import Pace
 from benchmarks.report import Report
-from model_training.baselines.answers import PlaceAnswers
-from model_training.baselines.paper.knn import PAPER_K
-from model_training.baselines.paper_data.pairs import Pairs
-from model_training.baselines.regression.locate import STAGES
 from model_training.evaluation.error_measures import (
     distance_errors,
     mean_error_distance,
     mean_squared_error,
     wilson_interval,
 )
+from research.baselines.answers import PlaceAnswers
+from research.baselines.paper.knn import PAPER_K
+from research.baselines.paper_data.pairs import Pairs
+from research.baselines.regression.locate import STAGES
 
 #: Number of images that the paper's 84 iterations show: four times 70 % of its frames.
 PAPER_IMAGES = round(4 * 0.7 * 46_741)
@@ -154,8 +154,13 @@ def _rows_of_other_pictures(report: Report, variant: str, result: MethodResult) 
 
 
 def _rows_of(
-    report: Report, method: str, split: str, result: MethodResult, found: Mapping[str, Mapping[str, Mapping[str, float]]], n: int
-) -> None:  # fmt: skip
+    report: Report,
+    method: str,
+    split: str,
+    result: MethodResult,
+    found: Mapping[str, Mapping[str, Mapping[str, float]]],
+    n: int,
+) -> None:
     own = found[method][split]
     others = [found[name][split] for name in found if not name.startswith("streetfix")]
     row = f"paper.{method}.{split}"

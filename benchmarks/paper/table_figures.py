@@ -12,7 +12,7 @@ from benchmarks.paper.kept import MethodResult
 from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import errors_of, minutes_for_paper_images
 from benchmarks.paper.tables import PAPER_ACCURACY, PAPER_MED_M, TABLE_II, TITLES, Figures
-from model_training.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PRINTED, TEST_IMAGES
+from research.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PRINTED, TEST_IMAGES
 
 INK, OURS, THEIRS, PRINTED = "#22303c", "#2a7f62", "#b5532a", "#9aa5ad"
 BASELINE_M, PAPER_MIN = 30.3, 138.0  # as Table III prints

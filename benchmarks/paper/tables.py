@@ -8,8 +8,8 @@ from benchmarks.paper.data import PaperData
 from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.paper.pace import Pace
 from benchmarks.paper.rows import errors_of, minutes_for_paper_images
-from model_training.baselines.paper.variants import WHAT
-from model_training.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PRINTED, PAPER_FRAMES, TEST_IMAGES
+from research.baselines.paper.variants import WHAT
+from research.baselines.paper_data.table_one import CLASS_NAMES, FRAMES_PRINTED, PAPER_FRAMES, TEST_IMAGES
 
 #: Table II as printed: the class, and the value that the paper calls MSE.
 TABLE_II = (("Beginning of street 1", 0.09224), ("Beginning of street 9", 0.0326), ("End of street 5", 0.0598),

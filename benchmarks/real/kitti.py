@@ -46,9 +46,9 @@ def drive_rows(report: Report, data: Path, work: Path) -> None:
     errors = {
         name: _both_halves(source, poses, work / f"kitti_drive_{name}", reference) for name, poses in away.items()
     }
-    for name, found in errors.items():
-        report.share(f"kitti_drive.{name}_poses.within_1_m", found <= 1.0)
-        report.row(f"kitti_drive.{name}_poses.median_m", float(np.median(found)), "m", n=len(found))
+    for name, error_m in errors.items():
+        report.share(f"kitti_drive.{name}_poses.within_1_m", error_m <= 1.0)
+        report.row(f"kitti_drive.{name}_poses.median_m", float(np.median(error_m)), "m", n=len(error_m))
     both = np.concatenate(list(errors.values()))
     report.share("kitti_drive.within_1_m", both <= 1.0, bar=1.0)
     report.row("kitti_drive.median_m", float(np.median(both)), "m", bar=0.12, better="lower", n=len(both), why=IN_SIGHT)

@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Report
-from model_training.baselines.cloud_registration import (
+from model_training.datasets.dataset import Dataset, QueryFrame
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.measures import RIGHT_M
+from model_training.evaluation.predict import predict
+from model_training.evaluation.raw_range import SETTINGS, raw_best_views
+from research.baselines.cloud_registration import (
     FpfhMap,
     GicpMap,
     by_kiss_matcher,
     points_of_depth,
     thinned_to_voxels,
 )
-from model_training.baselines.raw_range import SETTINGS, raw_best_views
-from model_training.baselines.scan_context import ContextSettings, context_of, context_of_depth, similarities
-from model_training.datasets.dataset import Dataset, QueryFrame
-from model_training.evaluation.failures import position_errors
-from model_training.evaluation.measures import RIGHT_M
-from model_training.evaluation.predict import predict
+from research.baselines.scan_context import ContextSettings, context_of, context_of_depth, similarities
 from service.errors import ExtraMissingError
 from service.geometry.rigid import Transform
 from service.localization.localizer import Localizer

@@ -78,9 +78,13 @@ def answer_rows(report: Report, row: str, found: Predictions) -> None:
 
 
 def status_rows(
-    report: Report, row: str, errors_m: NDArray[np.float64], localized: NDArray[np.bool_], *,
+    report: Report,
+    row: str,
+    errors_m: NDArray[np.float64],
+    localized: NDArray[np.bool_],
+    *,
     bars: tuple[float | None, float | None, float | None],
-) -> None:  # fmt: skip
+) -> None:
     """Shares of all queries with the status applied, and forced.
 
     Args:

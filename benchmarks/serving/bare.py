@@ -22,10 +22,10 @@ from service.imaging.decode import decode_depth, decode_rgb  # noqa: E402
 from service.imaging.depth_formats import read_depth_values  # noqa: E402
 from service.imaging.picture_headers import DEFAULT_LIMITS  # noqa: E402
 from service.imaging.raw16 import write_raw16  # noqa: E402
-from service.localization.encoder import Encoder  # noqa: E402
 from service.localization.localizer import Localizer  # noqa: E402
-from service.localization.query import Query  # noqa: E402
 from service.maps.reader import MapBundle  # noqa: E402
+from service.retrieval.encoder import Encoder  # noqa: E402
+from service.retrieval.query import Query  # noqa: E402
 
 
 def main() -> None:

@@ -76,7 +76,7 @@ def _depth_ways(stored: Data, camera: PinholeCamera) -> dict[str, tuple[Data, Ca
 
 def _colour_ways(stored: Data, camera: PinholeCamera) -> dict[str, tuple[Data, Callable[[bytes], object]]]:
     larger = camera.scaled_to(_TWICE * camera.width, _TWICE * camera.height)
-    pictures = [cv2.imdecode(np.frombuffer(each, np.uint8), cv2.IMREAD_COLOR) for each in stored]
+    pictures = [_colour(each) for each in stored]
     twice = [cv2.resize(each, (larger.width, larger.height), interpolation=cv2.INTER_CUBIC) for each in pictures]
     finest = finest_rad(ViewGrid())
     return {
@@ -90,5 +90,12 @@ def _colour_ways(stored: Data, camera: PinholeCamera) -> dict[str, tuple[Data, C
     }
 
 
-def _encoded(suffix: str, picture: np.ndarray) -> bytes:  # type: ignore[type-arg]  # OpenCV's own
+def _colour(data: bytes) -> np.ndarray:
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise ValueError("a colour image of the dataset is damaged; make the dataset again")
+    return picture
+
+
+def _encoded(suffix: str, picture: np.ndarray) -> bytes:
     return cv2.imencode(suffix, picture)[1].tobytes()

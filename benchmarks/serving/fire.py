@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import httpx
 import numpy as np
@@ -37,7 +38,7 @@ def overload_rows(report: Report, site: Site, *, seconds: float, rounds: int, co
         core: core of the server; None for all.
     """
     sent = site.payloads(refine=True)
-    threads = {} if core is None else {"threads": 1}
+    threads: dict[str, Any] = {} if core is None else {"threads": 1}
     peaks, founds, health_ms = [], [], []
     with Server(site.bundle, core=core, **threads) as server:
         for _ in range(rounds):  # each round has its own peak: a machine's speed drifts

@@ -22,7 +22,12 @@ def load(server: Server | Host, face: str, sent: list[Payload], how: Load) -> tu
         face: ``rest`` or ``grpc``; a peer has ``rest`` only.
         sent: requests, sent in turn.
         how: amount of load.
+
+    Raises:
+        ValueError: gRPC is asked of a peer.
     """
+    if face != "rest" and isinstance(server, Host):
+        raise ValueError(f"face: {face!r} is not of a peer; use 'rest'")
     before: Usage | None = None
     after: Usage | None = None
 
@@ -33,7 +38,9 @@ def load(server: Server | Host, face: str, sent: list[Payload], how: Load) -> tu
             before = after if before is None else before
 
     async def run() -> list[Shot]:
-        target: Target = Rest(server.url, key=None) if face == "rest" else Grpc(server.grpc, key=None)
+        target: Target = Rest(server.url, key=None)
+        if face != "rest" and isinstance(server, Server):
+            target = Grpc(server.grpc, key=None)
         async with target:
             return await drive(target, sent, how, tick)
 

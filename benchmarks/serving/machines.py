@@ -86,9 +86,14 @@ class Server:
     """
 
     def __init__(
-        self, maps: Path, *, core: int | None = SERVED_CORE, trusted: ssl.SSLContext | None = None,
-        log: Callable[[str], None] | None = None, **launching: Any,
-    ) -> None:  # fmt: skip
+        self,
+        maps: Path,
+        *,
+        core: int | None = SERVED_CORE,
+        trusted: ssl.SSLContext | None = None,
+        log: Callable[[str], None] | None = None,
+        **launching: Any,
+    ) -> None:
         began = time.perf_counter()
         self.process = launch(maps, stderr=None if log is None else subprocess.PIPE, **launching)
         pin(self.process.pid, core)

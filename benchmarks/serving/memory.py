@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
 from urllib.parse import urlsplit
 
 import cv2
@@ -53,7 +54,7 @@ def memory_rows(report: Report, site: Site) -> None:
     with Limited(LIMIT_MIB) as limited:
         # Without a control group the service sees the machine's memory, so it gets the value that the limit would have
         # left.
-        told: dict[str, int] = {} if limited.enter else {"request_memory_mib": LIMIT_MIB // 2}
+        told: dict[str, Any] = {} if limited.enter else {"request_memory_mib": LIMIT_MIB // 2}
         told["limits__max_message_bytes"] = LARGE_BYTES  # with the default, gRPC refuses such messages by their length
         with Server(site.bundle, core=None, enter=limited.enter, **told) as server:
             limited.watch(server.process.pid)

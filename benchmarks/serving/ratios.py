@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 from benchmarks.report import Report
 from benchmarks.serving.loads import closed, load, opened
@@ -62,7 +63,7 @@ def ratio_rows(report: Report, site: Site, *, seconds: float, rounds: int, core:
     Raises:
         RuntimeError: some requests failed.
     """
-    threads = {} if core is None else {"threads": 1}
+    threads: dict[str, Any] = {} if core is None else {"threads": 1}
     cpu: dict[tuple[str, str], list[float]] = {}
     rate: dict[tuple[str, str], list[float]] = {}
     with (
@@ -131,7 +132,7 @@ def tail_rows(report: Report, site: Site, *, seconds: float, rounds: int, core: 
         core: core of the server; None for all.
     """
     sent = site.payloads(refine=False)
-    threads = {} if core is None else {"threads": 1}
+    threads: dict[str, Any] = {} if core is None else {"threads": 1}
     middle, spread = [], []
     with Server(site.bundle, core=core, **threads) as server:
         for _ in range(rounds):

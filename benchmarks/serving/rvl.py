@@ -50,9 +50,11 @@ def _packed(numbers: NDArray[np.int64]) -> bytes:
     nibbles |= np.where(place < lengths[which] - 1, _MORE, 0)
     padded = np.r_[nibbles, np.zeros(-len(nibbles) % _NIBBLES, np.int64)].reshape(-1, _NIBBLES)
     words = (padded << (4 * np.arange(_NIBBLES)[::-1])).sum(axis=1)
-    return words.astype("<u4").tobytes()
+    data: bytes = words.astype("<u4").tobytes()
+    return data
 
 
 def _bits(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number of bits of every number, 0 for 0."""
-    return np.ceil(np.log2(numbers + 1.0)).astype(np.int64)
+    bits: NDArray[np.int64] = np.ceil(np.log2(numbers + 1.0)).astype(np.int64)
+    return bits

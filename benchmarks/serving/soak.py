@@ -224,7 +224,7 @@ class Traffic:
                 async with asyncio.timeout(_TIMEOUT_S):
                     await call.write(message)
                     response = await call.read()
-                if response == grpc.aio.EOF:
+                if not isinstance(response, pb.LocalizeStreamResponse):  # EOF
                     self.tally.fail("stream", f"ended by the service: {await call.code()} {await call.details()}")
                     return False
                 if response.outcome.HasField("problem"):
@@ -375,7 +375,9 @@ async def _soak(report: Report, site: Site, *, minutes: float, rate: float | Non
     threads = {} if core is None else {"threads": 1}
     with guard() as guarded:
         async with Collector() as collector:
-            settings = guarded.settings | threads | {"traces_endpoint": collector.endpoint, "traces_share": 1}
+            settings: dict[str, Any] = (
+                guarded.settings | threads | {"traces_endpoint": collector.endpoint, "traces_share": 1}
+            )
             server = await asyncio.to_thread(
                 lambda: Server(site.bundle, core=core, trusted=guarded.trusted, **settings)
             )
@@ -388,9 +390,16 @@ async def _soak(report: Report, site: Site, *, minutes: float, rate: float | Non
 
 
 async def _drive(
-    report: Report, site: Site, server: Server, guarded: Guard, collector: Collector, stop: asyncio.Event, *,
-    minutes: float, rate: float | None,
-) -> None:  # fmt: skip
+    report: Report,
+    site: Site,
+    server: Server,
+    guarded: Guard,
+    collector: Collector,
+    stop: asyncio.Event,
+    *,
+    minutes: float,
+    rate: float | None,
+) -> None:
     traffic = Traffic(server, guarded, site)
     async with traffic.open():
         capacity = None if rate is not None else await _capacity(traffic, stop)
@@ -435,9 +444,14 @@ async def _drive(
 
 
 async def _send(
-    traffic: Traffic, rate: float, until: float, stop: asyncio.Event, running: set[asyncio.Task[None]], server: Server,
+    traffic: Traffic,
+    rate: float,
+    until: float,
+    stop: asyncio.Event,
+    running: set[asyncio.Task[None]],
+    server: Server,
     beside: Sequence[asyncio.Task[None]],
-) -> None:  # fmt: skip
+) -> None:
     """Send requests that arrive at random and wait for no answer, until the time is over, a signal comes or the service ends."""
     random, kinds = np.random.default_rng(0), list(_MIX)
     weights = np.array([_MIX[kind][0] for kind in kinds], float)

@@ -13,11 +13,11 @@ from model_training.calibration.rigs import Rig
 from model_training.calibration.strangers import KINDS, strangers
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.predict import Predictions, predict
+from service.confidence.features import FEATURES
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
-from service.localization.query import Query
-from service.maps.calibration import FEATURES
+from service.retrieval.query import Query
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
@@ -62,8 +62,12 @@ def of_another_city(
 
 
 def where_streets_are_missing(
-    localizer: Localizer, dataset: Dataset, names: list[str], is_outside: Callable[[np.ndarray], np.ndarray], report: Report
-) -> list[Asked]:  # fmt: skip
+    localizer: Localizer,
+    dataset: Dataset,
+    names: list[str],
+    is_outside: Callable[[np.ndarray], np.ndarray],
+    report: Report,
+) -> list[Asked]:
     """Localize query sets in a map of their city without some streets.
 
     Args:

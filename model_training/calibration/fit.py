@@ -5,18 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.confidence.features import FEATURES, RIVALRY, UNWEIGHED
 from service.errors import DatasetError
-from service.maps.calibration import (
-    FEATURES,
-    RIVALRY,
-    UNWEIGHED,
-    Calibration,
-    Logistic,
-    Threshold,
-    expanded,
-    probability,
-    terms,
-)
+from service.maps.calibration import Calibration, Logistic, Threshold, expanded, probability, terms
 
 #: Largest distance of a right answer, metres on the ground.
 RIGHT_M = 1.0
@@ -89,9 +80,15 @@ def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RID
 
 
 def _logistic(
-    evidence: NDArray[np.float64], label: NDArray[np.bool_], weight: NDArray[np.float64], mean: NDArray[np.float64],
-    spread: NDArray[np.float64], ridge: float, *, without: tuple[str, ...],
-) -> Logistic:  # fmt: skip
+    evidence: NDArray[np.float64],
+    label: NDArray[np.bool_],
+    weight: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    ridge: float,
+    *,
+    without: tuple[str, ...],
+) -> Logistic:
     wide = expanded(evidence, tuple(mean), tuple(spread))
     silent = [any(FEATURES[k] in without for k in term) for term in terms(len(FEATURES))]
     wide[:, silent] = 0.0

@@ -24,10 +24,10 @@ from model_training.datasets.files import read_arrays
 from model_training.datasets.without_streets import WithoutStreets
 from model_training.mapping.build import BuildSettings, build_map
 from model_training.simulation.simulate import simulate
-from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
 
 #: The query sets of the clear day.
 CLEAR_SETS = ("clear_precise", "clear_stereo")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from service.localization.query import Query
+from service.retrieval.query import Query
 
 #: Focal length times baseline of the simulated depth presets (``DepthModel``), pixels times metres.
 FOCAL_BASELINE_PX_M = 80.0

@@ -14,7 +14,7 @@ from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import DEPTHS, measured_depth
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import rotation_x, rotation_z
-from service.localization.query import Query
+from service.retrieval.query import Query
 
 #: Distance that counts as infinite, metres.
 _FAR = 80.0

@@ -114,7 +114,7 @@ def print_answers(outcomes: list[Outcome], console: Console, *, places: tuple[st
 
 def print_next(
     outcomes: list[Outcome], bundle: Path, samples: Path, url: str, console: Console, *, goes_on: bool
-) -> None:  # fmt: skip
+) -> None:
     """Print the user's next commands.
 
     Args:

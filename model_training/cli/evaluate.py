@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from model_training.baselines.raw_range import raw_best_views
 from model_training.cli.progress import bars
 from model_training.cli.queries_table import print_queries
 from model_training.cli.stages_table import print_stages
@@ -18,10 +17,10 @@ from model_training.datasets.dataset import Dataset, require_map_first
 from model_training.evaluation.evaluate import evaluate, write_trajectory
 from model_training.evaluation.measures import recall_at
 from model_training.evaluation.predict import Predictions
+from model_training.evaluation.raw_range import raw_best_views
 from model_training.evaluation.saved_run import save_run
 from model_training.evaluation.stages import stages_of
 from model_training.evaluation.why_refused import FEW, causes
-from model_training.reporting.run_page import write_run_page
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
@@ -93,6 +92,9 @@ def command(
       streetfix evaluate maps/paper-city data/paper --queries drive1_precise --json result.json
       streetfix evaluate maps/paper-city data/paper --report reports/paper
     """
+    if report_folder is not None:
+        # Only a report needs matplotlib, and its import takes longer than that of all others. It must not fail after the run.
+        from model_training.reporting.run_page import write_run_page
     require_map_first(bundle, dataset, "evaluate")
     opened, data = MapBundle.open(bundle), Dataset(dataset)
     names = queries or data.query_sets(with_truth=True)
@@ -137,8 +139,11 @@ def command(
 
 
 def _add_raw(
-    figures: dict[str, Any], bundle: MapBundle, places: dict[str, NDArray[np.int64]], predictions: dict[str, Predictions]
-) -> None:  # fmt: skip
+    figures: dict[str, Any],
+    bundle: MapBundle,
+    places: dict[str, NDArray[np.int64]],
+    predictions: dict[str, Predictions],
+) -> None:
     """Add the raw range image's R@1 over all queries and of each set, each at its own best setting, which is named.
 
     ``places`` holds each query's first place by every setting, the sets one after the other; -1 for none.

@@ -70,9 +70,7 @@ def command(
         typer.Option(help="Process of a service on this machine. The command then counts its processor time."),
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="JSON file for all figures.")] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Plot of latency against rate, PNG or SVG. It needs matplotlib.")
-    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot of latency against rate, PNG or SVG.")] = None,
 ) -> None:
     """Load a running service with the queries of a dataset.
 
@@ -111,8 +109,15 @@ def command(
 
 
 def _tls_of(
-    url: str, address: str | None, *, ca: Path | None, cert: Path | None, key: Path | None, tls: bool | None, api_key: str | None
-) -> ClientTls | None:  # fmt: skip
+    url: str,
+    address: str | None,
+    *,
+    ca: Path | None,
+    cert: Path | None,
+    key: Path | None,
+    tls: bool | None,
+    api_key: str | None,
+) -> ClientTls | None:
     """What to speak; None: no TLS. A handshake that fails is told before the load, not as so many failed requests.
 
     Raises:

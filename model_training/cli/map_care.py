@@ -66,9 +66,11 @@ def verify(bundle: _Bundle) -> None:
 
 @app.command()
 def diff(
-    before: _Bundle, after: _Bundle, as_json: _Json = False,
+    before: _Bundle,
+    after: _Bundle,
+    as_json: _Json = False,
     picture: Annotated[Path | None, typer.Option(help="PNG file for a view of both clouds from above.")] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Show the changes from one map bundle to another.
 
     The command compares places, cloud by area, streets, parameters and encoder.
@@ -95,12 +97,14 @@ def diff(
 
 @app.command()
 def merge(
-    first: _Bundle, second: _Bundle, out: _Out,
+    first: _Bundle,
+    second: _Bundle,
+    out: _Out,
     name: Annotated[
         str | None, typer.Option(help="Name of the map in requests.  [default: the name of the first]")
     ] = None,
     overwrite: _Overwrite = False,
-) -> None:  # fmt: skip
+) -> None:
     """Merge two map bundles into one.
 
     Both have the same frame, encoder and parameters.
@@ -132,7 +136,7 @@ def update(
         ),
     ] = False,
     overwrite: _Overwrite = False,
-) -> None:  # fmt: skip
+) -> None:
     """Add a survey to a map, or replace a rebuilt part.
 
     The command uses the map's own encoder and settings.

@@ -16,7 +16,7 @@ from model_training.training.packs import make_packs
 from model_training.training.quantise import Views, quantise
 from model_training.training.recipe import stock_plans
 from service.imaging.view_grid import ViewGrid
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 RANGES, CHECKS = 8, 4  # batches
 

@@ -6,23 +6,38 @@ Frames are read one at a time. No function loads a whole traversal.
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from model_training.datasets.files import ROW_BYTES, read_bytes, read_rows, reading, size_of
 from service.errors import DatasetError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import quaternion_xyzw_from, rotation_from_quaternion_xyzw, transform_from
 from service.imaging.decode import ImageLimits, decode_depth, decode_rgb
+from service.imaging.level import GivenHeight
 from service.imaging.view_grid import ViewGrid
-from service.localization.decoding import DepthFormat, decoded_query
-from service.localization.query import Query
 from service.maps import manifest
+from service.option_limits import (
+    HEIGHT_STD_M,
+    LEAST_HEIGHT_M,
+    LEAST_HEIGHT_STD_M,
+    MOST_HEIGHT_M,
+    MOST_HEIGHT_STD_M,
+)
+from service.retrieval.query import DepthFormat, Query, decoded_query
 
 #: Version of the folder's format.
 FORMAT = 1
@@ -85,6 +100,8 @@ class CameraSensor(_Model):
         cy: row of the principal point, pixels.
         depth: format of its depth images.
         T_vehicle_sensor: pose (4, 4) in the vehicle frame, metres; None: unknown.
+        height_m: height above the ground, metres; None: the localizer finds it in each depth image.
+        height_std_m: standard deviation of ``height_m``, metres; None: the default of a request.
     """
 
     name: str
@@ -96,6 +113,26 @@ class CameraSensor(_Model):
     cy: float
     depth: DepthSpec = DepthSpec()
     T_vehicle_sensor: list[list[float]] | None = None
+    height_m: float | None = Field(None, ge=LEAST_HEIGHT_M, le=MOST_HEIGHT_M)
+    height_std_m: float | None = Field(None, ge=LEAST_HEIGHT_STD_M, le=MOST_HEIGHT_STD_M)
+
+    @model_validator(mode="after")
+    def _deviation_of_a_height(self) -> Self:
+        if self.height_m is None and self.height_std_m is not None:
+            raise ValueError(f"camera {self.name!r} has height_std_m, but no height_m; give both, or none")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unknown_height(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave an unknown height out, so that a release that does not know the fields can read the dataset."""
+        content: dict[str, Any] = serialize(self)
+        return {name: value for name, value in content.items() if value is not None or not name.startswith("height_")}
+
+    def given_height(self) -> GivenHeight | None:
+        """Return the height above the ground with its standard deviation; None if it is unknown."""
+        if self.height_m is None:
+            return None
+        return GivenHeight(self.height_m, HEIGHT_STD_M if self.height_std_m is None else self.height_std_m)
 
     def pinhole(self) -> PinholeCamera:
         """Return the intrinsics."""
@@ -194,12 +231,15 @@ class QueryFrame:
         )
         rgb, depth = read_bytes(self.rgb_path), read_bytes(self.depth_path)
         with _decoding(self.rgb_path, self.depth_path):
-            return decoded_query(rgb, depth, self.camera.pinhole(), how, grid=grid)
+            query = decoded_query(rgb, depth, self.camera.pinhole(), how, grid=grid)
+        return replace(query, camera_height=self.camera.given_height())
 
     def request(self) -> dict[str, Any]:
         """Return the camera and depth parts of a request to the service, as ``streetfix localize --camera`` takes them."""
         return {
-            "camera": self.camera.model_dump(include={"width", "height", "fx", "fy", "cx", "cy"}),
+            "camera": self.camera.model_dump(
+                include={"width", "height", "fx", "fy", "cx", "cy", "height_m", "height_std_m"}
+            ),
             "depth": self.camera.depth.model_dump(exclude_none=True),
         }
 

@@ -7,7 +7,7 @@ import numpy as np
 from model_training.datasets.dataset import QueryFrame
 from service.geometry.rigid import Transform, inverse, rotation_z, transform_from
 from service.imaging.view_grid import ViewGrid
-from service.localization.query import Query
+from service.retrieval.query import Query
 
 #: Standard deviations of the odometry's error from frame to frame: translation as a share of the travelled distance, and yaw.
 _WAY, _TURN_RAD = 0.01, float(np.deg2rad(0.2))

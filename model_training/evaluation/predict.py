@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.evaluation.odometry import as_query
+from service.confidence.features import FEATURES
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import Transform, heading_of_camera
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
-from service.localization.prior import Prior
-from service.localization.query import Query
-from service.maps.calibration import FEATURES
+from service.retrieval.prior import Prior
+from service.retrieval.query import Query
 
 #: Number of distinct places that are stored per answer.
 RANKED = 10
@@ -141,9 +141,17 @@ def joined(parts: list[Predictions]) -> Predictions:
 
 
 def predict(
-    localizer: Localizer, dataset: Dataset, name: str, *, refine: bool = True, workers: int = 2, frames_each: int = 1,
-    prior_of: PriorOf | None = None, seen_by: SeenBy | None = None, report: Report = lambda *_: None,
-) -> Predictions:  # fmt: skip
+    localizer: Localizer,
+    dataset: Dataset,
+    name: str,
+    *,
+    refine: bool = True,
+    workers: int = 2,
+    frames_each: int = 1,
+    prior_of: PriorOf | None = None,
+    seen_by: SeenBy | None = None,
+    report: Report = lambda *_: None,
+) -> Predictions:
     """Localize every query of a set with ground truth.
 
     Args:
@@ -192,9 +200,14 @@ def _in_order(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Iterable[
 
 
 def _ask(
-    localizer: Localizer, frames: list[QueryFrame], number: int, *, refine: bool, prior_of: PriorOf | None,
+    localizer: Localizer,
+    frames: list[QueryFrame],
+    number: int,
+    *,
+    refine: bool,
+    prior_of: PriorOf | None,
     seen_by: SeenBy | None,
-) -> tuple[Answer | None, float]:  # fmt: skip
+) -> tuple[Answer | None, float]:
     began = time.perf_counter()
     queries, poses = as_query(
         frames, np.random.default_rng([77, number]), grid=localizer.bundle.grid, ranked=RANKED, refine=refine

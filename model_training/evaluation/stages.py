@@ -16,16 +16,16 @@ from model_training.evaluation.measures import RIGHT_M, RIGHT_PLACE_M
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import Rotation, Transform, heading_of_camera, transform_from, wrap_angle
 from service.localization.answer import Answer
-from service.localization.frames import Frame
 from service.localization.localizer import Localizer
 from service.localization.refine import settings_for_rig
-from service.localization.retrieval import RANKED
-from service.localization.search import distinct_places
-from service.localization.starts import starts_from
 from service.registration.kernel import STATE, QueryPoints
 from service.registration.points import blocks_of, points_from
 from service.registration.register import RegistrationSettings, Start, register, registered_of, score
 from service.registration.surfel_map import SurfelMap
+from service.retrieval.frame import Frame
+from service.retrieval.knn import distinct_places
+from service.retrieval.retrieve import RANKED
+from service.retrieval.starts import starts_from
 
 #: Largest error of a right level. Registration starts from it and corrects about this much.
 TILT_DEG, HEIGHT_M = 3.0, 0.5

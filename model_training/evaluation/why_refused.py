@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from model_training.datasets.dataset import QueryFrame
 from model_training.evaluation.predict import Predictions
+from service.confidence.features import FEATURES
+from service.confidence.reasons import FOCAL_FACTORS, GAIN, reasons_of, support_of
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
-from service.localization.query import Query
-from service.localization.reasons import FOCAL_FACTORS, GAIN, reasons_of, support_of
-from service.maps.calibration import FEATURES, Calibration
+from service.maps.calibration import Calibration
+from service.retrieval.query import Query
 
 #: A map accepts almost no answer if it accepts less than this share of the queries.
 FEW = 0.25

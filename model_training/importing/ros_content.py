@@ -169,8 +169,14 @@ def _poses_by_tf(
 
 
 def _camera(
-    bag: BagReader, topics: Topics, settings: BagSettings, tree: FrameTree, vehicle: str, scan_frame: str, T_vehicle_lidar: Transform
-) -> BagCamera | None:  # fmt: skip
+    bag: BagReader,
+    topics: Topics,
+    settings: BagSettings,
+    tree: FrameTree,
+    vehicle: str,
+    scan_frame: str,
+    T_vehicle_lidar: Transform,
+) -> BagCamera | None:
     """The camera of the colour topic, if there is one."""
     if topics.color is None:
         return None

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from model_training.loadtest.summary import Summary
-from service.errors import ExtraMissingError
 
 
 def draw(found: list[Summary], path: Path) -> None:
@@ -12,14 +13,7 @@ def draw(found: list[Summary], path: Path) -> None:
     Args:
         found: results, one per run.
         path: file to write.
-
-    Raises:
-        ExtraMissingError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ExtraMissingError("--plot needs matplotlib: pip install matplotlib") from error
     runs = sorted(found, key=lambda each: each.offered_per_s)
     figure = Figure(figsize=(7, 5), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))

@@ -36,11 +36,11 @@ from model_training.mapping.voxel_map import VoxelMap, lattice_origin
 from model_training.mapping.work import Arrays, Work, key_of, work_beside
 from service.errors import BundleError, DatasetError
 from service.imaging.view_grid import ViewGrid
-from service.localization.encoder import Encoder
 from service.maps.calibration import Calibration, Site
 from service.maps.content import BundleContent
 from service.maps.manifest import NAME, Manifest
 from service.maps.writer import write_bundle
+from service.retrieval.encoder import Encoder
 
 __all__ = [
     "BuildSettings", "LevelledScan", "build_map", "describe", "fan", "levelled_scans", "thinned", "tool_versions", "view_ranges",
@@ -51,9 +51,15 @@ Report = Callable[[str, int, int], None]
 
 
 def build_map(
-    dataset: Dataset, encoder_file: Path, out: Path, settings: BuildSettings, *, overwrite: bool = False,
-    threads: int | None = None, report: Report = lambda *_: None,
-) -> Manifest:  # fmt: skip
+    dataset: Dataset,
+    encoder_file: Path,
+    out: Path,
+    settings: BuildSettings,
+    *,
+    overwrite: bool = False,
+    threads: int | None = None,
+    report: Report = lambda *_: None,
+) -> Manifest:
     """Build a map bundle, or continue a killed build with the same inputs; return the manifest.
 
     Args:
@@ -148,9 +154,15 @@ def tool_versions() -> dict[str, str]:
 
 
 def _checked(
-    drive: Drive, places: Places, content: BundleContent, cloud: VoxelMap, calibration: Calibration, apart: Set[int], work: Work,
+    drive: Drive,
+    places: Places,
+    content: BundleContent,
+    cloud: VoxelMap,
+    calibration: Calibration,
+    apart: Set[int],
+    work: Work,
     report: Report,
-) -> Site | None:  # fmt: skip
+) -> Site | None:
     """Run the site check on the map without the held-out scans, then add these scans to the cloud; None if none is held out."""
     if not apart:
         return None

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from service.confidence.features import require_features
 from service.errors import DatasetError
 from service.maps.calibration import Calibration, read_calibration
 
@@ -17,7 +18,7 @@ def calibration_for(path: Path | None, encoder_sha256: str) -> Calibration | Non
 
     Raises:
         DatasetError: the file cannot be read.
-        BundleError: the file is not a calibration.
+        BundleError: the file is not a calibration, or one of other confidence features.
     """
     if path is None:
         return None
@@ -28,5 +29,6 @@ def calibration_for(path: Path | None, encoder_sha256: str) -> Calibration | Non
             f"{path} cannot be read ({error.strerror}); make it with streetfix calibrate", field="calibration"
         ) from error
     calibration = read_calibration(document, path=str(path))
+    require_features(calibration, str(path))
     fits = calibration is not None and calibration.measured_on.get("encoder_sha256") == encoder_sha256
     return calibration if fits else None

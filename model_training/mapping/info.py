@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from model_training.mapping.stored_map import streets_of_bundle
-from service.localization.encoder import Encoder
 from service.maps import content as parts
 from service.maps.manifest import FILE
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
 
 
 def info_of(path: Path) -> dict[str, Any]:

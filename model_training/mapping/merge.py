@@ -18,9 +18,14 @@ Report = Callable[[str, int, int], None]
 
 
 def merge_maps(
-    first: Path, second: Path, out: Path, *, name: str | None = None, overwrite: bool = False,
+    first: Path,
+    second: Path,
+    out: Path,
+    *,
+    name: str | None = None,
+    overwrite: bool = False,
     report: Report = lambda *_: None,
-) -> Manifest:  # fmt: skip
+) -> Manifest:
     """Merge two bundles into a new one; return its manifest.
 
     All places of the first bundle stay. A place of the second stays if it keeps the spacing to them. The sums of the voxels add up, so

@@ -171,9 +171,17 @@ class Targets:
 
 
 def moved(
-    cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64], settings: BuildSettings, work: Work, *,
-    earlier: NDArray[np.int64] | None = None, each_scan: bool = False, report: Report = lambda *_: None,
-) -> NDArray[np.int64]:  # fmt: skip
+    cloud: VoxelMap,
+    dataset: Dataset,
+    poses: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    settings: BuildSettings,
+    work: Work,
+    *,
+    earlier: NDArray[np.int64] | None = None,
+    each_scan: bool = False,
+    report: Report = lambda *_: None,
+) -> NDArray[np.int64]:
     """Return the keys of the voxels that the vote removes, ascending (m,).
 
     A voxel is removed if more passes see through it than hit it, at least two. With ``each_scan`` it is removed if at least as many
@@ -231,9 +239,15 @@ class Ballot:
 
 
 def _votes(
-    ballot: Ballot, cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64],
-    settings: BuildSettings, scans: range, told: Callable[[int], None],
-) -> Arrays:  # fmt: skip
+    ballot: Ballot,
+    cloud: VoxelMap,
+    dataset: Dataset,
+    poses: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    settings: BuildSettings,
+    scans: range,
+    told: Callable[[int], None],
+) -> Arrays:
     targets, passes = ballot.targets, ballot.passes
     hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
     for scan in scans:
@@ -253,8 +267,13 @@ def _votes(
 
 
 def looked_through(
-    targets: Targets, candidates: NDArray[np.int64], points: NDArray[np.float64], T_map_lidar: NDArray[np.float64], *, behind_m: float
-) -> NDArray[np.int64]:  # fmt: skip
+    targets: Targets,
+    candidates: NDArray[np.int64],
+    points: NDArray[np.float64],
+    T_map_lidar: NDArray[np.float64],
+    *,
+    behind_m: float,
+) -> NDArray[np.int64]:
     """Return the indices of the voxels that a scan sees through (m,).
 
     The scan becomes a range image with cells of half a degree, the nearest point in each. The scan sees through a voxel under three

@@ -16,8 +16,8 @@ from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Arrays, Work
 from service.geometry.rigid import heading_of_body
 from service.imaging.view_grid import ViewGrid, survey_planes
-from service.localization.encoder import Encoder
 from service.maps.streets import Streets
+from service.retrieval.encoder import Encoder
 
 #: Number of places whose results are stored as one part.
 CHUNK = 64

@@ -17,11 +17,11 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.imaging.view_grid import ViewGrid, panorama_from_points
 from service.localization.localizer import Localizer
-from service.localization.query import Query
 from service.maps.calibration import Calibration, Site, probability
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
+from service.retrieval.query import Query
 
 #: Largest and smallest number of held-out scans. With fewer than ``FEWEST`` there is no check.
 MOST, FEWEST = 60, 20

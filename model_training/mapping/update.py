@@ -21,20 +21,28 @@ from model_training.mapping.survey import kept_scans, require_poses_within, rows
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
-from service.localization.encoder import Encoder
 from service.maps.content import BundleContent
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
+from service.retrieval.encoder import Encoder
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
 
 
 def update_map(
-    old: Path, dataset: Dataset, out: Path, *, replace_covered: bool = False, replace_area: Path | None = None,
-    passes_vote: bool = False, overwrite: bool = False, threads: int | None = None, report: Report = lambda *_: None,
-) -> Manifest:  # fmt: skip
+    old: Path,
+    dataset: Dataset,
+    out: Path,
+    *,
+    replace_covered: bool = False,
+    replace_area: Path | None = None,
+    passes_vote: bool = False,
+    overwrite: bool = False,
+    threads: int | None = None,
+    report: Report = lambda *_: None,
+) -> Manifest:
     """Add a survey to a map, with the encoder and the settings that the map was built with; return the new manifest.
 
     Without replacement, new places are added that keep the spacing to the old ones, and the new points are added to the cloud.

@@ -36,7 +36,7 @@ _NOT_IN_PARTS = ("name", "licence", "calibration", "passes_vote")
 #: Folders of the code that computes parts.
 _CODE = (
     (model_training, ("mapping", "datasets")),
-    (service, ("imaging", "geometry", "registration", "localization", "maps")),
+    (service, ("imaging", "geometry", "registration", "retrieval", "scoring", "confidence", "localization", "maps")),
 )
 
 

@@ -16,7 +16,7 @@ from model_training.odometry.pose_graph import closed, disagreement_m
 from model_training.odometry.scan_to_map import posed
 from model_training.stock import ENCODER
 from service.errors import DatasetError
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 Report = Callable[[str, int, int], None]
 

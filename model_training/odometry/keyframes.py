@@ -13,7 +13,7 @@ from model_training.odometry.scan_to_map import PosedScan
 from service.geometry.rigid import Transform
 from service.imaging.pca import Level, level_scan, principal_heading
 from service.imaging.view_grid import ViewGrid, panorama_from_points, survey_planes, view_from_panorama
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 #: Least distance travelled between keyframes, metres.
 SPACING_M = 2.0
@@ -73,9 +73,13 @@ class Drive:
 
 
 def drive_of(
-    scans: Iterable[PosedScan], encoder: Encoder | None, folder: Path, *, expected_height_m: float = 1.8,
+    scans: Iterable[PosedScan],
+    encoder: Encoder | None,
+    folder: Path,
+    *,
+    expected_height_m: float = 1.8,
     report: Callable[[int], None] = lambda _: None,
-) -> Drive:  # fmt: skip
+) -> Drive:
     """Collect poses and keyframes of a traversal.
 
     Args:

@@ -3,18 +3,19 @@
 from collections.abc import Mapping
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.evaluation.failures import position_errors
 from model_training.evaluation.measures import RIGHT_M, recall_at
 from model_training.evaluation.predict import RANKED, Predictions, joined
-from model_training.reporting.svg import COLOURS, Axis, Series, histogram, percent_axis, plot
+from model_training.reporting.chart import SERIES, chart, shares_up
 
-_METRES = Axis(
-    "distance from the truth, m", 0.01, 300.0,
-    ((0.01, "0.01"), (0.1, "0.1"), (0.5, "0.5"), (1.0, "1"), (5.0, "5"), (20.0, "20"), (100.0, "100")), log=True,
-)  # fmt: skip
+#: Ends of the axis of distances, and the distances with a number, metres.
+_NEAR_M, _FAR_M = 0.01, 300.0
+_NUMBERED_M = (0.01, 0.1, 0.5, 1.0, 5.0, 20.0, 100.0)
 _BINS = 10
 
 
@@ -24,24 +25,37 @@ def series_of(runs: Mapping[str, Predictions]) -> dict[str, Predictions]:
     Args:
         runs: answers by query set.
     """
-    if len(runs) == 1 or len(runs) >= COLOURS:
+    if len(runs) == 1 or len(runs) >= len(SERIES):
         return {"all queries": joined(list(runs.values()))}
     return {"all queries": joined(list(runs.values())), **runs}
 
 
 def error_curve(runs: Mapping[str, Predictions]) -> str:
-    """Plot the share of all queries whose answer lies within a distance, whatever its status; return SVG.
+    """Plot the share of all queries whose answer lies within a distance, whatever its status; return HTML.
 
     Args:
         runs: answers by name.
     """
-    reach = np.geomspace(_METRES.low, _METRES.high, 90)
-    drawn = [Series(name, np.column_stack([reach, _share_within(p, reach)])) for name, p in runs.items()]
+    reach = np.geomspace(_NEAR_M, _FAR_M, 90)
     first = next(iter(runs.values()))
     told = "; ".join(
         f"{share:.1%} within {m:g} m" for m, share in zip((0.5, 1, 5), _share_within(first, [0.5, 1, 5]), strict=True)
     )
-    return plot("Share of queries within a distance", told, _METRES, percent_axis("share of queries, %"), drawn)
+
+    def draw(axes: Axes) -> None:
+        for name, p in runs.items():
+            axes.plot(reach, _share_within(p, reach), label=name, clip_on=False)
+        _metres_across(axes)
+        shares_up(axes, "share of queries, %")
+
+    return chart("Share of queries within a distance", told, draw, legend=len(runs) > 1)
+
+
+def _metres_across(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_xticks(_NUMBERED_M, [f"{metres:g}" for metres in _NUMBERED_M])
+    axes.set_xticks([], minor=True)
+    axes.set(xlim=(_NEAR_M, _FAR_M), xlabel="distance from the truth, m")
 
 
 def _share_within(p: Predictions, reach: ArrayLike) -> NDArray[np.float64]:
@@ -50,16 +64,23 @@ def _share_within(p: Predictions, reach: ArrayLike) -> NDArray[np.float64]:
 
 
 def error_histogram(p: Predictions) -> str:
-    """Plot a histogram of position errors; return SVG. Errors beyond the axis count at its end.
+    """Plot a histogram of position errors; return HTML. Errors beyond the axis count at its end.
 
     Args:
         p: answers with ground truth.
     """
     errors = position_errors(p)
-    edges = np.geomspace(_METRES.low, _METRES.high, 46)
+    edges = np.geomspace(_NEAR_M, _FAR_M, 46)
     counts, _ = np.histogram(np.clip(errors[np.isfinite(errors)], edges[0], edges[-1]), edges)
     told = f"{int(np.isfinite(errors).sum())} answers; half of them within {_median(errors):.2f} m"
-    return histogram("Answers by distance from the truth", told, _METRES, edges, counts)
+
+    def draw(axes: Axes) -> None:
+        axes.stairs(counts, edges, fill=True, color=SERIES[1])
+        _metres_across(axes)
+        axes.set(ylim=(0.0, 1.05 * max(1, int(counts.max()))), ylabel="queries")
+        axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
+
+    return chart("Answers by distance from the truth", told, draw)
 
 
 def _median(errors: NDArray[np.float64]) -> float:
@@ -68,22 +89,27 @@ def _median(errors: NDArray[np.float64]) -> float:
 
 
 def recall_curves(runs: Mapping[str, Predictions]) -> str:
-    """Plot the share of queries with the correct place among the first k neighbours; return SVG.
+    """Plot the share of queries with the correct place among the first k neighbours; return HTML.
 
     Args:
         runs: answers by name.
     """
     k = np.arange(1, RANKED + 1)
     recalls = {name: [recall_at(p.ranked_xy, p.T_true[:, :2, 3], int(n)).mean() for n in k] for name, p in runs.items()}
-    axis = Axis("most similar places that are looked at", 1, RANKED, tuple((float(n), str(n)) for n in k))
     first = next(iter(recalls.values()))
     told = f"{first[0]:.1%} at one place, {first[4]:.1%} at five, {first[-1]:.1%} at ten"
-    drawn = [Series(name, np.column_stack([k, recall]).astype(np.float64)) for name, recall in recalls.items()]
-    return plot("Recall at 5 m", told, axis, percent_axis("share of queries, %"), drawn)
+
+    def draw(axes: Axes) -> None:
+        for name, recall in recalls.items():
+            axes.plot(k, recall, label=name, clip_on=False)
+        axes.set(xlim=(1, RANKED), xticks=k, xlabel="most similar places that are looked at")
+        shares_up(axes, "share of queries, %")
+
+    return chart("Recall at 5 m", told, draw, legend=len(runs) > 1)
 
 
 def reliability(p: Predictions) -> tuple[str, float] | None:
-    """Plot the share of correct answers by confidence; return SVG and the expected calibration error, or None without confidences.
+    """Plot the share of correct answers by confidence; return HTML and the expected calibration error, or None without confidences.
 
     Args:
         p: answers with ground truth.
@@ -101,30 +127,36 @@ def reliability(p: Predictions) -> tuple[str, float] | None:
             intervals.append(wilson_interval(int(right[chosen].sum()), int(chosen.sum())))
             gap += abs(points[-1][0] - points[-1][1]) * chosen.mean()
     told = "; ".join(f"of confidence {c:.2f}: {share:.0%} right" for c, share in points)
-    axis = Axis("confidence", 0.0, 1.0, tuple((j / 5, f"{j / 5:g}") for j in range(6)))
-    drawn = Series("answers", np.array(points), line=False, intervals=np.array(intervals))
-    return plot("Confidence against truth", told, axis, percent_axis("within 1 m, %"), [drawn], diagonal=True), float(
-        gap
-    )
+
+    def draw(axes: Axes) -> None:
+        axes.axline((0, 0), (1, 1), color=SERIES[0], linewidth=1, linestyle="--")
+        _dots(axes, np.array(points), np.array(intervals))
+        axes.set(xlim=(0.0, 1.0), xlabel="confidence")
+        shares_up(axes, "within 1 m, %")
+
+    return chart("Confidence against truth", told, draw), float(gap)
+
+
+def _dots(axes: Axes, points: NDArray[np.float64], intervals: NDArray[np.float64]) -> None:
+    """Draw points (n, 2), each with the ends of its vertical interval (n, 2)."""
+    axes.vlines(points[:, 0], intervals[:, 0], intervals[:, 1], color=SERIES[1], linewidth=2)
+    axes.plot(points[:, 0], points[:, 1], "o", color=SERIES[1], clip_on=False, zorder=3)
 
 
 def side_by_side(shares: Mapping[str, tuple[float, float, float]], label: str) -> str:
-    """Plot a share of each query set with its interval; return SVG.
+    """Plot a share of each query set with its interval; return HTML.
 
     Args:
         shares: share, lower end and upper end by query set.
         label: name of the share.
     """
-    names = list(shares)
-    axis = Axis(
-        "query set, in the table's order",
-        0.5,
-        len(names) + 0.5,
-        tuple((k + 1.0, str(k + 1)) for k in range(len(names))),
-    )
-    values = np.array([shares[name] for name in names])
-    points = np.column_stack([np.arange(1, len(names) + 1), values[:, 0]])
+    values = np.array(list(shares.values()))
+    number = np.arange(1, len(shares) + 1)
     told = "; ".join(f"{name} {share:.1%} ({low:.1%} to {high:.1%})" for name, (share, low, high) in shares.items())
-    return plot(
-        label, told, axis, percent_axis(f"{label}, %"), [Series(label, points, line=False, intervals=values[:, 1:])]
-    )
+
+    def draw(axes: Axes) -> None:
+        _dots(axes, np.column_stack([number, values[:, 0]]), values[:, 1:])
+        axes.set(xlim=(0.5, len(shares) + 0.5), xticks=number, xlabel="query set, in the table's order")
+        shares_up(axes, f"{label}, %")
+
+    return chart(label, told, draw)

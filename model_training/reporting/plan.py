@@ -1,6 +1,7 @@
 """The map from above in metres with the answers; SVG's y axis points down, so it is minus the map's y."""
 
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,6 @@ from numpy.typing import NDArray
 from model_training.evaluation.failures import position_errors
 from model_training.evaluation.predict import Predictions
 from model_training.reporting.pictures import grey_webp_uri
-from model_training.reporting.svg import drawing
 from service.maps.reader import MapBundle
 
 #: Classes of error: upper limit in metres, style class, and text of the legend.
@@ -87,7 +87,7 @@ class Plan:
             dots.append(f"<g>{mark}<title>{told}</title></g>")
         content = self._image() + "".join(lines) + "".join(dots)
         told = "; ".join(f"{number} {name}" for name, number in counted(errors).items())
-        return drawing("The map from above with all queries", told, content, view=self.view, kind="plan")
+        return _drawing("The map from above with all queries", told, content, view=self.view, kind="plan")
 
     def around(
         self,
@@ -119,7 +119,7 @@ class Plan:
             parts.append(_cross(answers_xy[k, 0], -answers_xy[k, 1], side / 28, f"answer{k}"))
         parts.append(f'<circle class="truth" cx="{true_xy[0]:.2f}" cy="{-true_xy[1]:.2f}" r="{side / 28:.2f}"/>')
         told = f"{side * 4 / 3:.0f} m across"
-        return drawing(
+        return _drawing(
             "Where the query was taken and where it was put", told, "".join(parts), view=view, kind="small-plan"
         )
 
@@ -144,6 +144,15 @@ def counted(errors: NDArray[np.float64]) -> dict[str, int]:
     """
     classes = [class_of(error) for error in errors]
     return {label: classes.count(name) for _, name, label in ERRORS}
+
+
+def _drawing(title: str, told: str, content: str, *, view: tuple[float, float, float, float], kind: str) -> str:
+    """Return an SVG element with a description for screen readers.
+
+    The drawings of a page share the map's image and the page's colours. So the page holds them as elements, not as images.
+    """
+    box = " ".join(f"{v:.2f}".rstrip("0").rstrip(".") for v in view)
+    return f'<svg class="{kind}" viewBox="{box}" role="img" aria-label="{escape(f"{title}: {told}")}">{content}</svg>'
 
 
 def _box(view: tuple[float, float, float, float]) -> str:

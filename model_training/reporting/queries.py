@@ -70,9 +70,14 @@ def said_of(p: Predictions, row: int, stage: Stage, error_m: float) -> str:
 
 
 def gallery(
-    shown: Sequence[Shown], p: Predictions, dataset: Dataset | None, plan: Plan | None, *,
-    other: Predictions | None = None, has_plan: bool = False,
-) -> str:  # fmt: skip
+    shown: Sequence[Shown],
+    p: Predictions,
+    dataset: Dataset | None,
+    plan: Plan | None,
+    *,
+    other: Predictions | None = None,
+    has_plan: bool = False,
+) -> str:
     """Show queries one below the other as HTML; images need the dataset, and maps need the plan.
 
     Args:

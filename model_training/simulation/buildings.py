@@ -124,9 +124,17 @@ def _turned(offset: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
 
 
 def _facade(
-    builder: MeshBuilder, plan: Footprint, style: FacadeStyle, side: int, along: float, away: float,
-    wall: NDArray[np.float64], material: Material, lively: float, rng: np.random.Generator,
-) -> None:  # fmt: skip
+    builder: MeshBuilder,
+    plan: Footprint,
+    style: FacadeStyle,
+    side: int,
+    along: float,
+    away: float,
+    wall: NDArray[np.float64],
+    material: Material,
+    lively: float,
+    rng: np.random.Generator,
+) -> None:
     """Add the piers and spandrels of one side, a door, and perhaps balconies, awnings, steps, a rain pipe or a bay window."""
     yaw = plan.yaw + side * np.pi / 2
     out = np.array([np.sin(yaw), -np.cos(yaw)])

@@ -46,10 +46,20 @@ def unit_rays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.fl
 
 
 def take(
-    scene: Scene, ground: GroundPicture, camera: PinholeCamera, T_map_camera: NDArray[np.float64], light: Light,
-    condition: Condition, model: RgbModel, rng: np.random.Generator, *, rays_camera: NDArray[np.float32], z_of_ray: NDArray[np.float32],
-    blocker: Blocker | None = None, metering: float | None = None,
-) -> Picture:  # fmt: skip
+    scene: Scene,
+    ground: GroundPicture,
+    camera: PinholeCamera,
+    T_map_camera: NDArray[np.float64],
+    light: Light,
+    condition: Condition,
+    model: RgbModel,
+    rng: np.random.Generator,
+    *,
+    rays_camera: NDArray[np.float32],
+    z_of_ray: NDArray[np.float32],
+    blocker: Blocker | None = None,
+    metering: float | None = None,
+) -> Picture:
     """Render an RGB-D image.
 
     Args:
@@ -87,8 +97,13 @@ def take(
 
 
 def _lit(
-    scene: Scene, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light, shape: tuple[int, int]
-) -> NDArray[np.bool_]:  # fmt: skip
+    scene: Scene,
+    origin: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    hits: Hits,
+    light: Light,
+    shape: tuple[int, int],
+) -> NDArray[np.bool_]:
     """Return which pixels see the sun (N,): cast shadow rays on a coarser grid and copy each result to its neighbours."""
 
     def coarse(values: NDArray[np.float32]) -> NDArray[np.float32]:

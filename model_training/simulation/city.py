@@ -241,9 +241,16 @@ class City:
             builder.box(base, (width, depth, height + 1.0), plan.yaw, rng.uniform(0.3, 0.75, 3), Material.MATTE)
 
     def _boundary(
-        self, builder: MeshBuilder, point: Vector, direction: Vector, normal: Vector, edge: float, length: float,
-        district: District, rng: np.random.Generator,
-    ) -> None:  # fmt: skip
+        self,
+        builder: MeshBuilder,
+        point: Vector,
+        direction: Vector,
+        normal: Vector,
+        edge: float,
+        length: float,
+        district: District,
+        rng: np.random.Generator,
+    ) -> None:
         """Add a fence, hedge or wall with a gate. Each piece stands at its own ground height."""
         kind = rng.choice(list(district.boundaries))
         height = {"fence": rng.uniform(0.8, 1.6), "hedge": rng.uniform(0.8, 1.9), "wall": rng.uniform(0.5, 1.8)}[

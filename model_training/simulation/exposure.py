@@ -57,8 +57,13 @@ RGBS = {
 
 
 def exposed(
-    linear: NDArray[np.float32], model: RgbModel, condition: Condition, rng: np.random.Generator, *, metering: float | None = None
-) -> NDArray[np.uint8]:  # fmt: skip
+    linear: NDArray[np.float32],
+    model: RgbModel,
+    condition: Condition,
+    rng: np.random.Generator,
+    *,
+    metering: float | None = None,
+) -> NDArray[np.uint8]:
     """Return the image (H, W, 3) of linear light.
 
     Args:

@@ -89,9 +89,17 @@ _RETURNS[Material.GLASS] = 0.75
 
 
 def scan(
-    scene: Scene, ground: GroundPicture, model: LidarModel, rays: NDArray[np.float32], T_map_lidar: NDArray[np.float64],
-    condition: Condition, rng: np.random.Generator, *, survey: SurveyModel = STANDING, ahead: Blocker | None = None,
-) -> NDArray[np.float32]:  # fmt: skip
+    scene: Scene,
+    ground: GroundPicture,
+    model: LidarModel,
+    rays: NDArray[np.float32],
+    T_map_lidar: NDArray[np.float64],
+    condition: Condition,
+    rng: np.random.Generator,
+    *,
+    survey: SurveyModel = STANDING,
+    ahead: Blocker | None = None,
+) -> NDArray[np.float32]:
     """Simulate one revolution.
 
     Args:

@@ -25,8 +25,13 @@ PANE = np.float32(0.05)
 
 
 def reflectance_of(
-    scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, condition: Condition
-) -> NDArray[np.float32]:  # fmt: skip
+    scene: Scene,
+    ground: GroundPicture,
+    origin: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    hits: Hits,
+    condition: Condition,
+) -> NDArray[np.float32]:
     """Return the share of the pulse (n,) that the intersected surfaces send back, 0 to 1.
 
     Args:

@@ -148,9 +148,17 @@ def albedo_of(
 
 
 def shade(
-    scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light,
-    condition: Condition, *, forward: NDArray[np.float64], lit: NDArray[np.bool_] | None = None,
-) -> Colour:  # fmt: skip
+    scene: Scene,
+    ground: GroundPicture,
+    origin: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    hits: Hits,
+    light: Light,
+    condition: Condition,
+    *,
+    forward: NDArray[np.float64],
+    lit: NDArray[np.bool_] | None = None,
+) -> Colour:
     """Return the linear light (n, 3) that comes along each ray from a surface or the sky.
 
     Args:
@@ -181,9 +189,16 @@ def shade(
 
 
 def _surfaces(
-    scene: Scene, ground: GroundPicture, origin: NDArray[np.float64], rays: NDArray[np.float32], hits: Hits, light: Light,
-    condition: Condition, forward: NDArray[np.float64], lit: NDArray[np.bool_] | None,
-) -> Colour:  # fmt: skip
+    scene: Scene,
+    ground: GroundPicture,
+    origin: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    hits: Hits,
+    light: Light,
+    condition: Condition,
+    forward: NDArray[np.float64],
+    lit: NDArray[np.bool_] | None,
+) -> Colour:
     """Return the light (n, 3) from surfaces. Every ray must have an intersection."""
     points = origin.astype(np.float32) + rays * hits.distance[:, None]
     colour = albedo_of(scene, ground, points, hits, condition)

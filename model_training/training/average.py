@@ -23,9 +23,16 @@ BATCHES = 150
 
 
 def average(
-    first: Path, second: Path, packs: list[Path], run: Path, *, share: float = 0.5, seed: int = 0, batches: int = BATCHES,
+    first: Path,
+    second: Path,
+    packs: list[Path],
+    run: Path,
+    *,
+    share: float = 0.5,
+    seed: int = 0,
+    batches: int = BATCHES,
     report: Callable[[int], None] = lambda _: None,
-) -> EncoderNet:  # fmt: skip
+) -> EncoderNet:
     """Write a run whose weights are ``(1 - share) * first + share * second``.
 
     Args:

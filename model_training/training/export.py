@@ -10,7 +10,7 @@ import torch
 from model_training.training.encoder_net import EncoderNet
 from service.errors import EncoderError
 from service.imaging.view_grid import PLANES
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 #: Greatest difference of a descriptor's component between torch and ONNX Runtime.
 TOLERANCE = 1e-4

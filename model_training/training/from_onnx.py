@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from model_training.training.encoder_net import EncoderNet, EncoderShape
 from service.errors import EncoderError
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 Floats = NDArray[np.float32]
 

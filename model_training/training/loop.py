@@ -25,7 +25,7 @@ from model_training.training.memory import DescriptorMemory
 from model_training.training.precision import Precision, forward_in
 from service.errors import DatasetError
 from service.imaging.view_grid import PLANES, ViewGrid
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 #: Pairs that are augmented together on a CPU.
 PAIRS_AT_ONCE = 16
@@ -125,10 +125,16 @@ def device_of(name: str) -> torch.device:
 
 
 def train(
-    packs: list[Path], run: Path, config: TrainingConfig, *, device: str = "auto", resume: bool = True, save_every: int = 200,
+    packs: list[Path],
+    run: Path,
+    config: TrainingConfig,
+    *,
+    device: str = "auto",
+    resume: bool = True,
+    save_every: int = 200,
     start_from: Path | None = None,
     report: Callable[[Progress], None] = lambda _: None,
-) -> EncoderNet:  # fmt: skip
+) -> EncoderNet:
     """Train an encoder on packs.
 
     The folder of the run holds ``config.json``, ``checkpoint.pt`` and the TensorBoard log.

@@ -40,8 +40,14 @@ class DescriptorMemory:
         self.step = torch.full((pairs,), _NEVER, dtype=torch.int64)
 
     def keep(
-        self, pairs: NDArray[np.int64], queries: Tensor, surveys: Tensor, queries_xy: Tensor, surveys_xy: Tensor, step: int
-    ) -> None:  # fmt: skip
+        self,
+        pairs: NDArray[np.int64],
+        queries: Tensor,
+        surveys: Tensor,
+        queries_xy: Tensor,
+        surveys_xy: Tensor,
+        step: int,
+    ) -> None:
         """Store what a batch of pairs had at a step.
 
         Args:

@@ -132,9 +132,13 @@ def rows_seen_by(panoramas: NDArray[np.float16], *, least: float = 0.02) -> NDAr
 
 
 def make_packs(
-    plans: list[PackPlan], root: Path, grid: ViewGrid, *, workers: int | None = None,
+    plans: list[PackPlan],
+    root: Path,
+    grid: ViewGrid,
+    *,
+    workers: int | None = None,
     report: Callable[[str, int, int], None] = lambda *_: None,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Make the packs that do not exist yet, one city per process, and return all folders.
 
     Args:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quant_pre_process, quantize_static
 
 from service.errors import EncoderError
-from service.localization.encoder import Descriptors, Encoder
+from service.retrieval.encoder import Descriptors, Encoder
 
 #: ONNX operators that are quantised.
 QUANTISED = ("Conv", "Gemm", "MatMul", "Add", "Relu")

@@ -75,10 +75,13 @@ def of_answer(
         counted: names and values of ``Counts.values``.
     """
     confidence = "unknown" if answer.confidence is None else f"{answer.confidence:.3f}"
+    height = answer.camera_height
     values = (
         ("status", answer.status), ("confidence", confidence),
         ("street", "none" if answer.street is None else answer.street.name),
-        ("map", f"{answer.map.name}@{answer.map.version}"), ("latency_ms", f"{1e3 * latency_s:.0f}"),
+        ("map", f"{answer.map.name}@{answer.map.version}"),
+        ("camera_height", "unknown" if height is None else f"{height.height_m:.2f} m, {height.origin}"),
+        ("latency_ms", f"{1e3 * latency_s:.0f}"),
     )  # fmt: skip
     if why_not:
         return Diagnosis(stamp_ns, Level.WARN, f"not published: {why_not}", values + counted)

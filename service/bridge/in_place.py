@@ -10,7 +10,8 @@ from service.contract.schema import LocalizeAnswer
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import require_sizes
 from service.imaging.depth_units import depth_from_values
-from service.localization.query import Query
+from service.imaging.level import GivenHeight
+from service.retrieval.query import Query
 from service.runtime.engine import Located
 from service.runtime.map_registry import MapRegistry
 from service.runtime.threads import limit_pools
@@ -21,13 +22,15 @@ class InPlace:
 
     Args:
         bundle: folder of the map bundle.
+        camera_height: height of the camera above the ground; None: it is found in the depth image.
 
     Raises:
         BundleError: the bundle is missing or damaged.
     """
 
-    def __init__(self, bundle: Path) -> None:
+    def __init__(self, bundle: Path, camera_height: GivenHeight | None = None) -> None:
         limit_pools()
+        self._camera_height = camera_height
         self._localizer = MapRegistry.open((bundle,)).get(None)
 
     def __call__(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera) -> LocalizeAnswer:
@@ -44,5 +47,5 @@ class InPlace:
         require_camera(camera)
         z_m = depth_from_values(depth_m, scale_m=1.0, kind="z", camera=camera, baseline_m=None, max_range_m=None)
         require_sizes(rgb, z_m, camera)
-        answer = self._localizer.localize(Query(rgb=rgb, depth_m=z_m, camera=camera))
+        answer = self._localizer.localize(Query(rgb=rgb, depth_m=z_m, camera=camera, camera_height=self._camera_height))
         return answer_from(Located(answer, self._localizer.bundle))

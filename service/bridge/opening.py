@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from service.bridge.bridge import Bridge, Localize, Topics
 from service.bridge.gate import Gate
 from service.bridge.pairs import Pairs
-from service.bridge.pose import CAMERA_AS_BODY, mount_from
+from service.bridge.pose import CAMERA_AS_BODY, height_from, mount_from
 from service.bridge.settings import BridgeSettings
 from service.errors import RequestError
+from service.imaging.level import GivenHeight
 from service.runtime.wakeup import Wakeup
 
 #: Limits of a query. After a longer time the robot has left the place of the images.
@@ -32,20 +33,21 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
         settings.color_topic, settings.depth_topic, settings.info_topic, settings.pose_topic, settings.diagnostics_topic
     )
     gate, pairs = Gate(settings.rate, settings.min_confidence), Pairs(tolerance_s=settings.tolerance)
-    T_vehicle_camera = CAMERA_AS_BODY if settings.mount is None else mount_from(settings.mount)
+    mount = None if settings.mount is None else mount_from(settings.mount)
+    height = height_from(settings.camera_height_m, mount, base_on_ground=settings.base_on_ground)
     if settings.queue < 0:
         raise RequestError(
             f"--queue: {settings.queue} is no number of images; give 1 or more, or 0 to keep all", field="queue"
         )
-    with _asking(settings) as localize:
+    with _asking(settings, height) as localize:
         yield Bridge(
-            localize=localize, topics=topics, gate=gate, pairs=pairs, T_vehicle_camera=T_vehicle_camera,
-            frame_id=settings.frame, rectified=settings.rectified,
+            localize=localize, topics=topics, gate=gate, pairs=pairs,
+            T_vehicle_camera=CAMERA_AS_BODY if mount is None else mount, frame_id=settings.frame, rectified=settings.rectified,
         )  # fmt: skip
 
 
 @contextmanager
-def _asking(settings: BridgeSettings) -> Iterator[Localize]:
+def _asking(settings: BridgeSettings, height: GivenHeight | None = None) -> Iterator[Localize]:
     """Provide the function that localizes: by a service, or by the map in this process."""
     if settings.map is not None:
         if given := next((name for name in ("ca", "cert", "key") if getattr(settings, name) is not None), None):
@@ -57,7 +59,7 @@ def _asking(settings: BridgeSettings) -> Iterator[Localize]:
         limit_pools_before_import()
         from service.bridge.in_place import InPlace
 
-        yield InPlace(settings.map)
+        yield InPlace(settings.map, height)
         return
     from service.client import Client, RetryPolicy
 
@@ -66,7 +68,10 @@ def _asking(settings: BridgeSettings) -> Iterator[Localize]:
         settings.url, api_key=settings.api_key, timeout_s=_TIMEOUT_S, retry=patience,
         ca=settings.ca, cert=settings.cert, key=settings.key,
     ) as client:  # fmt: skip
-        yield lambda rgb, depth_m, camera: client.localize(rgb, depth_m, camera, map=name)
+        height_m, std_m = (None, None) if height is None else (height.height_m, height.std_m)
+        yield lambda rgb, depth_m, camera: client.localize(
+            rgb, depth_m, camera, map=name, camera_height_m=height_m, camera_height_std_m=std_m
+        )
 
 
 @contextmanager

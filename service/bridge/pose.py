@@ -17,6 +17,8 @@ from service.geometry.rigid import (
     rotation_from_quaternion_xyzw,
     transform_from,
 )
+from service.imaging.level import GivenHeight
+from service.option_limits import HEIGHT_STD_M, LEAST_HEIGHT_M, MOST_HEIGHT_M, VEHICLE_HEIGHT_STD_M
 
 Covariance = Float64[NDArray[np.float64], "6 6"]
 
@@ -108,3 +110,40 @@ def mount_from(text: str) -> Transform:
             field="mount",
         )
     return transform_from(rotation_from_quaternion_xyzw(np.array(numbers[3:])), np.array(numbers[:3]))
+
+
+def height_from(
+    camera_height_m: float, T_vehicle_camera: Transform | None, *, base_on_ground: bool
+) -> GivenHeight | None:
+    """Return the height of the camera above the ground; None if it shall be found in the depth image.
+
+    Args:
+        camera_height_m: measured height, metres; it goes before the height of the mounting. 0 if none was measured.
+        T_vehicle_camera: mounting, from the camera frame to the vehicle frame, metres; None if it is unknown.
+        base_on_ground: whether the origin of the vehicle frame lies on the ground (z up), as that of base_footprint (REP 105).
+
+    Raises:
+        RequestError: the height is out of bounds, or ``base_on_ground`` is true without a mounting.
+    """
+    if camera_height_m:
+        if not LEAST_HEIGHT_M <= camera_height_m <= MOST_HEIGHT_M:
+            raise RequestError(
+                f"--camera-height-m: {camera_height_m:g} m is no height of a camera; give {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m, "
+                "or 0 to find it in the depth image", field="camera_height_m",
+            )  # fmt: skip
+        return GivenHeight(camera_height_m, HEIGHT_STD_M)
+    if not base_on_ground:
+        return None
+    if T_vehicle_camera is None:
+        raise RequestError(
+            "--base-on-ground: the height of the camera follows from --mount, which is missing; give --mount, or --camera-height-m",
+            field="base_on_ground",
+        )
+    height_m = float(T_vehicle_camera[2, 3])
+    if not LEAST_HEIGHT_M <= height_m <= MOST_HEIGHT_M:
+        raise RequestError(
+            f"--mount: with --base-on-ground, its Z of {height_m:g} m is the height of the camera, and {LEAST_HEIGHT_M:g} to "
+            f"{MOST_HEIGHT_M:g} m are read; give the mounting on base_footprint, or --camera-height-m and no --base-on-ground",
+            field="mount",
+        )
+    return GivenHeight(height_m, VEHICLE_HEIGHT_STD_M)

@@ -55,9 +55,14 @@ def ros_node(*, args: list[str] | None = None, domain: int | None = None) -> Ite
 
 
 def run(
-    bridge: Bridge, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None, *,
-    domain: int = 0, reliable: bool = False, depth: int = 5,
-) -> None:  # fmt: skip
+    bridge: Bridge,
+    over: Event | Wakeup,
+    told: Callable[[Published], None] = lambda _: None,
+    *,
+    domain: int = 0,
+    reliable: bool = False,
+    depth: int = 5,
+) -> None:
     """Process images in a new node and publish the results until ``over`` is set.
 
     Args:
@@ -76,9 +81,14 @@ def run(
 
 
 def spin(
-    node: Any, bridge: Bridge, over: Event | Wakeup, told: Callable[[Published], None] = lambda _: None, *,
-    reliable: bool = False, depth: int = 5,
-) -> None:  # fmt: skip
+    node: Any,
+    bridge: Bridge,
+    over: Event | Wakeup,
+    told: Callable[[Published], None] = lambda _: None,
+    *,
+    reliable: bool = False,
+    depth: int = 5,
+) -> None:
     """Process images in a node and publish the results until ``over`` is set.
 
     Args:

@@ -31,6 +31,8 @@ class BridgeSettings:
         diagnostics_topic: see ``Topics``.
         frame: of the poses.
         mount: see ``mount_from``.
+        base_on_ground: see ``height_from``.
+        camera_height_m: see ``height_from``.
         rectified: see ``camera_from``.
         rate: see ``Gate``, Hz.
         min_confidence: see ``Gate``.
@@ -59,6 +61,14 @@ class BridgeSettings:
         "Camera pose on the vehicle, X,Y,Z,QX,QY,QZ,QW as tf2_echo base_link OPTICAL_FRAME prints it. The bridge then "
         "publishes the vehicle's pose. Otherwise it publishes the camera's pose as a body (x forward, z up).",
     ] = None
+    base_on_ground: Annotated[
+        bool,
+        "The frame of --mount lies on the ground and its z axis points up, as base_footprint. The camera's height is then the Z of "
+        "--mount.",
+    ] = False
+    camera_height_m: Annotated[
+        float, "Height of the camera above the ground, metres. 0: from --base-on-ground, else the depth image tells it."
+    ] = 0.0
     rectified: Annotated[bool, "The images are rectified, whatever lens the CameraInfo describes."] = False
     rate: Annotated[float, "Largest number of queries per second. 0 sends one for every pair."] = 1.0
     min_confidence: Annotated[float, "Smallest confidence of a published pose. 0 passes every LOCALIZED answer."] = 0.9

@@ -8,7 +8,7 @@ from rich.table import Table
 
 
 def print_answer(answer: dict[str, Any], console: Console | None = None) -> None:
-    """Print status, street, pose, neighbours and timings. Without a pose, also print likely reasons and the hypotheses.
+    """Print status, street, pose, camera height, neighbours and timings. Without a pose, also print likely reasons and the hypotheses.
 
     Args:
         answer: as in the REST contract. If other focal lengths were tried, it has ``focal_length_factor``; None if none fits.
@@ -36,8 +36,12 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     confidence = answer["confidence"]
     status = ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f})"))
     version = ("map", f"{place['name']}, version {place['version']}")
+    told = answer.get("camera_height")  # an older service sends none
+    height = [] if told is None else [("camera", _height(told))]
     if pose is None:
-        return [status, ("pose", "none: the answer is not LOCALIZED"), ("spread", _doubt(answer["spread"])), version]
+        return [
+            status, ("pose", "none: the answer is not LOCALIZED"), ("spread", _doubt(answer["spread"])), *height, version,
+        ]  # fmt: skip
     facts = [
         status,
         ("street", "none" if street is None else f"{street['name']} ({street['vote']:.0%} of the votes)"),
@@ -51,7 +55,13 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     if answer.get("vehicle_pose"):
         vehicle = answer["vehicle_pose"]
         facts.append(("vehicle", f"{_metres(vehicle['position'])}, heading {vehicle['heading_deg']:.1f} degrees"))
-    return [*facts, version]
+    return [*facts, *height, version]
+
+
+def _height(told: dict[str, Any]) -> str:
+    """Text for the height of the camera and its origin."""
+    why = "; the depth image shows no ground, so give --camera-height" if told["origin"] == "assumed" else ""
+    return f"{told['height_m']:.2f} m above the ground ({told['origin']}{why})"
 
 
 def _why(answer: dict[str, Any]) -> list[str]:

@@ -42,6 +42,10 @@ def ros2(
     diagnostics_topic: Annotated[str, typer.Option(help=about("diagnostics_topic"))] = _DEFAULTS.diagnostics_topic,
     frame: Annotated[str, typer.Option(help=about("frame"))] = _DEFAULTS.frame,
     mount: Annotated[str | None, typer.Option(help=about("mount"), show_default=False)] = None,
+    base_on_ground: Annotated[
+        bool, typer.Option("--base-on-ground", help=about("base_on_ground"))
+    ] = _DEFAULTS.base_on_ground,
+    camera_height_m: Annotated[float, typer.Option(help=about("camera_height_m"))] = _DEFAULTS.camera_height_m,
     rectified: Annotated[bool, typer.Option("--rectified", help=about("rectified"))] = _DEFAULTS.rectified,
     rate: Annotated[float, typer.Option(help=about("rate"))] = _DEFAULTS.rate,
     min_confidence: Annotated[float, typer.Option(help=about("min_confidence"))] = _DEFAULTS.min_confidence,
@@ -65,8 +69,8 @@ def ros2(
     settings = BridgeSettings(
         url=url, map=map_bundle, map_name=map_name, api_key=api_key, ca=ca, cert=cert, key=key, color_topic=color_topic,
         depth_topic=depth_topic, info_topic=info_topic, pose_topic=pose_topic, diagnostics_topic=diagnostics_topic, frame=frame,
-        mount=mount, rectified=rectified, rate=rate, min_confidence=min_confidence, tolerance=tolerance, reliable=reliable,
-        queue=queue,
+        mount=mount, base_on_ground=base_on_ground, camera_height_m=camera_height_m, rectified=rectified, rate=rate,
+        min_confidence=min_confidence, tolerance=tolerance, reliable=reliable, queue=queue,
     )  # fmt: skip
     run = _node_of(node, domain=domain, reliable=reliable, depth=queue)
     from service.bridge.opening import opened, until_signalled

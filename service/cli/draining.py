@@ -31,10 +31,15 @@ class DrainingServer(uvicorn.Server):
     """
 
     def __init__(
-        self, config: uvicorn.Config, engine: "Engine", *, delay_s: float, started: Callable[[], object] = lambda: None,
+        self,
+        config: uvicorn.Config,
+        engine: "Engine",
+        *,
+        delay_s: float,
+        started: Callable[[], object] = lambda: None,
         leaving: Callable[[], object] = lambda: None,
         beside: Sequence[tuple[socket.socket, uvicorn.Config]] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(config)
         self._engine = engine
         self._delay_s = delay_s

@@ -32,6 +32,17 @@ def command(
     heading: Annotated[
         float | None, typer.Option(help="Approximate heading, degrees counter-clockwise from map x.")
     ] = None,
+    camera_height: Annotated[
+        float | None,
+        typer.Option(
+            help="Height of the camera above the ground, metres. Without it, the service finds the height in the depth image.",
+            show_default=False,
+        ),
+    ] = None,
+    camera_height_std: Annotated[
+        float | None,
+        typer.Option(help="Standard deviation of the height, metres.  [default: 0.05]", show_default=False),
+    ] = None,
     api_key: Annotated[
         str | None,
         typer.Option(
@@ -79,7 +90,7 @@ def command(
     def ask(focal_factor: float) -> dict[str, Any]:
         return localize(
             url, rgb=rgb, depth=depth, camera=camera, map_name=map_name, prior=prior, api_key=api_key, ca=ca, cert=cert, key=key,
-            focal_factor=focal_factor,
+            focal_factor=focal_factor, camera_height_m=camera_height, camera_height_std_m=camera_height_std,
         )  # fmt: skip
 
     answer = ask(1.0)
@@ -97,7 +108,7 @@ def command(
 
 def _fitting_factor(answer: dict[str, Any], ask: Callable[[float], dict[str, Any]]) -> float | None:
     """Factor of fx and fy that fits the map clearly better than the given camera; None if there is none."""
-    from service.localization.reasons import FOCAL_FACTORS, GAIN_OF_ONE
+    from service.confidence.reasons import FOCAL_FACTORS, GAIN_OF_ONE
 
     before, best, most = _support(answer), None, (False, GAIN_OF_ONE)
     for factor in FOCAL_FACTORS:
@@ -115,7 +126,7 @@ def _fitting_factor(answer: dict[str, Any], ask: Callable[[float], dict[str, Any
 
 def _support(answer: dict[str, Any]) -> float:
     """Support of the first hypothesis in nats; 0 if nothing could be registered."""
-    from service.localization.reasons import support_of
+    from service.confidence.reasons import support_of
 
     return max((support_of(each["inliers"], each["similarity"]) for each in answer["hypotheses"][:1]), default=0.0)
 
@@ -146,6 +157,8 @@ def localize(
     cert: Path | None = None,
     key: Path | None = None,
     focal_factor: float = 1.0,
+    camera_height_m: float | None = None,
+    camera_height_std_m: float | None = None,
 ) -> dict[str, Any]:
     """Send an image pair to a service and return its answer.
 
@@ -161,10 +174,12 @@ def localize(
         cert: PEM file of the client's certificate.
         key: PEM file of the client's private key.
         focal_factor: multiplies fx and fy of the camera file.
+        camera_height_m: height of the camera above the ground, metres; overrides ``height_m`` of the camera file.
+        camera_height_std_m: standard deviation of the height, metres; overrides the file.
 
     Raises:
-        RequestError: a file cannot be read, the camera file is no JSON object, the URL is invalid, or the map's name is that of a
-            folder.
+        RequestError: a file cannot be read, the camera file is no JSON object, the URL is invalid, the map's name is that of a
+            folder, or a standard deviation is given without a height.
         KeysError: a TLS file cannot be used.
         UnreachableError: nothing answers at the address, or the answer is not from Streetfix.
         RefusedError: the service answered with a problem.
@@ -172,6 +187,7 @@ def localize(
     from service.client import Client, RetryPolicy, rest
 
     request = _camera_parts(camera, focal_factor) | ({} if map_name is None else {"map": map_name})
+    request["camera"] = _with_height(request["camera"], camera_height_m, camera_height_std_m)
     request |= {} if prior is None else {"prior": prior}
     files = {
         "rgb": (rgb.name, _bytes_of(rgb, "rgb"), "application/octet-stream"),
@@ -187,6 +203,23 @@ def localize(
             if error.field == "map" and map_name is not None and (wrong := _folder_for_a_name(map_name)):
                 raise RequestError(f"{wrong}\n  {error.detail}", field="map") from error
             raise
+
+
+def _with_height(camera: Any, height_m: float | None, std_m: float | None) -> Any:
+    """Return the camera of a request with the height of the options. The service checks the values.
+
+    Raises:
+        RequestError: there is a standard deviation, but neither the options nor the camera file give a height.
+    """
+    if (height_m is None and std_m is None) or not isinstance(camera, dict):
+        return camera
+    if height_m is None and camera.get("height_m") is None:
+        raise RequestError(
+            "--camera-height-std: there is no height that it belongs to; give --camera-height, or height_m in the camera file",
+            field="camera_height_std",
+        )
+    given = {"height_m": height_m, "height_std_m": std_m}
+    return camera | {name: value for name, value in given.items() if value is not None}
 
 
 def _folder_for_a_name(map_name: str) -> str:

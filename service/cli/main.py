@@ -12,6 +12,7 @@ import typer
 from pydantic import ValidationError
 
 from service.cli import bridge, doctor, health, keys, localize, serve
+from service.cli.extras import EXTRA_OF_PACKAGE, package_of
 from service.errors import ExtraMissingError, StreetfixError, how_to_install
 
 GROUP = "streetfix.commands"
@@ -34,24 +35,6 @@ _KNOWN = {
     "average": ("Average the weights of two training runs.", "training"),
     "export": ("Export a trained encoder to ONNX.", "training"),
     "quantize": ("Quantise an encoder to 8 bits: smaller, faster, nearly equal.", "training"),
-}
-
-
-#: Packages that a command needs only for some tasks, and the extra that installs each.
-_EXTRA_OF_PACKAGE = {
-    "rosbags": "ros",
-    "laspy": "clouds",
-    "plyfile": "clouds",
-    "pypcd4": "clouds",
-    "osmium": "geo",
-    "pyproj": "geo",
-    "gtsam": "odometry",
-    "kiss_icp": "odometry",
-    "small_gicp": "odometry",
-    "carla": "carla",
-    "cyclonedds": "ros2",
-    "rerun": "view",
-    "foxglove": "view",
 }
 #: Packages without a wheel for every supported platform, as in the markers of ``pyproject.toml``.
 _NOT_EVERYWHERE = {
@@ -102,7 +85,7 @@ def _run(arguments: list[str]) -> None:
     try:
         app_for(arguments)(arguments, prog_name="streetfix")
     except ModuleNotFoundError as error:
-        if _package(error) not in _EXTRA_OF_PACKAGE:
+        if package_of(error) not in EXTRA_OF_PACKAGE:
             raise
         raise _extra_missing(" ".join(arguments[:1]), None, error) from error
 
@@ -198,13 +181,12 @@ def _telling_extras(point: EntryPoint, extra: str | None, function: Callable[...
     return run
 
 
-def _package(error: ModuleNotFoundError) -> str:
-    return (error.name or "").partition(".")[0]
-
-
 def _extra_missing(command: str, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
-    extra = _EXTRA_OF_PACKAGE.get(_package(error), extra)
+    needed = EXTRA_OF_PACKAGE.get(package_of(error))
+    # The extra of a command contains that of the server.
+    if needed is not None and (extra is None or needed != "server"):
+        extra = needed
     remedy = how_to_install(extra) if extra else "install the packages it needs"
-    if _package(error) in _NOT_EVERYWHERE:
-        remedy = f"it is to be had {_NOT_EVERYWHERE[_package(error)]} alone ({remedy})"
+    if package_of(error) in _NOT_EVERYWHERE:
+        remedy = f"it is to be had {_NOT_EVERYWHERE[package_of(error)]} alone ({remedy})"
     return ExtraMissingError(f"the command {command!r} needs the package {error.name!r}: {remedy}", field=command)

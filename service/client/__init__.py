@@ -1,9 +1,13 @@
-"""Clients of the service over HTTP and gRPC. They take NumPy arrays and return typed answers."""
+"""Clients of the service over HTTP and gRPC. They take NumPy arrays or image files and return typed answers.
+
+``GrpcClient`` needs the extra ``grpc``, so its module is imported on first use. The others need no extra.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 from service.client.asking import About, AboutSequence, Frame
 from service.client.async_client import AsyncClient
 from service.client.client import Client
-from service.client.grpc_client import GrpcClient
 from service.client.retry import RetryPolicy
 from service.contract.schema import (
     LocalizeAnswer,
@@ -25,8 +29,12 @@ from service.errors import (
     StreetfixError,
     UnavailableError,
     UnreachableError,
+    extra_missing,
 )
 from service.geometry.camera import PinholeCamera
+
+if TYPE_CHECKING:
+    from service.client.grpc_client import GrpcClient
 
 __all__ = [
     "About",
@@ -55,3 +63,23 @@ __all__ = [
     "UnavailableError",
     "UnreachableError",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import ``GrpcClient`` on first use (PEP 562).
+
+    Args:
+        name: name of the attribute.
+
+    Raises:
+        AttributeError: there is no such name.
+        ExtraMissingError: the extra ``grpc`` is not installed.
+    """
+    if name != "GrpcClient":
+        raise AttributeError(f"module 'service.client' has no attribute {name!r}")
+    try:
+        from service.client.grpc_client import GrpcClient
+    except ModuleNotFoundError as error:
+        raise extra_missing("GrpcClient", "grpc", error) from error
+    globals()[name] = GrpcClient
+    return GrpcClient

@@ -10,13 +10,15 @@ from pydantic import BaseModel, ValidationError
 
 from service.client.encode import Packing, encode_depth, encode_rgb
 from service.contract import schema
+from service.contract.invalid import invalid
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import quaternion_xyzw_from
 
 D = TypeVar("D", bound=BaseModel)
-Rgb = NDArray[np.uint8]
-Depth = NDArray[Any]
+#: An image as an array, or the bytes of an image file, which are sent unchanged.
+Rgb = NDArray[np.uint8] | bytes
+Depth = NDArray[Any] | bytes
 Camera = PinholeCamera | schema.Camera
 
 
@@ -29,11 +31,16 @@ class About(TypedDict, total=False):
         T_vehicle_camera: (4, 4), pose of the camera in the vehicle frame, metres. With it, the answer has ``vehicle_pose``.
         prior: prior knowledge of the camera's pose.
         options: what the answer contains.
-        depth_scale_m: metres (disparity: pixels) per unit of the depth array. The default is 0.001 for integers and 1 for
+        depth_scale_m: metres (disparity: pixels) per unit of the depth image. The default is 0.001 for integers and 1 for
             floating-point values.
         depth_kind: ``z`` (along the optical axis, the default), ``range`` (along the ray) or ``disparity``.
         max_range_m: larger ranges are no measurement, metres.
         baseline_m: baseline of the stereo rig, metres. Required for disparity.
+        camera_height_m: height of the camera's centre above the ground, metres. Without it, the service finds the height in the
+            depth image. It replaces ``height_m`` of a ``schema.Camera``.
+        camera_height_std_m: standard deviation of ``camera_height_m``, metres. The default is 0.05.
+        vehicle_base_on_ground: whether the origin of the vehicle frame lies on the ground, as that of ``base_footprint``. Then the
+            height of the camera follows from ``T_vehicle_camera``.
     """
 
     map: str | None
@@ -45,6 +52,9 @@ class About(TypedDict, total=False):
     depth_kind: str
     max_range_m: float | None
     baseline_m: float | None
+    camera_height_m: float | None
+    camera_height_std_m: float | None
+    vehicle_base_on_ground: bool
 
 
 class AboutSequence(TypedDict, total=False):
@@ -57,12 +67,14 @@ class AboutSequence(TypedDict, total=False):
         T_vehicle_camera: (4, 4), pose of the camera in the vehicle frame, metres.
         prior: prior knowledge of the camera's pose.
         options: what the answer contains.
+        vehicle_base_on_ground: whether the origin of the vehicle frame lies on the ground, as in ``About``.
     """
 
     map: str | None
     T_vehicle_camera: NDArray[Any] | None
     prior: schema.Prior | None
     options: schema.Options | None
+    vehicle_base_on_ground: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -70,12 +82,13 @@ class Frame:
     """One colour image and one depth image of a sequence or a batch.
 
     Attributes:
-        rgb: (H, W, 3), sRGB.
-        depth: (H, W), metres as floating-point values, or uint16. 0 and NaN mean that nothing was measured.
+        rgb: (H, W, 3), sRGB, or the bytes of a JPEG, PNG or WebP file.
+        depth: (H, W), metres as floating-point values, or uint16. 0 and NaN mean that nothing was measured. Or the bytes of a
+            16-bit PNG, TIFF, NPY or raw16 file.
         camera: rectified intrinsics, pixels.
         T_reference_camera: (4, 4), transform from this camera to the first frame's camera, metres. None in the first frame
             and in a batch.
-        gravity, depth_scale_m, depth_kind, max_range_m, baseline_m: as in ``About``.
+        gravity, depth_scale_m, depth_kind, max_range_m, baseline_m, camera_height_m, camera_height_std_m: as in ``About``.
     """
 
     rgb: Rgb
@@ -87,6 +100,8 @@ class Frame:
     depth_kind: str = "z"
     max_range_m: float | None = None
     baseline_m: float | None = None
+    camera_height_m: float | None = None
+    camera_height_std_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,8 +121,8 @@ def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing) 
     """Build the request for a single query.
 
     Args:
-        rgb: (H, W, 3), sRGB.
-        depth: (H, W), metres along the optical axis as floating-point values, or uint16.
+        rgb: (H, W, 3), sRGB, or the bytes of an image file.
+        depth: (H, W), metres along the optical axis as floating-point values, or uint16. Or the bytes of an image file.
         camera: rectified intrinsics, pixels.
         about: optional data of the query.
         packing: how images are encoded.
@@ -117,7 +132,9 @@ def one(rgb: Rgb, depth: Depth, camera: Camera, about: About, packing: Packing) 
         TypeError: ``about`` has an unknown key.
     """
     _only_known(about, About)
-    names = ("gravity", "depth_scale_m", "depth_kind", "max_range_m", "baseline_m")
+    names = (
+        "gravity", "depth_scale_m", "depth_kind", "max_range_m", "baseline_m", "camera_height_m", "camera_height_std_m",
+    )  # fmt: skip
     known = {name: about[name] for name in names if name in about}  # type: ignore[literal-required]  # names of About
     frame = Frame(rgb=rgb, depth=depth, camera=camera, **known)
     said, pictures = _frame(frame, packing)
@@ -178,18 +195,38 @@ def _frame(frame: Frame, packing: Packing, where: str = "") -> tuple[dict[str, A
         RequestError: a value is invalid. ``field`` begins with ``where``.
     """
     try:
-        depth = encode_depth(frame.depth, scale_m=frame.depth_scale_m, codec=packing.depth_codec)
-        pictures = (encode_rgb(frame.rgb, quality=packing.quality), depth.data)
+        rgb = _rgb(frame, packing)
+        depth, scale_m = _depth(frame, packing)
     except RequestError as error:
         raise RequestError(f"{where}{error.message}", field=f"{where}{error.field}") from error
     said = {
-        "camera": _camera(frame.camera),
+        "camera": _camera(frame.camera) | _height(frame, where),
         "depth": {
-            "scale_m": depth.scale_m, "kind": frame.depth_kind, "max_range_m": frame.max_range_m, "baseline_m": frame.baseline_m,
+            "scale_m": scale_m, "kind": frame.depth_kind, "max_range_m": frame.max_range_m, "baseline_m": frame.baseline_m,
         },
         "gravity": _vector(frame.gravity, f"{where}gravity"),
     }  # fmt: skip
-    return said, pictures
+    return said, (rgb, depth)
+
+
+def _rgb(frame: Frame, packing: Packing) -> bytes:
+    if isinstance(frame.rgb, bytes):
+        return _file(frame.rgb, "rgb")
+    return encode_rgb(frame.rgb, quality=packing.quality)
+
+
+def _depth(frame: Frame, packing: Packing) -> tuple[bytes, float | None]:
+    """Return the encoded depth image and its scale, metres per unit. None leaves the scale of a file to the service."""
+    if isinstance(frame.depth, bytes):
+        return _file(frame.depth, "depth"), frame.depth_scale_m
+    encoded = encode_depth(frame.depth, scale_m=frame.depth_scale_m, codec=packing.depth_codec)
+    return encoded.data, encoded.scale_m
+
+
+def _file(data: bytes, field: str) -> bytes:
+    if not data:
+        raise RequestError(f"{field}: the file is empty (0 bytes); give the bytes of an image file", field=field)
+    return data
 
 
 def _of_all(about: About | AboutSequence) -> dict[str, Any]:
@@ -204,14 +241,31 @@ def _of_all(about: About | AboutSequence) -> dict[str, Any]:
     return {
         "map": about.get("map"), "prior": prior,
         "T_vehicle_camera": _transform(about.get("T_vehicle_camera"), "T_vehicle_camera"),
-    } | ({} if options is None else {"options": options})  # fmt: skip
+    } | ({} if options is None else {"options": options}) | (
+        {"vehicle_base_on_ground": about["vehicle_base_on_ground"]} if "vehicle_base_on_ground" in about else {}
+    )  # fmt: skip
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
     if isinstance(camera, schema.Camera):
-        return camera.model_dump()
+        return camera.model_dump(exclude_unset=True)
     numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     return numbers | {"distortion": list(camera.distortion)}
+
+
+def _height(frame: Frame, where: str) -> dict[str, float]:
+    """Return the fields of the camera's height. Nothing is sent that was not given: an earlier service does not know the fields.
+
+    Raises:
+        RequestError: a standard deviation was given without a height.
+    """
+    height_m, std_m = frame.camera_height_m, frame.camera_height_std_m
+    if height_m is None:
+        if std_m is not None:
+            field = f"{where}camera_height_std_m"
+            raise RequestError(f"{field}: it belongs to camera_height_m, which was not given; give both", field=field)
+        return {}
+    return {"height_m": height_m} | ({} if std_m is None else {"height_std_m": std_m})
 
 
 def _vector(vector: Sequence[float] | NDArray[Any] | None, field: str) -> dict[str, float] | None:
@@ -252,6 +306,4 @@ def _checked(make: Callable[[], D]) -> D:
     try:
         return make()
     except ValidationError as error:
-        from service.contract.convert import invalid  # slow import of the whole service, only needed for errors
-
         raise invalid(error) from error

@@ -48,13 +48,22 @@ class Client:
     """
 
     def __init__(
-        self, url: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
-        quality: int | None = JPEG_QUALITY, depth_codec: Codec = "zstd",
-        ca: str | Path | None = None, cert: str | Path | None = None, key: str | Path | None = None,
+        self,
+        url: str,
+        *,
+        api_key: str | None = None,
+        timeout_s: float = 30.0,
+        retry: RetryPolicy | None = None,
+        quality: int | None = JPEG_QUALITY,
+        depth_codec: Codec = "zstd",
+        ca: str | Path | None = None,
+        cert: str | Path | None = None,
+        key: str | Path | None = None,
         transport: httpx.BaseTransport | None = None,
-        sleep: Callable[[float], None] = time.sleep, clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.monotonic,
         draw: Callable[[], float] = random.random,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._tls = ClientTls.of(ca, cert, key)
         how = rest.settings_for(url, api_key=api_key, timeout_s=timeout_s, tls=self._tls)
         self._url, self._timeout_s = url, timeout_s
@@ -81,14 +90,16 @@ class Client:
         """Localize one query.
 
         Args:
-            rgb: (H, W, 3), sRGB.
+            rgb: (H, W, 3), sRGB, or the bytes of a JPEG, PNG or WebP file.
             depth: (H, W), metres along the optical axis as floating-point values, or uint16 (millimetres unless
-                ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured.
+                ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured. Or the bytes of a 16-bit PNG, TIFF, NPY
+                or raw16 file.
             camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
             **about: optional data; see ``About``.
 
         Raises:
             RequestError: an argument is invalid.
+            ExtraMissingError: the package that encodes an array is not installed.
             RefusedError: the service refused the request.
             UnavailableError: the service was temporarily unavailable until the retries ended.
             UnreachableError: no Streetfix service answers, or not in time.

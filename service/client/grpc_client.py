@@ -61,13 +61,23 @@ class GrpcClient:
     """
 
     def __init__(
-        self, address: str, *, api_key: str | None = None, timeout_s: float = 30.0, retry: RetryPolicy | None = None,
-        quality: int | None = JPEG_QUALITY, depth_codec: Codec = "zstd",
-        ca: str | Path | None = None, cert: str | Path | None = None, key: str | Path | None = None, tls: bool | None = None,
+        self,
+        address: str,
+        *,
+        api_key: str | None = None,
+        timeout_s: float = 30.0,
+        retry: RetryPolicy | None = None,
+        quality: int | None = JPEG_QUALITY,
+        depth_codec: Codec = "zstd",
+        ca: str | Path | None = None,
+        cert: str | Path | None = None,
+        key: str | Path | None = None,
+        tls: bool | None = None,
         credentials: grpc.ChannelCredentials | None = None,
-        sleep: Callable[[float], None] = time.sleep, clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.monotonic,
         draw: Callable[[], float] = random.random,
-    ) -> None:  # fmt: skip
+    ) -> None:
         host, _, port = address.rpartition(":")
         if not (host and port.isdecimal()) or "/" in address:
             raise RequestError(
@@ -111,9 +121,10 @@ class GrpcClient:
         """Localize one query, as ``Client.localize`` does.
 
         Args:
-            rgb: (H, W, 3), sRGB.
+            rgb: (H, W, 3), sRGB, or the bytes of a JPEG, PNG or WebP file.
             depth: (H, W), metres along the optical axis as floating-point values, or uint16 (millimetres unless
-                ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured.
+                ``depth_scale_m`` is given). 0 and NaN mean that nothing was measured. Or the bytes of a 16-bit PNG, TIFF, NPY
+                or raw16 file.
             camera: rectified intrinsics, pixels. Either image may be a uniformly resized version of this camera's image.
             **about: optional data; see ``About``.
         """

@@ -7,7 +7,7 @@ from service.contract import schema
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
 _KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
-_STATUS_PREFIX, _SECTION_PREFIX = "LOCALIZATION_STATUS_", "STREET_SECTION_"
+_STATUS_PREFIX, _SECTION_PREFIX, _ORIGIN_PREFIX = "LOCALIZATION_STATUS_", "STREET_SECTION_", "CAMERA_HEIGHT_ORIGIN_"
 
 
 def request_message(asked: Asked[schema.LocalizeRequest]) -> pb.LocalizeRequest:
@@ -45,7 +45,7 @@ def sequence_message(asked: Asked[schema.SequenceRequest]) -> pb.LocalizeSequenc
     ]  # fmt: skip
     return pb.LocalizeSequenceRequest(
         map=request.map, frames=frames, vehicle_from_camera=_transform(request.T_vehicle_camera), prior=_prior(request.prior),
-        options=_options(request.options),
+        options=_options(request.options), vehicle_base_on_ground=request.vehicle_base_on_ground,
     )  # fmt: skip
 
 
@@ -86,6 +86,7 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
                 }
                 for each in message.neighbours
             ],
+            "camera_height": _height_content(message.camera_height) if message.HasField("camera_height") else None,
             "map": {"name": message.map.name, "version": message.map.version},
             "timings_ms": {
                 stage: getattr(times, f"{stage}_ms") for stage in ("decode", "fuse", "encode", "search", "register", "total")
@@ -112,12 +113,14 @@ def _pair(request: schema.LocalizeRequest, pictures: tuple[bytes, bytes]) -> pb.
     return pb.LocalizeRequest(
         map=request.map, rgb=rgb, depth=depth, camera=_camera(request.camera), depth_format=_depth(request.depth),
         gravity=_vector(request.gravity), vehicle_from_camera=_transform(request.T_vehicle_camera),
-        options=_options(request.options), prior=_prior(request.prior),
+        options=_options(request.options), prior=_prior(request.prior), vehicle_base_on_ground=request.vehicle_base_on_ground,
     )  # fmt: skip
 
 
 def _camera(camera: schema.Camera) -> pb.Camera:
     numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy", "distortion")}
+    if camera.height_m is not None:
+        numbers |= {"height_m": camera.height_m, "height_std_m": camera.height_std_m}
     return pb.Camera(model=pb.CAMERA_MODEL_PINHOLE, **numbers)
 
 
@@ -168,6 +171,11 @@ def _pose_content(message: pb.Pose) -> dict[str, Any]:
         "position": _xyz(message.position), "orientation": _xyzw(message.orientation), "heading_deg": message.heading_deg,
         "covariance": list(message.covariance) or None,
     }  # fmt: skip
+
+
+def _height_content(message: pb.CameraHeight) -> dict[str, Any]:
+    origin = pb.CameraHeightOrigin.Name(message.origin).removeprefix(_ORIGIN_PREFIX).lower()
+    return {"height_m": message.height_m, "origin": origin}
 
 
 def _spread_content(message: pb.Spread) -> dict[str, Any]:

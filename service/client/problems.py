@@ -4,9 +4,16 @@ from service.errors import RefusedError, UnavailableError
 
 
 def refused(
-    title: str, detail: str, *, problem: str, status: str, field: str = "", request_id: str = "",
-    may_come_back: bool = False, retry_after_s: float | None = None,
-) -> RefusedError:  # fmt: skip
+    title: str,
+    detail: str,
+    *,
+    problem: str,
+    status: str,
+    field: str = "",
+    request_id: str = "",
+    may_come_back: bool = False,
+    retry_after_s: float | None = None,
+) -> RefusedError:
     """Return the error for a problem that the service reported.
 
     Args:

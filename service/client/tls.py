@@ -71,9 +71,13 @@ class ClientTls:
 
     @classmethod
     def of(
-        cls, ca: str | Path | None = None, cert: str | Path | None = None, key: str | Path | None = None, *,
+        cls,
+        ca: str | Path | None = None,
+        cert: str | Path | None = None,
+        key: str | Path | None = None,
+        *,
         environ: Mapping[str, str] | None = None,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """Read the settings from the arguments, and from the environment for each argument that is None.
 
         ``STREETFIX_CLIENT_CA``, ``STREETFIX_CLIENT_CERT`` and ``STREETFIX_CLIENT_KEY`` replace missing arguments. If neither

@@ -13,16 +13,16 @@ from service.geometry.rigid import R_BODY_OPTICAL, Transform, rotation_z, transf
 from service.imaging.fusion import picture_of
 from service.imaging.gather import gather
 from service.imaging.view_grid import ViewGrid
-from service.localization.frames import Frame
-from service.localization.query import Query
 from service.localization.refine import RefineSettings
 from service.maps.reader import MapBundle
 from service.registration.kernel import render
 from service.registration.register import Registered
-from service.registration.rendered import REACH_M, SURFEL_M
 from service.registration.surfel_map import TILE_M, SurfelMap
+from service.retrieval.frame import Frame
+from service.retrieval.query import Query
 from service.runtime.engine import EncodedQuery, Engine, Located
 from service.runtime.memory import EXPLAIN_PEAK
+from service.scoring.rendered_depth import REACH_M, SURFEL_M
 
 _WIDTH, _MAP_WIDTH = 320, 160  # of depth pictures; in a larger one the gaps between surfels show
 _POINTS_ACROSS = 160  # of the query's points in the map
@@ -143,8 +143,11 @@ def _small(depth_m: Float32[NDArray[np.float32], "H W"], width: int = _WIDTH) ->
 
 
 def _points(
-    query: Query, depth_m: Float32[NDArray[np.float32], "H W"], T_map_camera: Transform, origin_m: Float64[NDArray[np.float64], "3"]
-) -> bytes:  # fmt: skip
+    query: Query,
+    depth_m: Float32[NDArray[np.float32], "H W"],
+    T_map_camera: Transform,
+    origin_m: Float64[NDArray[np.float64], "3"],
+) -> bytes:
     z = _small(depth_m, _POINTS_ACROSS)
     camera = query.camera.scaled_to(z.shape[1], z.shape[0])
     colour = cv2.resize(query.rgb, (z.shape[1], z.shape[0]), interpolation=cv2.INTER_AREA)

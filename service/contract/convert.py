@@ -3,13 +3,17 @@
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
+from service.confidence.reasons import Reason
+from service.confidence.spread import Spread
 from service.contract import schema
+from service.contract.invalid import invalid
 from service.errors import NotYetSupportedError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import (
@@ -20,18 +24,21 @@ from service.geometry.rigid import (
     transform_from,
 )
 from service.geometry.uncertainty import covariance_at
+from service.imaging.level import GivenHeight
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
-from service.localization.prior import POSITION_STD_M, Prior
-from service.localization.reasons import Reason
-from service.localization.rivals import distinct_candidates, shares_of
-from service.localization.search import Neighbour
-from service.localization.spread import Spread
 from service.maps.reader import MapBundle
+from service.option_limits import LEAST_HEIGHT_M, MOST_HEIGHT_M, VEHICLE_HEIGHT_STD_M
+from service.retrieval.knn import Neighbour
+from service.retrieval.prior import POSITION_STD_M, Prior
 from service.runtime.engine import EncodedQuery, Located
 from service.runtime.last_answers import LastAnswer
+from service.scoring.candidates import distinct_candidates, shares_of
 
 M = TypeVar("M", bound=BaseModel)
+#: A camera of a sequence that is at most so far from the first one, metres, is on the same ground as the vehicle. The slope of a
+#: street makes the height of a farther camera unknown.
+SAME_GROUND_M = 2.0
 
 
 def parsed(document: bytes, model: type[M]) -> M:
@@ -66,29 +73,6 @@ def checked(content: dict[str, Any], model: type[M]) -> M:
         raise invalid(error) from error
 
 
-def invalid(error: ValidationError) -> RequestError:
-    """Convert an error of pydantic. The error names the first field; its message also names the next ones.
-
-    Args:
-        error: of pydantic.
-    """
-    return request_error_from(error.errors(include_url=False, include_input=False, include_context=False))
-
-
-def request_error_from(errors: Sequence[Any]) -> RequestError:
-    """Convert a list of pydantic's errors, as ``invalid`` does.
-
-    Args:
-        errors: as pydantic lists them; at least one.
-    """
-    told = [
-        f"{'.'.join(str(part) for part in each['loc']) or 'the request'}: {each['msg'].removeprefix('Value error, ')}"
-        for each in errors[:5]
-    ]
-    field = ".".join(str(part) for part in errors[0]["loc"])
-    return RequestError("; ".join(told) + "; see the schema at /openapi.json", field=field)
-
-
 def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> EncodedQuery:
     """Build the query of the core.
 
@@ -102,6 +86,10 @@ def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> 
         NotYetSupportedError: this release cannot use a field.
     """
     _require_supported(request.camera)
+    T_vehicle_camera = (
+        None if request.T_vehicle_camera is None else transform_of(request.T_vehicle_camera, "T_vehicle_camera")
+    )
+    over_base = height_over_base(T_vehicle_camera) if request.vehicle_base_on_ground else None
     return EncodedQuery(
         rgb=rgb,
         depth=depth,
@@ -113,9 +101,8 @@ def query_from(request: schema.LocalizeRequest, *, rgb: bytes, depth: bytes) -> 
         baseline_m=request.depth.baseline_m,
         max_range_m=request.depth.max_range_m,
         down_camera=None if request.gravity is None else _down(request.gravity),
-        T_vehicle_camera=None
-        if request.T_vehicle_camera is None
-        else transform_of(request.T_vehicle_camera, "T_vehicle_camera"),
+        camera_height=_given_height(request.camera) or over_base,
+        T_vehicle_camera=T_vehicle_camera,
         neighbours=request.options.neighbours,
         refine=request.options.refine,
         prior=None if request.prior is None else _prior(request.prior),
@@ -138,6 +125,11 @@ def sequence_from(
         NotYetSupportedError: this release cannot use a field.
     """
     queries, transforms = [], []
+    T_vehicle_reference = None
+    if request.vehicle_base_on_ground:
+        given = request.T_vehicle_camera
+        T_vehicle_reference = None if given is None else transform_of(given, "T_vehicle_camera")
+        height_over_base(T_vehicle_reference)  # refuses the request here, where the field has its own name
     for number, (frame, (rgb, depth)) in enumerate(zip(request.frames, pictures, strict=True)):
         where = f"frames.{number}"
         if (frame.T_reference_camera is None) != (number == 0):
@@ -150,10 +142,52 @@ def sequence_from(
             T_vehicle_camera=None if number else request.T_vehicle_camera, prior=None if number else request.prior,
         )  # fmt: skip
         with fields_under(where):
-            queries.append(query_from(alone, rgb=rgb, depth=depth))
+            query = query_from(alone, rgb=rgb, depth=depth)
             T = frame.T_reference_camera
             transforms.append(np.eye(4) if T is None else transform_of(T, "T_reference_camera"))
+        if query.camera_height is None and T_vehicle_reference is not None:
+            query = replace(query, camera_height=_height_on_same_ground(T_vehicle_reference, transforms[-1]))
+        queries.append(query)
     return tuple(queries), tuple(transforms)
+
+
+def height_over_base(T_vehicle_camera: NDArray[np.float64] | None) -> GivenHeight:
+    """Return the height of a camera over the origin of a vehicle frame that lies on the ground.
+
+    Args:
+        T_vehicle_camera: from the camera frame to the vehicle frame (z up), (4, 4), metres; None if it was not sent.
+
+    Raises:
+        RequestError: the transform was not sent, or its height is out of bounds.
+    """
+    if T_vehicle_camera is None:
+        raise RequestError(
+            "vehicle_base_on_ground: the height of the camera follows from T_vehicle_camera, which was not sent; send it, or send "
+            "camera.height_m instead", field="vehicle_base_on_ground",
+        )  # fmt: skip
+    height_m = float(T_vehicle_camera[2, 3])
+    if not LEAST_HEIGHT_M <= height_m <= MOST_HEIGHT_M:
+        raise RequestError(
+            f"T_vehicle_camera.position.z: with vehicle_base_on_ground, the camera would be {height_m:g} m above the ground, and "
+            f"{LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m are read; send T_vehicle_camera of a frame on the ground (z up, "
+            "metres), or send camera.height_m and no vehicle_base_on_ground", field="T_vehicle_camera.position.z",
+        )  # fmt: skip
+    return GivenHeight(height_m, VEHICLE_HEIGHT_STD_M)
+
+
+def _height_on_same_ground(
+    T_vehicle_reference: NDArray[np.float64], T_reference_camera: NDArray[np.float64]
+) -> GivenHeight | None:
+    """Return the height of a camera of a sequence over the ground of the vehicle; None if that ground may not be under it."""
+    height_m = float((T_vehicle_reference @ T_reference_camera)[2, 3])
+    near = math.dist(T_reference_camera[:3, 3], (0.0, 0.0, 0.0)) <= SAME_GROUND_M
+    if not near or not LEAST_HEIGHT_M <= height_m <= MOST_HEIGHT_M:
+        return None
+    return GivenHeight(height_m, VEHICLE_HEIGHT_STD_M)
+
+
+def _given_height(camera: schema.Camera) -> GivenHeight | None:
+    return None if camera.height_m is None else GivenHeight(camera.height_m, camera.height_std_m)
 
 
 @contextmanager
@@ -193,6 +227,7 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         spread=None if spread is None else _spread(spread),
         reasons=[_reason(each) for each in answer.reasons],
         neighbours=[_neighbour(each, bundle) for each in answer.neighbours],
+        camera_height=schema.CameraHeight(height_m=answer.height_m, origin=answer.height_origin),
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(
             decode=times.decode_ms,

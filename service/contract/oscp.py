@@ -6,6 +6,7 @@ Source: github.com/OpenArCloud/oscp-geopose-protocol (README, November 2026). Th
 - A DEPTH image of integers holds millimetres, one of floats holds metres. Depth beyond the
   maximum of ``minMaxDepth`` counts as not measured.
 - An accuracy of 0, or above ``_MOST_STD_M``, means unknown. The clients' structures start with 0 and with the largest float.
+- ``heightAboveGround`` and ``heightAboveGroundAccuracy`` of a camera's parameters are our own fields. The protocol has none.
 - The accelerometer follows W3C: x right, y up, z towards the viewer. At rest it points up. The camera looks the other way.
 """
 
@@ -22,6 +23,7 @@ from service.contract import schema
 from service.contract.convert import checked, query_from
 from service.errors import DecodeError, NotYetSupportedError, RequestError
 from service.geometry.rigid import rotation_from_quaternion_xyzw
+from service.option_limits import LEAST_HEIGHT_M, LEAST_HEIGHT_STD_M, MOST_HEIGHT_M, MOST_HEIGHT_STD_M
 from service.runtime.engine import EncodedQuery
 
 #: Number of focal lengths and of distortion coefficients per camera model. The principal point has two numbers in each model.
@@ -50,11 +52,20 @@ class _Lenient(BaseModel):
 
 
 class CameraParams(_Lenient):
-    """Intrinsics of a camera, as in COLMAP, and its depth range."""
+    """Intrinsics of a camera, as in COLMAP, its depth range, and its height."""
 
     model: str | None = None
     modelParams: list[_Pixels] | None = Field(None, max_length=32)
     minMaxDepth: list[_Metres] | None = Field(None, max_length=2)
+    heightAboveGround: float | None = Field(
+        None, ge=LEAST_HEIGHT_M, le=MOST_HEIGHT_M,
+        description="height of the colour camera above the ground, metres. A field of this service, not of the protocol. Not sent: "
+        "the service finds the height in the DEPTH image",
+    )  # fmt: skip
+    heightAboveGroundAccuracy: float | None = Field(
+        None, ge=LEAST_HEIGHT_STD_M, le=MOST_HEIGHT_STD_M,
+        description="standard deviation of heightAboveGround, metres. A field of this service, not of the protocol",
+    )  # fmt: skip
 
 
 class ImageOrientation(_Lenient):
@@ -214,7 +225,11 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
         "camera's picture (16-bit PNG in mm, or float TIFF in m) as a second reading",
     )  # fmt: skip
     _require_same_view(colour, depth)
-    content: dict[str, Any] = {"map": map_name, "camera": _camera(colour), "depth": _depth_format(depth)}
+    content: dict[str, Any] = {
+        "map": map_name,
+        "camera": _camera(colour) | _height(colour),
+        "depth": _depth_format(depth),
+    }
     if gravity := _gravity(readings):
         content["gravity"] = gravity
     if prior := _prior(request, readings):
@@ -273,6 +288,14 @@ def _camera(reading: CameraReading) -> dict[str, Any]:
         "width": int(reading.size[0]), "height": int(reading.size[1]), "fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5,
         "distortion": numbers[focal + 2 :],
     }  # fmt: skip
+
+
+def _height(reading: CameraReading) -> dict[str, float]:
+    params = reading.params or CameraParams()
+    if params.heightAboveGround is None:
+        return {}
+    std_m = params.heightAboveGroundAccuracy
+    return {"height_m": params.heightAboveGround} | ({} if std_m is None else {"height_std_m": std_m})
 
 
 def _require_same_view(colour: CameraReading, depth: CameraReading) -> None:

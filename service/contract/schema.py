@@ -7,8 +7,18 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationInfo, 
 from pydantic.config import JsonDict
 
 from service.errors import NotLocalizedError, RequestError
-from service.localization.prior import HEADING_STD_DEG, POSITION_STD_M
-from service.localization.query import LEAST_FALSE_ACCEPT_RATE, MOST_NEIGHBOURS, NEIGHBOURS
+from service.option_limits import (
+    HEIGHT_STD_M,
+    LEAST_FALSE_ACCEPT_RATE,
+    LEAST_HEIGHT_M,
+    LEAST_HEIGHT_STD_M,
+    MOST_HEIGHT_M,
+    MOST_HEIGHT_STD_M,
+    MOST_NEIGHBOURS,
+    NEIGHBOURS,
+    VEHICLE_HEIGHT_STD_M,
+)
+from service.retrieval.prior import HEADING_STD_DEG, POSITION_STD_M
 
 #: Limits of a focal length, in widths or heights of the image: 175 and 0.6 degrees of view. A value outside was given in another unit
 #: than pixels.
@@ -89,6 +99,14 @@ class Camera(_Strict):
         description="distortion coefficients of the images as sent: empty or zero. The service refuses other values: "
         "rectify the images first",
     )
+    height_m: float | None = Field(
+        None, ge=LEAST_HEIGHT_M, le=MOST_HEIGHT_M,
+        description="height of the camera's centre above the ground, metres. Not sent: the service finds it in the depth image",
+    )  # fmt: skip
+    height_std_m: float = Field(
+        HEIGHT_STD_M, ge=LEAST_HEIGHT_STD_M, le=MOST_HEIGHT_STD_M,
+        description="standard deviation of height_m, metres. It counts only with height_m",
+    )  # fmt: skip
 
     @field_validator("model", mode="before")
     @classmethod
@@ -217,7 +235,7 @@ class LocalizeRequest(_Strict):
             "examples": [
                 {
                     "map": "paper-city",
-                    "camera": _CAMERA,
+                    "camera": _CAMERA | {"height_m": 1.6, "height_std_m": 0.05},
                     "depth": _DEPTH,
                     "gravity": {"x": 0.01, "y": 0.999, "z": 0.02},
                     "prior": {"position": {"x": 12.0, "y": -40.0, "std_m": 20.0}, "heading_deg": 90.0},
@@ -235,6 +253,12 @@ class LocalizeRequest(_Strict):
     )
     T_vehicle_camera: RigidTransform | None = Field(
         None, description="pose of the camera on the vehicle. If sent, the answer also has the vehicle pose"
+    )
+    vehicle_base_on_ground: bool = Field(
+        False,
+        description="true: the origin of the vehicle frame lies on the ground and its z axis points up, as base_footprint of "
+        "REP 105. Without camera.height_m, the camera's height is then the z of T_vehicle_camera "
+        f"(standard deviation {VEHICLE_HEIGHT_STD_M:g} m)",
     )
     prior: Prior | None = Field(None, description="prior of the camera pose: a position, a heading, or both")
     options: Options = Options()
@@ -291,6 +315,7 @@ class SequenceRequest(_Strict):
                         {"camera": _CAMERA, "depth": _DEPTH, "T_reference_camera": _AHEAD},
                     ],
                     "T_vehicle_camera": _FORWARD_CAMERA,
+                    "vehicle_base_on_ground": True,
                 }
             ]
         }
@@ -301,6 +326,12 @@ class SequenceRequest(_Strict):
     T_vehicle_camera: RigidTransform | None = Field(
         None,
         description="pose of the first frame's camera on the vehicle. If sent, the answer also has the vehicle pose",
+    )
+    vehicle_base_on_ground: bool = Field(
+        False,
+        description="true: the origin of the vehicle frame lies on the ground and its z axis points up, as base_footprint of "
+        "REP 105. Without camera.height_m, the first camera's height is then the z of T_vehicle_camera "
+        f"(standard deviation {VEHICLE_HEIGHT_STD_M:g} m). A camera within 2 m of the first one follows by its T_reference_camera",
     )
     prior: Prior | None = Field(None, description="prior of the pose of the first frame's camera")
     options: Options = Options()
@@ -428,6 +459,16 @@ class Reason(BaseModel):
     remedy: str = Field(description="what to do")
 
 
+class CameraHeight(BaseModel):
+    """Height of the camera above the ground that the answer rests on."""
+
+    height_m: float = Field(description="height of the camera's centre above the ground, metres")
+    origin: Literal["given", "estimated", "assumed"] = Field(
+        description="given: by the request. estimated: from the ground in the depth image. assumed: the depth image shows no "
+        "ground, so the service takes the usual height of 1.5 m; send camera.height_m if the camera has another height"
+    )
+
+
 class MapVersion(BaseModel):
     """A map and its version, for example the map that answered."""
 
@@ -486,6 +527,10 @@ class LocalizeAnswer(BaseModel):
         description="k distinct places. The places nearest to the registered poses come first, "
         "with those of the best supported pose before all others. The most similar places follow. "
         "Without registration, only similarity orders them"
+    )
+    camera_height: CameraHeight | None = Field(
+        None,  # an earlier service sends none
+        description="height of the camera above the ground, in an answer of any status. In a sequence, that of the first frame",
     )
     map: MapVersion
     timings_ms: TimingsMs

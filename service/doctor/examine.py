@@ -12,7 +12,7 @@ from service.doctor.pair import Pair, check_depth_unit, check_images, check_meas
 from service.doctor.registered import check_registered
 from service.errors import StreetfixError
 from service.localization.localizer import Localizer
-from service.localization.query import FALSE_ACCEPT_RATE
+from service.option_limits import FALSE_ACCEPT_RATE
 from service.runtime.settings import Settings, load_settings
 
 
@@ -132,5 +132,6 @@ def _pair(request: LocalizeRequest, rgb: Path, depth: Path) -> Generator[Finding
     if not pair.depth_m.any():
         return None
     yield check_registered(pair.rgb, pair.depth_m)
-    yield check_ground(ground_of(pair.depth_m, pair.encoded.camera, pair.encoded.down_camera))
+    encoded = pair.encoded
+    yield check_ground(ground_of(pair.depth_m, encoded.camera, encoded.down_camera, encoded.camera_height))
     return pair

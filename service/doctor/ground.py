@@ -1,4 +1,4 @@
-"""Check that the depth image shows the ground, and that the camera is mounted as the service assumes."""
+"""Check that the depth image shows the ground, and that the service finds the height and tilt of the camera."""
 
 from dataclasses import dataclass
 
@@ -8,16 +8,26 @@ from numpy.typing import NDArray
 
 from service.doctor.finding import Finding
 from service.geometry.camera import PinholeCamera
-from service.imaging.level import NEAR_M, REACH_M, STEP_PIXELS, CameraLevel, level_camera
+from service.imaging.level import (
+    HEIGHT_RANGE_M,
+    NEAR_M,
+    REACH_M,
+    STEP_PIXELS,
+    USUAL_HEIGHT_M,
+    CameraLevel,
+    GivenHeight,
+    HeightOrigin,
+    level_camera,
+    level_query,
+)
 
-#: Height above the ground that the service takes as usual (``service.imaging.query_view``), metres.
-ASSUMED_HEIGHT_M = 1.5
 #: Heights from which a fit starts, metres, and pitches (down is positive) where no gravity is given, degrees. ``level_camera`` finds only
 #: planes near its prior.
-HEIGHTS_M = (0.2, 0.35, 0.6, 1.0, 1.5, 2.0, 2.7, 3.6)
+HEIGHTS_M = (0.1, 0.2, 0.35, 0.6, 1.0, 1.5, 2.0, 2.7, 3.6, 5.0, 7.0)
 PITCHES_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
-#: Usual heights of the camera, metres, and the largest tilt, degrees.
-LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.5, 2.5
+#: Usual heights of a camera, metres. Another height may also come from a wrong depth unit or focal length.
+USUAL_RANGE_M = (0.5, 2.5)
+#: Largest tilt, degrees.
 MOST_TILT_DEG = 15.0
 #: A ground point lies so near to the plane: constant part (m), and part per metre of distance.
 NEAR_PLANE_M, NEAR_PLANE_PER_M = 0.05, 0.01
@@ -25,7 +35,7 @@ NEAR_PLANE_M, NEAR_PLANE_PER_M = 0.05, 0.01
 LEAST_SHARE = 0.1
 #: Another plane than that of the service counts only if it has so many times as many points.
 BETTER = 1.25
-#: Largest difference between the height of the plane and the height that the service finds from its own prior, metres.
+#: Largest difference between the height of the plane and the height that the service finds, or that the request gives, metres.
 AGREE_M = 0.2
 
 
@@ -39,6 +49,8 @@ class Ground:
         pitch_deg: how far the optical axis points below the horizon, degrees.
         roll_deg: rotation about the optical axis, degrees; positive if the right side of the image is lower.
         found_by_service_m: height of the camera that the service finds, metres.
+        origin: where the service takes this height from.
+        given_m: height that the request gives, metres; None if it gives none.
     """
 
     share: float
@@ -46,22 +58,26 @@ class Ground:
     pitch_deg: float
     roll_deg: float
     found_by_service_m: float
+    origin: HeightOrigin = "estimated"
+    given_m: float | None = None
 
 
 def ground_of(
     depth_m: Float32[NDArray[np.float32], "H W"],
     camera: PinholeCamera,
     down_camera: Float64[NDArray[np.float64], "3"] | None,
+    given: GivenHeight | None = None,
 ) -> Ground:
-    """Find the ground from many priors, and compare with what the service finds from its own prior.
+    """Find the ground from many priors, and compare with what the service finds.
 
     Args:
         depth_m: z, metres, 0 where nothing was measured.
         camera: intrinsics, pixels, at any size with the same aspect ratio.
         down_camera: direction of gravity in the camera frame, if known.
+        given: height of the camera that the request gives; None if it gives none.
     """
     points = _points(depth_m, camera)
-    own = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=ASSUMED_HEIGHT_M)
+    own, origin = level_query(depth_m, camera, down_camera=down_camera, given=given)
     own_share = _share_on(points, own)
     best, best_share = own, own_share
     for down in [down_camera] if down_camera is not None else [_down_of(pitch) for pitch in PITCHES_DEG]:
@@ -77,6 +93,8 @@ def ground_of(
         pitch_deg=float(np.rad2deg(np.arcsin(np.clip(-R[2, 2], -1, 1)))),
         roll_deg=float(np.rad2deg(np.arctan2(-R[2, 0], -R[2, 1]))),
         found_by_service_m=own.height_m,
+        origin=origin,
+        given_m=None if given is None else given.height_m,
     )
 
 
@@ -104,28 +122,34 @@ def _share_on(points: Float64[NDArray[np.float64], "N 3"], found: CameraLevel) -
 
 
 def check_ground(ground: Ground) -> Finding:
-    """Check that the ground is seen, and that height and tilt of the camera are usual.
+    """Check that the ground is seen, that the service finds the height of the camera, and that its tilt is small.
 
     Args:
         ground: as ``ground_of`` found it.
     """
-    check = "camera height"
+    check, (least_m, most_m) = "camera height", HEIGHT_RANGE_M
     if ground.share < LEAST_SHARE:
+        taken_m = USUAL_HEIGHT_M if ground.given_m is None else ground.given_m
+        sent = ", and send camera.height_m and gravity" if ground.given_m is None else ", and send gravity"
         return Finding(
             check, "warning", f"no ground is seen: {ground.share:.0%} of the pixels between {NEAR_M:g} and {REACH_M:g} m lie on one plane "
             "below the camera",
-            f"the service then assumes a level camera {ASSUMED_HEIGHT_M:g} m above the ground; let the image show the ground, and send "
-            "gravity",
+            f"the service then assumes a level camera {taken_m:g} m above the ground; let the image show the ground{sent}",
         )  # fmt: skip
     text = (
         f"{ground.height_m:.2f} m above the ground, {abs(ground.pitch_deg):.0f} degrees {'down' if ground.pitch_deg >= 0 else 'up'}, "
         f"rolled by {abs(ground.roll_deg):.0f} degrees"
     )
-    if not LEAST_HEIGHT_M <= ground.height_m <= MOST_HEIGHT_M:
+    if ground.given_m is not None and abs(ground.height_m - ground.given_m) > AGREE_M:
+        return Finding(
+            check, "warning", f"{text}, but the request gives {ground.given_m:g} m",
+            "measure the height of the camera's centre above the ground again; if it is right, depth.scale_m or fy is wrong",
+        )  # fmt: skip
+    if ground.given_m is None and not least_m <= ground.height_m <= most_m:
         return Finding(
             check, "warning", text,
-            f"usual are {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m, and the service assumes about {ASSUMED_HEIGHT_M:g} m: mount the camera "
-            f"so; if it is mounted so, depth.scale_m is off by a factor of about {ASSUMED_HEIGHT_M / ground.height_m:.2g}, or fy is wrong",
+            f"the service finds heights from {least_m:g} to {most_m:g} m: send camera.height_m; if the camera is not mounted so, "
+            "depth.scale_m or fy is wrong",
         )  # fmt: skip
     if max(abs(ground.pitch_deg), abs(ground.roll_deg)) > MOST_TILT_DEG:
         return Finding(
@@ -134,7 +158,12 @@ def check_ground(ground: Ground) -> Finding:
         )  # fmt: skip
     if abs(ground.height_m - ground.found_by_service_m) > AGREE_M:
         return Finding(
-            check, "warning", f"{text}, but the service takes it for {ground.found_by_service_m:.2f} m",
-            f"the service assumes a level camera about {ASSUMED_HEIGHT_M:g} m above the ground: mount the camera so, or send gravity",
+            check, "warning", f"{text}, but the service takes it for {ground.found_by_service_m:.2f} m ({ground.origin})",
+            "send camera.height_m and gravity in every request",
+        )  # fmt: skip
+    if ground.given_m is None and not USUAL_RANGE_M[0] <= ground.height_m <= USUAL_RANGE_M[1]:
+        return Finding(
+            check, "ok", f"{text}; the service finds this height",
+            "if the camera is not mounted so, depth.scale_m or fy is wrong; if it is, camera.height_m makes the height certain",
         )  # fmt: skip
     return Finding(check, "ok", text)

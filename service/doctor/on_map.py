@@ -7,15 +7,14 @@ from jaxtyping import Bool
 from numpy.typing import NDArray
 
 from service.doctor.finding import Finding
-from service.doctor.ground import ASSUMED_HEIGHT_M
 from service.doctor.pair import Pair
 from service.errors import StreetfixError
 from service.imaging.gather import gather
-from service.imaging.level import level_camera
+from service.imaging.level import level_query
 from service.localization.answer import Answer
-from service.localization.decoding import DepthFormat, decoded_query
 from service.localization.localizer import Localizer
 from service.maps.reader import MapBundle
+from service.retrieval.query import DepthFormat, decoded_query
 from service.runtime.engine import prior_in
 
 #: Share of the camera's rows that the LiDAR must see.
@@ -29,8 +28,8 @@ def rows_of_camera(pair: Pair, bundle: MapBundle) -> Bool[NDArray[np.bool_], " r
         pair: decoded images.
         bundle: the map.
     """
-    camera = pair.encoded.camera
-    level = level_camera(pair.depth_m, camera, down_camera=pair.encoded.down_camera, nominal_height_m=ASSUMED_HEIGHT_M)
+    encoded, camera = pair.encoded, pair.encoded.camera
+    level, _ = level_query(pair.depth_m, camera, down_camera=encoded.down_camera, given=encoded.camera_height)
     _, _, seen = gather(pair.rgb, pair.depth_m, camera, level.R_level_camera.T, bundle.grid)
     columns = int(seen.any(axis=0).sum())
     rows: Bool[NDArray[np.bool_], " rows"] = (seen.sum(axis=1) * 2 >= columns) & (columns > 0)
@@ -38,8 +37,10 @@ def rows_of_camera(pair: Pair, bundle: MapBundle) -> Bool[NDArray[np.bool_], " r
 
 
 def check_rows(
-    camera_rows: Bool[NDArray[np.bool_], " rows"], lidar_rows: Bool[NDArray[np.bool_], " rows"], elevations_rad: NDArray[np.float64]
-) -> Finding:  # fmt: skip
+    camera_rows: Bool[NDArray[np.bool_], " rows"],
+    lidar_rows: Bool[NDArray[np.bool_], " rows"],
+    elevations_rad: NDArray[np.float64],
+) -> Finding:
     """Check that the LiDAR of the survey saw the heights that the camera sees.
 
     Args:
@@ -90,8 +91,9 @@ def answer_of(pair: Pair, localizer: Localizer, false_accept_rate: float) -> Ans
     query = decoded_query(encoded.rgb, encoded.depth, encoded.camera, form, grid=bundle.grid)
     return localizer.localize(
         replace(
-            query, down_camera=encoded.down_camera, T_vehicle_camera=encoded.T_vehicle_camera, neighbours=encoded.neighbours,
-            refine=encoded.refine, prior=prior_in(encoded, bundle), false_accept_rate=encoded.false_accept_rate or false_accept_rate,
+            query, down_camera=encoded.down_camera, camera_height=encoded.camera_height, T_vehicle_camera=encoded.T_vehicle_camera,
+            neighbours=encoded.neighbours, refine=encoded.refine, prior=prior_in(encoded, bundle),
+            false_accept_rate=encoded.false_accept_rate or false_accept_rate,
         )
     )  # fmt: skip
 

@@ -6,8 +6,10 @@ from numpy.typing import NDArray
 
 
 def covariance_at(
-    covariance: Float64[NDArray[np.float64], "6 6"], from_m: Float64[NDArray[np.float64], "3"], to_m: Float64[NDArray[np.float64], "3"]
-) -> Float64[NDArray[np.float64], "6 6"]:  # fmt: skip
+    covariance: Float64[NDArray[np.float64], "6 6"],
+    from_m: Float64[NDArray[np.float64], "3"],
+    to_m: Float64[NDArray[np.float64], "3"],
+) -> Float64[NDArray[np.float64], "6 6"]:
     """Propagate a pose covariance from one reference point of a rigid body to another (adjoint).
 
     All arguments use the same axes.

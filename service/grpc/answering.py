@@ -15,6 +15,7 @@ from service.grpc.memory import held_by_call
 from service.grpc.status import fail, refuse
 from service.runtime.engine import Engine
 from service.runtime.logs import log_request
+from service.runtime.tracing import NO_SPAN
 
 REQUEST_ID = "x-request-id"
 _ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -36,7 +37,7 @@ def answering(
     given = metadata.get(REQUEST_ID, "")
     request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
     began, code = perf_counter(), "OK"
-    span = engine.tracing.begin("grpc", metadata.get("traceparent"))
+    span = NO_SPAN if engine.tracing is None else engine.tracing.begin("grpc", metadata.get("traceparent"))
     try:
         context.send_initial_metadata(((REQUEST_ID, request_id),))
         yield Call(

@@ -9,8 +9,7 @@ from typing import TypeVar
 import grpc
 
 from service.errors import DeadlineError
-from service.runtime.admission import Admission
-from service.runtime.memory import Hold
+from service.runtime.admission import Admission, Hold
 from service.runtime.tracing import RequestSpan
 
 T = TypeVar("T")
@@ -31,8 +30,14 @@ class Call:
     """
 
     def __init__(
-        self, admission: Admission, context: grpc.ServicerContext, span: RequestSpan, *, timeout_s: float, hold: Hold | None = None
-    ) -> None:  # fmt: skip
+        self,
+        admission: Admission,
+        context: grpc.ServicerContext,
+        span: RequestSpan,
+        *,
+        timeout_s: float,
+        hold: Hold | None = None,
+    ) -> None:
         self.span = span
         self._admission = admission
         self._context = context

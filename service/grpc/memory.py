@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 from service.errors import BusyError
-from service.runtime.memory import GRPC_OTHERS, GRPC_PARSED, Hold, MemoryBudget
+from service.runtime.admission import Hold, MemoryBudget
+from service.runtime.memory import GRPC_OTHERS, GRPC_PARSED
 
 #: Share of the budget for open streams. Each may send a message of the largest size at any time.
 STREAMS_SHARE = 0.5

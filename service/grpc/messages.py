@@ -29,6 +29,10 @@ _STATUS = {
     "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED, "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
     "OUT_OF_MAP": pb.LOCALIZATION_STATUS_OUT_OF_MAP,
 }  # fmt: skip
+_ORIGINS = {
+    "given": pb.CAMERA_HEIGHT_ORIGIN_GIVEN, "estimated": pb.CAMERA_HEIGHT_ORIGIN_ESTIMATED,
+    "assumed": pb.CAMERA_HEIGHT_ORIGIN_ASSUMED,
+}  # fmt: skip
 _SECTIONS = {
     None: pb.STREET_SECTION_UNSPECIFIED, "beginning": pb.STREET_SECTION_BEGINNING, "end": pb.STREET_SECTION_END,
 }  # fmt: skip
@@ -79,6 +83,7 @@ def _of_all(message: pb.LocalizeRequest | pb.LocalizeSequenceRequest) -> dict[st
     """Fields that a single pair and a sequence share."""
     return (
         _given(message, "map") | _sub(message, "vehicle_from_camera", "T_vehicle_camera", transform_content)
+        | {"vehicle_base_on_ground": message.vehicle_base_on_ground}
         | _sub(message, "prior", "prior", _prior)
         | _sub(message, "options", "options", lambda m: _given(m, "neighbours", "refine", "false_accept_rate"))
     )  # fmt: skip
@@ -94,10 +99,14 @@ def _of_pair(message: pb.LocalizeRequest | pb.SequenceFrame) -> dict[str, Any]:
 
 def _camera(message: pb.Camera) -> dict[str, Any]:
     numbers = {name: getattr(message, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return numbers | {
-        "model": _MODELS.get(message.model, message.model),
-        "distortion": list(message.distortion[:_MOST_COEFFICIENTS]),
-    }
+    return (
+        numbers
+        | _given(message, "height_m", "height_std_m")
+        | {
+            "model": _MODELS.get(message.model, message.model),
+            "distortion": list(message.distortion[:_MOST_COEFFICIENTS]),
+        }
+    )
 
 
 def _depth(message: pb.DepthFormat) -> dict[str, Any]:
@@ -166,6 +175,7 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
             )
             for each in answer.neighbours
         ],
+        camera_height=None if answer.camera_height is None else _camera_height(answer.camera_height),
         map=pb.MapVersion(name=answer.map.name, version=answer.map.version),
         timings=pb.Timings(
             decode_ms=times.decode, fuse_ms=times.fuse, encode_ms=times.encode, search_ms=times.search,
@@ -190,6 +200,10 @@ def map_message(entry: schema.MapEntry) -> pb.MapEntry:
         entry: of the map.
     """
     return pb.MapEntry(**entry.model_dump())
+
+
+def _camera_height(height: schema.CameraHeight) -> pb.CameraHeight:
+    return pb.CameraHeight(height_m=height.height_m, origin=_ORIGINS[height.origin])
 
 
 def _geopose(geopose: schema.GeoPose) -> pb.GeoPose:

@@ -9,13 +9,10 @@ from fastapi.openapi.utils import get_openapi
 from service.contract import schema
 from service.contract.oscp import GeoPoseRequest
 from service.http import problems, reference
-from service.http.asking import Asking
-from service.http.auth import AuthMiddleware
-from service.http.host_check import HostMiddleware
-from service.http.request_id import RequestIdMiddleware
+from service.http.body import Asking
+from service.http.middleware import AllowedHosts, AuthMiddleware, HostMiddleware, RequestIdMiddleware
 from service.http.routes import answers, console, drawing, explain, health, localize, maps, oscp, samples
 from service.runtime.engine import Engine
-from service.runtime.hosts import AllowedHosts
 from service.runtime.keys import KeyRing
 
 _DESCRIPTION = """Streetfix localizes one RGB image and one depth image against a LiDAR map: street, position and heading.

@@ -1,4 +1,4 @@
-"""Read a request body with a byte limit, and split multipart/form-data in memory.
+"""Receive a request body with limits on size, number and time, and split multipart/form-data in memory.
 
 Starlette limits form fields but not files, and writes parts over 1 MiB to temporary files. This service needs a byte limit for files
 too, and may run on a read-only file system.
@@ -6,19 +6,23 @@ too, and may run on a read-only file system.
 
 import asyncio
 import re
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from email.message import Message
 from functools import lru_cache
 from typing import TypeVar
 
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response
 
-from service.errors import RequestError, TooLargeError, UnsupportedFormatError
-from service.runtime.admission import Admission
-from service.runtime.memory import MIB, Hold
+from service.contract.schema import MOST_FRAMES
+from service.errors import BusyError, DeadlineError, RequestError, TooLargeError, UnsupportedFormatError
+from service.runtime.admission import MIB, Admission, Hold
+from service.runtime.engine import Engine
 
 T = TypeVar("T")
 
+#: Maximum number of parts: an image pair for each frame of the longest sequence, and the JSON.
+MOST_PARTS = 2 * MOST_FRAMES + 1
 #: Step of the memory reservation for a body of unknown length.
 _STEP = MIB
 _HEADERS_AT_MOST = 4096
@@ -112,10 +116,65 @@ class Body:
         return content
 
 
-def _too_large(what: str, max_bytes: int) -> TooLargeError:
-    return TooLargeError(
-        f"the body has {what}; this service takes {max_bytes}: send smaller or better compressed pictures"
-    )
+class Asking:
+    """Reads bodies for an engine. All routes of an application share one.
+
+    Args:
+        engine: does the work.
+
+    Attributes:
+        engine: as given.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._bodies = asyncio.Semaphore(
+            engine.admission.capacity
+        )  # limits the number of bodies being received; the memory budget limits their size
+
+    async def in_time(self, work: Callable[[], T]) -> T:
+        """Run work without a body on a worker, within the time limit of a request.
+
+        Args:
+            work: to run.
+
+        Raises:
+            BusyError: the queue is full.
+            DeadlineError: the work took too long.
+        """
+        settings = self.engine.settings
+        try:
+            async with asyncio.timeout(settings.request_timeout_s):
+                return await asyncio.wrap_future(self.engine.admission.submit(work))
+        except TimeoutError as error:
+            raise DeadlineError(f"not done within {settings.request_timeout_s:g} s; try again later") from error
+
+    async def __call__(self, request: Request, work: Callable[[Body], Awaitable[Response]]) -> Response:
+        """Read the body and run the work on it.
+
+        Args:
+            request: its body has not been read yet.
+            work: answers a complete body.
+
+        Raises:
+            BusyError: too many requests are being received or wait, or the memory for requests is taken.
+            TooLargeError: the body exceeds the limit.
+            DeadlineError: body and work took longer than a request may.
+        """
+        settings = self.engine.settings
+        if self._bodies.locked():
+            raise BusyError(
+                f"{self.engine.admission.capacity} requests are coming in or wait already; try again in a second"
+            )
+        try:
+            with self.engine.memory.hold() as hold:
+                async with asyncio.timeout(settings.request_timeout_s), self._bodies:
+                    content = await read_body(request, max_bytes=settings.limits.max_request_bytes, hold=hold)
+                    return await _unless_gone(request, work(Body(content, hold, self.engine.admission)))
+        except TimeoutError as error:
+            raise DeadlineError(
+                f"no answer within {settings.request_timeout_s:g} s; send the body faster, or try again later"
+            ) from error
 
 
 def split_multipart(body: bytearray, content_type: str, *, max_parts: int) -> dict[str, bytes]:
@@ -148,6 +207,83 @@ def split_multipart(body: bytearray, content_type: str, *, max_parts: int) -> di
         parts[name] = content
         start = end + len(delimiter)
     return parts
+
+
+def require_parts(parts: dict[str, bytes], names: tuple[str, ...]) -> None:
+    """Require exactly the given parts.
+
+    Args:
+        parts: content by name.
+        names: required names.
+
+    Raises:
+        RequestError: a part is missing or unknown.
+    """
+    told = f"send the parts {', '.join(names[:-1])} and {names[-1]}"
+    for name in names:
+        if name not in parts:
+            raise RequestError(f"the part {name!r} is missing; {told}", field=name)
+    if unknown := sorted(set(parts) - set(names)):
+        raise RequestError(f"the part {unknown[0]!r} is unknown; {told}", field=unknown[0])
+
+
+def document_of(parts: dict[str, bytes]) -> bytes:
+    """Return the JSON part.
+
+    Args:
+        parts: content by name.
+
+    Raises:
+        RequestError: the part is missing.
+    """
+    if "request" not in parts:
+        raise RequestError(
+            "the part 'request' is missing; send the JSON that says what the pictures are", field="request"
+        )
+    return parts["request"]
+
+
+def numbered_pictures(parts: dict[str, bytes], count: int) -> list[tuple[bytes, bytes]]:
+    """Return the image pairs (rgb0, depth0), (rgb1, depth1) and so on.
+
+    Args:
+        parts: content by name.
+        count: number of pairs.
+
+    Raises:
+        RequestError: a part is missing or unknown.
+    """
+    require_parts(parts, (*(f"{kind}{k}" for k in range(count) for kind in ("rgb", "depth")), "request"))
+    return [(parts[f"rgb{k}"], parts[f"depth{k}"]) for k in range(count)]
+
+
+async def _unless_gone(request: Request, answering: Awaitable[Response]) -> Response:
+    """Return the answer, or cancel the work if the client disconnects.
+
+    Raises:
+        ClientDisconnect: the client has disconnected.
+    """
+    work, gone = asyncio.ensure_future(answering), asyncio.ensure_future(_gone(request))
+    try:
+        await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
+        if not work.done():
+            raise ClientDisconnect
+        return work.result()
+    finally:
+        gone.cancel()
+        work.cancel()
+
+
+async def _gone(request: Request) -> None:
+    """Wait until the connection is closed. After the body no other message can arrive."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+def _too_large(what: str, max_bytes: int) -> TooLargeError:
+    return TooLargeError(
+        f"the body has {what}; this service takes {max_bytes}: send smaller or better compressed pictures"
+    )
 
 
 def _boundary_of(content_type: str) -> bytes:

@@ -1,32 +1,10 @@
-"""OGC GeoPose by content negotiation. Such an answer holds only the pose."""
+"""OGC GeoPose as the whole answer."""
 
 from service.contract.schema import GeoPose, LocalizeAnswer
 from service.errors import NoPoseError, NotGeoreferencedError
 
 #: Registered with IANA for OGC 21-056r11.
 GEOPOSE = "application/geopose+json"
-
-
-def wants_geopose(accept: str) -> bool:
-    """Return whether a caller prefers GeoPose to the JSON answer of this service.
-
-    Args:
-        accept: value of the header. The highest quality wins; the first entry breaks ties.
-    """
-    best, wanted = 0.0, False
-    for entry in accept.split(","):
-        name, *parameters = (word.strip().lower() for word in entry.split(";"))
-        quality = 1.0
-        for parameter in parameters:
-            key, _, value = parameter.partition("=")
-            if key.strip() == "q":
-                try:
-                    quality = float(value)
-                except ValueError:
-                    quality = 0.0
-        if quality > best and name in (GEOPOSE, "application/json", "application/*", "*/*"):
-            best, wanted = quality, name == GEOPOSE
-    return wanted
 
 
 def sure_geopose(answer: LocalizeAnswer) -> GeoPose:

@@ -12,7 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.contract.convert import request_error_from
+from service.contract.invalid import request_error_from
 from service.errors import Kind, StreetfixError
 
 MEDIA_TYPE = "application/problem+json"

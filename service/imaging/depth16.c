@@ -8,13 +8,15 @@
 #include <stdlib.h>
 #include <string.h>
 
-static uint8_t paeth(int a, int b, int c) {
+static uint8_t paeth(int a, int b, int c)
+{
     const int pa = abs(b - c), pb = abs(a - c), pc = abs(a + b - 2 * c);
     const int least = pa <= pb ? a : b;
     return (uint8_t)((pa <= pb ? pa : pb) <= pc ? least : c);
 }
 
-int64_t streetfix_unfilter(uint8_t *raw, int64_t height, int64_t width, uint16_t *out) {
+int64_t streetfix_unfilter(uint8_t *raw, int64_t height, int64_t width, uint16_t *out)
+{
     const int64_t bytes = 2 * width;
     const uint8_t *before = NULL; /* the unfiltered row above; NULL counts as zeros */
     for (int64_t y = 0; y < height; y++) {
@@ -69,7 +71,8 @@ typedef struct {
     int left, bad;
 } Nibbles;
 
-static uint32_t number_of(Nibbles *n) {
+static uint32_t number_of(Nibbles *n)
+{
     uint32_t value = 0;
     for (int shift = 0; shift < 32; shift += 3) {
         if (n->left == 0) {
@@ -93,7 +96,8 @@ static uint32_t number_of(Nibbles *n) {
 
 /* Decodes RVL (Wilson, ISS 2017) as in ROS compressedDepth: runs of zeros alternate with runs of zigzag-coded differences.
  * Returns the number of decoded pixels. The number is less than pixels if the data are damaged or end early. */
-int64_t streetfix_rvl(const uint8_t *data, int64_t length, int64_t pixels, uint16_t *out) {
+int64_t streetfix_rvl(const uint8_t *data, int64_t length, int64_t pixels, uint16_t *out)
+{
     Nibbles n = {data, data + length, 0, 0, 0};
     int64_t done = 0;
     uint32_t before = 0;

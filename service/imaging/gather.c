@@ -20,7 +20,8 @@ const LayoutEntry streetfix_layout[] = {
 };
 
 /* Projects each ray of a block into an image: flat index of the pixel, -1 outside. Rounds half to even, like rint. */
-static void pixels(const float *x, const float *y, const float *z, int64_t count, const Picture *p, int32_t *index) {
+static void pixels(const float *x, const float *y, const float *z, int64_t count, const Picture *p, int32_t *index)
+{
     const float fx = (float)p->fx, fy = (float)p->fy, cx = (float)p->cx, cy = (float)p->cy;
     const float w = (float)p->width, h = (float)p->height;
     const float magic = 12582912.0f; /* 1.5 * 2^23: a float of this size has no fractional bits, so adding it rounds */
@@ -40,7 +41,8 @@ static void pixels(const float *x, const float *y, const float *z, int64_t count
     }
 }
 
-static void order(float *a, float *b, int64_t count) {
+static void order(float *a, float *b, int64_t count)
+{
     for (int64_t i = 0; i < count; i++) {
         const float low = a[i] < b[i] ? a[i] : b[i], high = a[i] < b[i] ? b[i] : a[i];
         a[i] = low;
@@ -49,16 +51,16 @@ static void order(float *a, float *b, int64_t count) {
 }
 
 /* Floyd's network of 25 comparators for nine (Knuth, The Art of Computer Programming 3, 5.3.4). */
-static const int NETWORK[25][2] = {{0, 1}, {3, 4}, {6, 7}, {1, 2}, {4, 5}, {7, 8}, {0, 1}, {3, 4}, {6, 7},
-                                   {0, 3}, {3, 6}, {0, 3}, {1, 4}, {4, 7}, {1, 4}, {2, 5}, {5, 8}, {2, 5},
-                                   {1, 3}, {5, 7}, {2, 6}, {4, 6}, {2, 4}, {2, 3}, {5, 6}};
+static const int NETWORK[25][2] = {{0, 1}, {3, 4}, {6, 7}, {1, 2}, {4, 5}, {7, 8}, {0, 1}, {3, 4}, {6, 7}, {0, 3}, {3, 6}, {0, 3}, {1, 4},
+                                   {4, 7}, {1, 4}, {2, 5}, {5, 8}, {2, 5}, {1, 3}, {5, 7}, {2, 6}, {4, 6}, {2, 4}, {2, 3}, {5, 6}};
 
 /* rays: SAMPLES x 3 x cells, level frame of the view. R: rotation from this frame to the optical frame, row-major.
  * depth: z, metres. min_range, max_range: metres. fewest: rays with a measurement that a range needs.
  * Output: ranges (metres, 0 without a range) and seen have one value per cell, colour (0..255) has cells x 3 values. */
 void streetfix_gather(const float *rays, int64_t cells, const double *R, const float *depth, const Picture *depth_picture,
-                      const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range, int64_t fewest,
-                      float *ranges, float *colour, uint8_t *seen) {
+                      const uint8_t *rgb, const Picture *rgb_picture, double min_range, double max_range, int64_t fewest, float *ranges,
+                      float *colour, uint8_t *seen)
+{
     float r[9];
     for (int k = 0; k < 9; k++) r[k] = (float)R[k];
     const int same = memcmp(depth_picture, rgb_picture, sizeof(Picture)) == 0;

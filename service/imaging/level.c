@@ -19,6 +19,7 @@ typedef struct {
 } Point;
 
 /* Compared with Python's structures when the library is loaded. */
+/* clang-format off */
 const LayoutEntry streetfix_layout[] = {
     PICTURE_LAYOUT,
     LAYOUT_STRUCT(Ground), LAYOUT_FIELD(Ground, near_m), LAYOUT_FIELD(Ground, reach_m), LAYOUT_FIELD(Ground, below_m),
@@ -28,9 +29,11 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_FIELD(Point, reach), LAYOUT_FIELD(Point, certainty),
     LAYOUT_END,
 };
+/* clang-format on */
 
 /* Solves H s = g for a symmetric, positive definite H (lower triangle given) by Cholesky decomposition. */
-static void solve(double H[3][3], const double g[3], double s[3]) {
+static void solve(double H[3][3], const double g[3], double s[3])
+{
     double L[3][3] = {{0}};
     for (int i = 0; i < 3; i++)
         for (int j = 0; j <= i; j++) {
@@ -53,14 +56,17 @@ static void solve(double H[3][3], const double g[3], double s[3]) {
 
 /* R: rotation from the optical frame to the nominal level frame, row-major. step: distance between the pixels that are read.
  * bands: a, b, c for each round. At the horizontal distance r, a point may lie a + b r below the plane and c (a + b r) above it (metres).
- * out: slopes a, b and offset c (metres) of the plane. */
-void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, const double *R, const Ground *o,
-                          const double *bands, int64_t rounds, Point *points, double *out) {
-    int64_t count = 0;
+ * out: slopes a, b and offset c (metres) of the plane; then the number of pixels with a depth in the limits, of those in the last band around
+ * the plane, and of those more than three times the last band below it. */
+void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, const double *R, const Ground *o, const double *bands,
+                          int64_t rounds, Point *points, double *out)
+{
+    int64_t count = 0, measured = 0, on = 0, below = 0;
     for (int64_t v = step / 2; v < p->height; v += step)
         for (int64_t u = step / 2; u < p->width; u += step) {
             const double z = (double)depth[v * p->width + u];
             if (!(z > o->near_m && z < o->reach_m)) continue;
+            measured++;
             const double cx = z * (((double)u - p->cx) / p->fx), cy = z * (((double)v - p->cy) / p->fy);
             const double up = R[6] * cx + R[7] * cy + R[8] * z;
             if (!(up < -o->below_m)) continue;
@@ -98,4 +104,14 @@ void streetfix_fit_ground(const float *depth, const Picture *p, int64_t step, co
         if (kept == 0) break;
         solve(H, g, out);
     }
+    for (int64_t i = 0; i < count; i++) {
+        const Point *q = points + i;
+        const double off = q->z - (q->x * out[0] + q->y * out[1] + out[2]);
+        const double band = bands[3 * rounds - 3] + bands[3 * rounds - 2] * q->reach;
+        on += fabs(off) <= band;
+        below += off < -3 * band;
+    }
+    out[3] = (double)measured;
+    out[4] = (double)on;
+    out[5] = (double)below;
 }

@@ -2,7 +2,8 @@
 
 Map views are level with the ground under the vehicle, so query views must be level too. A depth image shows little ground, and a
 stereo depth image shows it with much noise. So the ground plane is fitted under a prior: the direction of gravity or of the
-mounting, and the usual height (decisions 0005 and 0009).
+mounting, and the height of the camera (decisions 0005 and 0009). The height is given, or the usual one. If the plane of the
+usual height does not fit the image, other heights are tried (decision 0145).
 """
 
 import ctypes
@@ -10,6 +11,7 @@ from ctypes import POINTER, Structure, byref, c_double, c_int64, c_void_p
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -30,8 +32,16 @@ REACH_M = 14.0
 NEAR_M = 1.0
 #: Standard deviation of the prior of each slope of the plane (decision 0009).
 TILT_PRIOR_RAD = np.deg2rad(1.5)
-#: Standard deviation of the prior of the camera's height (decision 0009).
-HEIGHT_PRIOR_M = 0.12
+#: Usual height of a camera above the ground, and the standard deviation of this prior (decision 0009).
+USUAL_HEIGHT_M, HEIGHT_PRIOR_M = 1.5, 0.12
+#: Heights that are tried if the usual one does not fit. A fit finds planes near its prior only. An estimate lies in ``HEIGHT_RANGE_M``.
+HEIGHTS_M, HEIGHT_RANGE_M = (0.2, 0.35, 0.6, 1.0, 1.5, 2.2, 3.2), (0.15, 4.0)
+#: A fit is repeated from its own result this often, so that the prior of the height does not bias it.
+REPEATS = 3
+#: A plane is the ground if at least this share of the measured pixels lies on it, and at most that share below it.
+LEAST_ON, MOST_BELOW = 0.1, 0.02
+#: The usual height counts as fitting if its plane differs by less than this, metres. Beyond it the prior would bias the result.
+USUAL_WITHIN_M = 0.1
 #: Standard deviation of one ground point across the plane: constant part (m), and part per metre of horizontal distance.
 NOISE_M, NOISE_PER_M = 0.08, 0.01
 #: Number of neighbouring points with correlated errors. The fit counts so many points as one (decision 0081).
@@ -52,10 +62,36 @@ class CameraLevel:
         R_level_camera: rotation from the optical frame to the level frame (x along the horizontal part of the optical axis,
             z up along the normal of the ground).
         height_m: height of the camera above the ground, metres.
+        on_share: share of the measured pixels within reach that lie on the fitted plane.
+        below_share: share of these pixels that lie clearly below the plane.
     """
 
     R_level_camera: Rotation
     height_m: float
+    on_share: float = 0.0
+    below_share: float = 0.0
+
+    @property
+    def is_ground(self) -> bool:
+        """Whether the fitted plane can be the ground: enough pixels on it, hardly any below it."""
+        return self.on_share >= LEAST_ON and self.below_share <= MOST_BELOW
+
+
+#: Where the height of a camera comes from: the request, the image, or neither of them.
+HeightOrigin = Literal["given", "estimated", "assumed"]
+
+
+@dataclass(frozen=True, slots=True)
+class GivenHeight:
+    """Height of the camera above the ground that the caller knows.
+
+    Attributes:
+        height_m: height of the camera's centre above the ground, metres.
+        std_m: its standard deviation, metres.
+    """
+
+    height_m: float
+    std_m: float
 
 
 def nominal_level(down_camera: Float64[NDArray[np.float64], "3"] | None) -> Rotation:
@@ -79,6 +115,7 @@ def level_camera(
     *,
     down_camera: Float64[NDArray[np.float64], "3"] | None,
     nominal_height_m: float,
+    height_std_m: float = HEIGHT_PRIOR_M,
 ) -> CameraLevel:
     """Fit the ground plane of a depth image under a prior and level the camera with it.
 
@@ -86,13 +123,14 @@ def level_camera(
         depth_m: z, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
         camera: intrinsics, pixels, at any size with the same aspect ratio.
         down_camera: direction of gravity in the camera frame, any length, if an IMU measured it. Else None.
-        nominal_height_m: usual height of the camera above the ground, metres.
+        nominal_height_m: mean of the prior of the camera's height above the ground, metres.
+        height_std_m: standard deviation of this prior, metres.
 
     Returns:
         Level of the camera. Without visible ground, this is the prior.
     """
     R = nominal_level(down_camera)
-    slope_x, slope_y, ground = _fit_ground(depth_m, camera, R, nominal_height_m)
+    slope_x, slope_y, ground, measured, on, below = _fit_ground(depth_m, camera, R, nominal_height_m, height_std_m)
     normal = np.array([-slope_x, -slope_y, 1.0])
     normal /= np.linalg.norm(normal)
     R_level = rotation_taking(normal, np.array([0.0, 0.0, 1.0])) @ R
@@ -103,7 +141,49 @@ def level_camera(
     if flat > 1e-6:
         turn = np.array([[axis[0], axis[1], 0.0], [-axis[1], axis[0], 0.0], [0.0, 0.0, flat]]) / flat
         R_level = turn @ R_level
-    return CameraLevel(R_level, float(-ground * normal[2]))
+    pixels = max(measured, 1.0)
+    return CameraLevel(R_level, float(-ground * normal[2]), on / pixels, below / pixels)
+
+
+def level_query(
+    depth_m: Float32[NDArray[np.float32], "H W"],
+    camera: PinholeCamera,
+    *,
+    down_camera: Float64[NDArray[np.float64], "3"] | None = None,
+    given: GivenHeight | None = None,
+) -> tuple[CameraLevel, HeightOrigin]:
+    """Level the camera of a query, and find its height if it is not given.
+
+    The usual height is tried first. If its plane is not the ground, or lies so far from it that the prior would bias the result,
+    other heights are tried. The plane with the most pixels counts, if it can be the ground.
+
+    Args:
+        depth_m: z, metres, 0 where nothing was measured. It has the aspect ratio of the camera.
+        camera: intrinsics, pixels, at any size with the same aspect ratio.
+        down_camera: direction of gravity in the camera frame, any length, if an IMU measured it. Else None.
+        given: height of the camera, if the caller knows it.
+
+    Returns:
+        Level of the camera, and the origin of its height. "assumed": the image shows no ground, so the usual height counts.
+    """
+    if given is not None:
+        level = level_camera(
+            depth_m, camera, down_camera=down_camera, nominal_height_m=given.height_m, height_std_m=given.std_m
+        )
+        return level, "given"
+    usual = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=USUAL_HEIGHT_M)
+    if usual.is_ground and abs(usual.height_m - USUAL_HEIGHT_M) < USUAL_WITHIN_M:
+        return usual, "estimated"
+    found = [
+        level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=height_m) for height_m in HEIGHTS_M
+    ]
+    for best in sorted((level for level in found if level.is_ground), key=lambda level: -level.on_share):
+        level = best
+        for _ in range(REPEATS):
+            level = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=level.height_m)
+        if level.is_ground and HEIGHT_RANGE_M[0] <= level.height_m <= HEIGHT_RANGE_M[1]:
+            return level, "estimated"
+    return usual, "assumed"
 
 
 class _Ground(Structure):
@@ -127,23 +207,28 @@ def _library() -> ctypes.CDLL:
 
 
 def _fit_ground(
-    depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R: Rotation, height_m: float
-) -> tuple[float, float, float]:
+    depth_m: Float32[NDArray[np.float32], "H W"],
+    camera: PinholeCamera,
+    R: Rotation,
+    height_m: float,
+    height_std_m: float,
+) -> tuple[float, ...]:
     """Fit slopes a, b and offset c (m) of the ground z = a x + b y + c in the nominal level frame.
 
-    The prior is a = b = 0 and c = -height_m. It is the result if the image shows no ground.
+    The prior is a = b = 0 and c = -height_m. It is the result if the image shows no ground. The result ends with the number of
+    measured pixels within reach, of those on the plane, and of those clearly below it.
     """
     depth_m, R = np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(R, np.float64)
     height, width = depth_m.shape
     if R.shape != (3, 3):
         raise ValueError(f"R {R.shape} is no rotation")
     step = max(1, width // STEP_PIXELS)
-    found, points = np.empty(3), np.empty(-(-height // step) * -(-width // step), _POINT)
+    found, points = np.empty(6), np.empty(-(-height // step) * -(-width // step), _POINT)
     _library().streetfix_fit_ground(
         depth_m.ctypes.data, byref(c_picture(camera, depth_m)), step, R.ctypes.data,
         byref(_Ground(
-            NEAR_M, REACH_M, 0.3 * height_m, height_m, TILT_PRIOR_RAD, HEIGHT_PRIOR_M, NOISE_M, NOISE_PER_M, CORRELATED
+            NEAR_M, REACH_M, 0.3 * height_m, height_m, TILT_PRIOR_RAD, height_std_m, NOISE_M, NOISE_PER_M, CORRELATED
         )),
         BANDS.ctypes.data, len(BANDS), points.ctypes.data, found.ctypes.data,
     )  # fmt: skip
-    return float(found[0]), float(found[1]), float(found[2])
+    return tuple(found.tolist())

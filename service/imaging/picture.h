@@ -10,8 +10,8 @@ typedef struct {
     double fx, fy, cx, cy;
 } Picture;
 
-#define PICTURE_LAYOUT                                                                                                     \
-    LAYOUT_STRUCT(Picture), LAYOUT_FIELD(Picture, height), LAYOUT_FIELD(Picture, width), LAYOUT_FIELD(Picture, fx),        \
+#define PICTURE_LAYOUT                                                                                              \
+    LAYOUT_STRUCT(Picture), LAYOUT_FIELD(Picture, height), LAYOUT_FIELD(Picture, width), LAYOUT_FIELD(Picture, fx), \
         LAYOUT_FIELD(Picture, fy), LAYOUT_FIELD(Picture, cx), LAYOUT_FIELD(Picture, cy)
 
 #endif

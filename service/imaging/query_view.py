@@ -13,7 +13,7 @@ from service.imaging.brightness import brightness
 from service.imaging.depth_unit_hint import unit_hint
 from service.imaging.fusion import fuse_and_keep
 from service.imaging.gather import gather
-from service.imaging.level import level_camera
+from service.imaging.level import GivenHeight, HeightOrigin, level_query
 from service.imaging.view_grid import PLANES, Planes, ViewGrid, heights_of
 
 
@@ -44,6 +44,7 @@ class QueryViews:
         R_level_camera: rotation from the optical frame to the level frame, (3, 3).
         height_m: height of the camera above the ground, metres.
         measured_share: share of cells with a range, over all views.
+        height_origin: where ``height_m`` comes from.
     """
 
     planes: Float32[NDArray[np.float32], "T 6 rows columns"]
@@ -51,6 +52,7 @@ class QueryViews:
     R_level_camera: Rotation
     height_m: float
     measured_share: float
+    height_origin: HeightOrigin = "assumed"
 
 
 def query_view(
@@ -61,7 +63,7 @@ def query_view(
     grid: ViewGrid,
     rows_seen: Bool[NDArray[np.bool_], " rows"],
     down_camera: Float64[NDArray[np.float64], "3"] | None = None,
-    nominal_height_m: float = 1.5,
+    given_height: GivenHeight | None = None,
     turn_rad: float = 0.0,
 ) -> QueryView:
     """Compute one view of a query at any heading. ``query_views`` describes the method.
@@ -73,7 +75,7 @@ def query_view(
         grid: view grid of the map.
         rows_seen: rows that the survey of the map covers. The other rows are blanked.
         down_camera: direction of gravity in the camera frame, any length, if known.
-        nominal_height_m: usual height of the camera above the ground, metres.
+        given_height: height of the camera above the ground, if the caller knows it. None: it is found in the depth image.
         turn_rad: heading of the view relative to the optical axis, counter-clockwise, radians.
 
     Raises:
@@ -81,7 +83,7 @@ def query_view(
     """
     views = query_views(
         rgb, depth_m, camera, grid=grid, rows_seen=rows_seen, turns=(0,), turn_rad=turn_rad,
-        down_camera=down_camera, nominal_height_m=nominal_height_m,
+        down_camera=down_camera, given_height=given_height,
     )  # fmt: skip
     return QueryView(views.planes[0], views.R_level_camera, views.height_m, views.measured_share)
 
@@ -96,7 +98,7 @@ def query_views(
     turns: tuple[int, ...],
     turn_rad: float = 0.0,
     down_camera: Float64[NDArray[np.float64], "3"] | None = None,
-    nominal_height_m: float = 1.5,
+    given_height: GivenHeight | None = None,
 ) -> QueryViews:
     """Level a query, resample it to the view grid, and fuse colour and depth (paper, section 3, testing stage).
 
@@ -111,12 +113,12 @@ def query_views(
         turns: headings of the views relative to ``turn_rad``, in whole columns of the grid, counter-clockwise.
         turn_rad: heading relative to the optical axis that ``turns`` start from, counter-clockwise, radians.
         down_camera: direction of gravity in the camera frame, any length, if known.
-        nominal_height_m: usual height of the camera above the ground, metres. It is the prior of the ground fit.
+        given_height: height of the camera above the ground, if the caller knows it. None: it is found in the depth image.
 
     Raises:
         NoDepthError: no cell of the grid holds a measurement.
     """
-    level = level_camera(depth_m, camera, down_camera=down_camera, nominal_height_m=nominal_height_m)
+    level, height_origin = level_query(depth_m, camera, down_camera=down_camera, given=given_height)
     aside = max(abs(turn) for turn in turns)
     R_camera_view = level.R_level_camera.T @ rotation_z(turn_rad)
     ranges, colour, seen = gather(rgb, depth_m, camera, R_camera_view, grid.widened(aside))
@@ -133,7 +135,8 @@ def query_views(
     if not planes[:, 0].any():
         raise _no_depth(depth_m, grid)
     turns_rad = tuple(turn_rad + turn * grid.column_rad for turn in turns)
-    return QueryViews(planes, turns_rad, level.R_level_camera, level.height_m, float(np.mean(planes[:, 0] > 0)))
+    measured_share = float(np.mean(planes[:, 0] > 0))
+    return QueryViews(planes, turns_rad, level.R_level_camera, level.height_m, measured_share, height_origin)
 
 
 def _no_depth(depth_m: Float32[NDArray[np.float32], "h w"], grid: ViewGrid) -> NoDepthError:

@@ -3,17 +3,18 @@
 raw16 is the cheapest format to send and to read. The bytes are ``SFD1``, width and height as little-endian uint32, then one frame
 of little-endian uint16 rows. The frame is zstd or lz4, and its first bytes tell the codec. zstd is a little smaller than PNG and
 takes half of its time to read. lz4 is a fifth larger than zstd and takes two thirds of the time of zstd.
+
+The codecs are imported where they are used, because a client that sends encoded images needs neither.
 """
 
 import struct
 from typing import Any, Literal
 
-import lz4.frame
 import numpy as np
-import zstandard
 from jaxtyping import UInt16
 from numpy.typing import NDArray
 
+from service.errors import extra_missing
 from service.imaging.picture_headers import ImageLimits, damaged, require_pixels
 
 Codec = Literal["zstd", "lz4"]
@@ -56,17 +57,36 @@ def write_raw16(values: NDArray[Any], codec: Codec = "zstd") -> bytes:
     Args:
         values: (H, W), uint16 values as in a 16-bit PNG.
         codec: ``zstd`` for a slow link, ``lz4`` if processor time costs more than bytes.
+
+    Raises:
+        ExtraMissingError: the package of the codec is not installed.
     """
     height, width = values.shape
     raw = values.astype("<u2", copy=False).tobytes()
-    if codec == "lz4":
-        frame: bytes = lz4.frame.compress(raw, store_size=True)
-    else:
-        frame = zstandard.ZstdCompressor(level=1, write_content_size=True).compress(raw)
+    frame = _lz4_frame(raw) if codec == "lz4" else _zstd_frame(raw)
     return _HEADER.pack(b"SFD1", width, height) + frame
 
 
+def _zstd_frame(raw: bytes) -> bytes:
+    try:
+        import zstandard
+    except ModuleNotFoundError as error:
+        raise extra_missing("depth_codec 'zstd'", None, error) from error
+    return zstandard.ZstdCompressor(level=1, write_content_size=True).compress(raw)
+
+
+def _lz4_frame(raw: bytes) -> bytes:
+    try:
+        import lz4.frame
+    except ModuleNotFoundError as error:
+        raise extra_missing("depth_codec 'lz4'", "lz4", error) from error
+    frame: bytes = lz4.frame.compress(raw, store_size=True)
+    return frame
+
+
 def _from_zstd(frame: memoryview, needed: int, where: str, field: str) -> bytes:
+    import zstandard
+
     try:
         stated = zstandard.get_frame_parameters(frame).content_size
         if stated != needed:
@@ -82,6 +102,8 @@ def _from_zstd(frame: memoryview, needed: int, where: str, field: str) -> bytes:
 
 
 def _from_lz4(frame: memoryview, needed: int, where: str, field: str) -> bytes:
+    import lz4.frame
+
     unpacking = lz4.frame.LZ4FrameDecompressor()
     try:
         # One spare byte reveals a frame that is too long.

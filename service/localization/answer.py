@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+from service.confidence.reasons import Reason
+from service.confidence.spread import Spread
 from service.errors import NotFiniteError
 from service.geometry.rigid import Transform
-from service.localization.hypotheses import Hypothesis
-from service.localization.reasons import Reason
-from service.localization.scoring import Candidate
-from service.localization.search import Neighbour
-from service.localization.spread import Spread
-from service.localization.street_vote import StreetVote
+from service.imaging.level import HeightOrigin
+from service.retrieval.hypotheses import Hypothesis
+from service.retrieval.knn import Neighbour, StreetVote
+from service.scoring.candidates import Candidate
 
 Status = Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
 
@@ -64,13 +64,14 @@ class Answer:
         reasons: what may be wrong with the query or the map, the likeliest first. Empty for a LOCALIZED answer, and if all
             confidence features lie in the range of the calibration data.
         frames: number of image pairs in the query.
-        evidence: confidence features, in the order of ``service.maps.calibration.FEATURES``; None without registration.
+        evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without registration.
         T_map_vehicle_guess: best guess of the vehicle pose; None if the query does not give the camera's pose on the vehicle.
         neighbours: distinct places, as many as the query asked for. First those nearest to the registered poses, then the most
             similar.
         hypotheses: all clusters of the most similar views, the heaviest first; a prior, if given, counts in this order.
         measured_share: share of the view grid's cells with a measurement, 0 to 1.
-        height_m: height of the camera above the ground.
+        height_m: height of the reference camera above the ground, metres.
+        height_origin: where this height comes from: the query ("given"), the depth image ("estimated"), or neither ("assumed").
         timings: duration of each stage.
     """
 
@@ -90,6 +91,7 @@ class Answer:
     hypotheses: tuple[Hypothesis, ...]
     measured_share: float
     height_m: float
+    height_origin: HeightOrigin
     timings: Timings
 
 

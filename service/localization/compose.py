@@ -6,16 +6,19 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+from service.confidence.decision import Outcome
 from service.geometry.rigid import Transform, inverse, transform_from
 from service.imaging.query_view import QueryViews
 from service.localization.answer import Answer, Timings, require_finite
-from service.localization.frames import Frame
-from service.localization.hypotheses import Hypothesis
-from service.localization.outcome import Outcome
-from service.localization.refine import Refined
-from service.localization.rerank import reranked
-from service.localization.retrieval import Retrieved
 from service.maps.reader import MapBundle
+from service.retrieval.frame import Frame
+from service.retrieval.hypotheses import Hypothesis
+from service.retrieval.knn import Neighbour
+from service.retrieval.retrieve import Retrieved
+from service.scoring.candidates import Candidate, Refined
+
+#: Largest distance at which a registered pose verifies a place.
+VERIFIED_M = 5.0
 
 
 def compose(
@@ -58,6 +61,7 @@ def compose(
         hypotheses=retrieved.hypotheses,
         measured_share=views.measured_share,
         height_m=views.height_m,
+        height_origin=views.height_origin,
         timings=_timings(frames, started, found, done, registered=refined is not None),
     )
     require_finite(answer)
@@ -92,3 +96,25 @@ def _pose_of(bundle: MapBundle, hypothesis: Hypothesis, views: QueryViews) -> Tr
     above_lidar_m = views.height_m - bundle.manifest.lidar_height_m
     position_m = hypothesis.position_m + np.array([0.0, 0.0, above_lidar_m])
     return transform_from(hypothesis.R_map_level @ views.R_level_camera, position_m)
+
+
+def reranked(neighbours: tuple[Neighbour, ...], candidates: tuple[Candidate, ...]) -> tuple[Neighbour, ...]:
+    """Sort places: first the place nearest to each registered pose, then the others by similarity.
+
+    Place recognition methods verify the nearest neighbours of a global descriptor by registration before they report recall.
+    Sources: Hausler et al., Patch-NetVLAD, CVPR 2021; Vidanapathirana et al., Spectral Geometric Verification, RA-L 2023
+    (decision 0128).
+
+    Args:
+        neighbours: distinct places, the most similar first.
+        candidates: registered poses, the best supported first.
+    """
+    rest, verified = list(neighbours), list[Neighbour]()
+    for candidate in candidates:
+        if not rest:
+            break
+        away = [float(np.hypot(*(place.position_m[:2] - candidate.T_map_camera[:2, 3]))) for place in rest]
+        nearest = int(np.argmin(away))
+        if away[nearest] <= VERIFIED_M:
+            verified.append(rest.pop(nearest))
+    return (*verified, *rest)

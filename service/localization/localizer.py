@@ -5,19 +5,19 @@ from time import perf_counter
 
 import numpy as np
 
+from service.confidence.decision import outcome_of, require_promise
+from service.confidence.features import evidence_of, require_features
+from service.confidence.spread import Extent
 from service.geometry.rigid import Transform
 from service.localization.answer import Answer
 from service.localization.compose import compose
-from service.localization.encoder import Encoder, Provider
-from service.localization.evidence import evidence_of
-from service.localization.frames import Frame
-from service.localization.hypotheses import ClusterSettings
-from service.localization.outcome import outcome_of, require_promise
-from service.localization.query import Query
 from service.localization.refine import RefineSettings, refine
-from service.localization.retrieval import look_up, require_encoder_of, retrieve
-from service.localization.spread import Extent
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder, Provider
+from service.retrieval.frame import Frame
+from service.retrieval.hypotheses import ClusterSettings
+from service.retrieval.query import Query
+from service.retrieval.retrieve import look_up, require_encoder_of, retrieve
 
 
 class Localizer:
@@ -30,13 +30,15 @@ class Localizer:
         refining: settings of registration and scoring; None for the defaults.
 
     Raises:
-        BundleError: the encoder did not compute the map's descriptors, or reads another view grid.
+        BundleError: the encoder did not compute the map's descriptors, or reads another view grid; or the map's calibration has
+            other confidence features.
     """
 
     def __init__(
         self, bundle: MapBundle, encoder: Encoder, *, clusters: ClusterSettings | None = None, refining: RefineSettings | None = None
     ) -> None:  # fmt: skip
         require_encoder_of(bundle, encoder)
+        require_features(bundle.calibration, str(bundle.path))
         self.bundle = bundle
         self.encoder = encoder
         self.clusters = clusters or ClusterSettings()

@@ -11,18 +11,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from service.errors import BundleError
 
-#: The confidence features in this order. ``service.localization.evidence`` computes them.
-FEATURES = (
-    "margin", "inliers", "similarity", "similarity_margin", "likelihood", "through", "front", "unmapped", "log_sigma", "scale", "votes",
-    "entropy", "log_noise", "points", "measured", "place_m",
-    "facings", "far", "edges", "residual", "pose_spread", "log_share",
-)  # fmt: skip
-#: The features that measure competing candidates. The probability that a query is in the map does not use them.
-RIVALRY = ("margin", "similarity_margin", "votes", "entropy", "pose_spread")
-#: Features with weight 0. ``log_share`` is a separate rule beside the confidence (``service.localization.decide``,
-#: decision 0086). ``similarity`` depends more on the kind of street than on the place. Real streets lie four standard
-#: deviations below simulated streets (decision 0137).
-UNWEIGHED = ("log_share", "similarity")
 #: Limit of a normalised feature, standard deviations. It stops extrapolation beyond the calibration data.
 _CLIP = 4.0
 
@@ -47,11 +35,8 @@ class Logistic(_Frozen):
     bias: float
 
     @model_validator(mode="after")
-    def _lengths(self) -> "Logistic":
-        count = len(FEATURES)
-        if (len(self.mean), len(self.spread), len(self.weights)) != (count, count, len(terms(count))):
-            raise ValueError(f"mean and spread need {count} numbers, weights {len(terms(count))}")
-        if min(self.spread) <= 0:
+    def _positive(self) -> "Logistic":
+        if min(self.spread, default=1.0) <= 0:
             raise ValueError("spread must be positive")
         return self
 
@@ -59,7 +44,7 @@ class Logistic(_Frozen):
         """Return the log odds for one or more rows of features.
 
         Args:
-            evidence: confidence features in the order of ``FEATURES``.
+            evidence: confidence features in the order of ``features``.
         """
         return np.asarray(expanded(evidence, self.mean, self.spread) @ np.array(self.weights) + self.bias)
 
@@ -127,7 +112,7 @@ class Calibration(_Frozen):
 
     Attributes:
         calibrated: always true. An uncalibrated map has ``false`` in its file.
-        features: names of the features. They must equal ``FEATURES``.
+        features: names of the confidence features. ``service.confidence.features`` defines those that this program computes.
         right: regression of the event that the position is within 1 m.
         known: regression of the event that the query was taken in the map, at any of its places.
         thresholds: sorted by rising false-accept rate.
@@ -145,8 +130,10 @@ class Calibration(_Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Calibration":
-        if self.features != FEATURES:
-            raise ValueError(f"its features are not this program's: {', '.join(FEATURES)}")
+        count = len(self.features)
+        for name, part in (("right", self.right), ("known", self.known)):
+            if (len(part.mean), len(part.spread), len(part.weights)) != (count, count, len(terms(count))):
+                raise ValueError(f"{name}: mean and spread need {count} numbers, weights {len(terms(count))}")
         rates = [threshold.false_accept_rate for threshold in self.thresholds]
         if rates != sorted(rates):
             raise ValueError("thresholds must come by rising false-accept rate")
@@ -156,7 +143,7 @@ class Calibration(_Frozen):
         """Return the probability that the position is within 1 m.
 
         Args:
-            evidence: confidence features in the order of ``FEATURES``.
+            evidence: confidence features in the order of ``features``.
         """
         odds = self.right.log_odds(evidence)
         if self.site is not None:

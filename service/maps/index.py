@@ -1,19 +1,24 @@
-"""The memory-mapped FAISS index of view descriptors, and a coarse copy in memory that makes a shortlist for it."""
+"""The memory-mapped FAISS index of view descriptors, and a coarse copy in memory that makes a shortlist for it.
+
+FAISS makes the coarse copy: principal axes and 8-bit numbers. Decision 0144 compares it with code of our own.
+"""
 
 from pathlib import Path
 
 import faiss
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float32, Int64
 from numpy.typing import NDArray
 
 from service.errors import BundleError
 
 FILE = "views.faiss"
-#: Largest absolute value of an 8-bit component.
-_LEVELS = 127.0
-#: Least share of the descriptors' second moment that the kept principal axes hold.
-_HELD = 0.999
+#: Number of principal axes of the coarse copy. With fewer, the list loses similar views (decision 0144).
+_AXES = 64
+#: Smallest number of views for a coarse copy. A scan of fewer exact descriptors takes no longer.
+_FEWEST = 1000
+#: Largest number of views that determine the principal axes.
+_SAMPLE = 16_384
 #: Views that are copied at once.
 _CHUNK = 16_384
 
@@ -40,64 +45,31 @@ def write_index(path: Path, descriptors: Descriptors) -> None:
     faiss.write_index(index, str(path))
 
 
-class _Coarse:
-    """A coarse copy of the descriptors: components along the principal axes, as signed 8-bit integers.
+def _coarse_copy(index: faiss.Index) -> tuple[faiss.Index, Float32[NDArray[np.float32], " D"]]:
+    """Return an index of 8-bit components along the principal axes, and the mean descriptor that it subtracts.
 
-    The copy is small, so a scan of it hardly waits for memory. Fewer axes than components suffice. For the stock encoder,
-    64 axes hold 99.99 % of the 256 components (decision 0065).
+    The copy is small, so a scan of it hardly waits for memory.
 
     Args:
-        index: the exact index of the descriptors.
+        index: the exact index, with at least ``_FEWEST`` views.
     """
-
-    def __init__(self, index: faiss.Index) -> None:
-        chunks = [range(first, min(first + _CHUNK, index.ntotal)) for first in range(0, index.ntotal, _CHUNK)]
-        moment = np.zeros((index.d, index.d))
-        for chunk in chunks:
-            vectors = index.reconstruct_n(chunk.start, len(chunk))
-            moment += vectors.T @ vectors
-        self.is_finite = bool(np.isfinite(moment).all())
-        self._axes = np.zeros((index.d, 0), np.float32)
-        self._numbers: faiss.Index | None = None
-        if not (self.is_finite and chunks):
-            return
-        self._axes = _principal_axes(moment)
-        self._numbers = faiss.IndexScalarQuantizer(
-            self._axes.shape[1], faiss.ScalarQuantizer.QT_8bit_direct_signed, faiss.METRIC_INNER_PRODUCT
-        )
-        largest = max(float(np.abs(self._along(index, chunk)).max()) for chunk in chunks)
-        for chunk in chunks:
-            self._numbers.add(np.rint(self._along(index, chunk) * np.float32(_LEVELS / max(largest, 1e-9))))
-
-    def _along(self, index: faiss.Index, chunk: range) -> Float32[NDArray[np.float32], "n d"]:
-        along: NDArray[np.float32] = index.reconstruct_n(chunk.start, len(chunk)) @ self._axes
-        return along
-
-    @property
-    def count(self) -> int:
-        """Number of components of a vector in this copy."""
-        return int(self._axes.shape[1])
-
-    def search(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
-        """Return the indices of approximately the k most similar views."""
-        along = descriptor @ self._axes
-        # The components are rounded to integers below. So they are scaled to the full 8-bit range first.
-        levels = np.float32(_LEVELS / max(float(np.abs(along).max()), 1e-9))
-        if self._numbers is None:
-            return np.zeros(0, np.int64)
-        found: NDArray[np.int64] = self._numbers.search(np.rint(along * levels)[None], k)[1][0]
-        return found
+    axes = faiss.PCAMatrix(index.d, min(_AXES, index.d))
+    numbers = faiss.IndexScalarQuantizer(axes.d_out, faiss.ScalarQuantizer.QT_8bit_uniform, faiss.METRIC_INNER_PRODUCT)
+    coarse = faiss.IndexPreTransform(axes, numbers)
+    coarse.train(index.reconstruct_batch(np.arange(0, index.ntotal, -(-index.ntotal // _SAMPLE))))
+    for first in range(0, index.ntotal, _CHUNK):
+        coarse.add(index.reconstruct_n(first, min(_CHUNK, index.ntotal - first)))
+    return coarse, np.array(faiss.vector_to_array(axes.mean), np.float32)
 
 
-def _principal_axes(moment: Float64[NDArray[np.float64], "D D"]) -> Float32[NDArray[np.float32], "D d"]:
-    """Return the principal axes that hold the share ``_HELD`` of the second moment.
+def _is_finite(index: faiss.Index) -> bool:
+    """Return whether all descriptors are finite.
 
-    Their number is a multiple of 16 where the descriptor is long enough, because a scan reads 16 components at once.
+    Args:
+        index: the exact index.
     """
-    values, axes = np.linalg.eigh(moment)
-    held = np.cumsum(values[::-1]) / max(float(values.sum()), 1e-9)
-    count = min(len(values), 16 * (int(np.searchsorted(held, _HELD)) // 16 + 1))
-    return np.ascontiguousarray(axes[:, ::-1][:, :count], np.float32)
+    pieces = (index.reconstruct_n(first, min(_CHUNK, index.ntotal - first)) for first in range(0, index.ntotal, _CHUNK))
+    return all(bool(np.isfinite(piece).all()) for piece in pieces)
 
 
 class ViewIndex:
@@ -112,8 +84,10 @@ class ViewIndex:
 
     def __init__(self, index: faiss.Index) -> None:
         self._index = index
-        self._coarse = _Coarse(index)
-        self.is_finite = self._coarse.is_finite
+        self.is_finite = _is_finite(index)
+        self._coarse, self._mean = index, np.zeros(index.d, np.float32)
+        if self.is_finite and index.ntotal >= _FEWEST:
+            self._coarse, self._mean = _coarse_copy(index)
 
     @classmethod
     def open(cls, path: Path) -> "ViewIndex":
@@ -152,22 +126,22 @@ class ViewIndex:
         """Number of components of a descriptor."""
         return int(self._index.d)
 
-    @property
-    def coarse_numbers(self) -> int:
-        """Number of components of a vector in the coarse copy."""
-        return self._coarse.count
-
     def shortlist(self, descriptor: Float32[NDArray[np.float32], " D"], k: int) -> Int64[NDArray[np.int64], " k"]:
         """Return the indices of approximately the k most similar views, in no particular order.
 
-        The search uses the coarse 8-bit copy. The caller then compares the listed views exactly with ``vectors``. The list
-        must be several times longer than the number of wanted views (decision 0046).
+        The search uses the coarse 8-bit copy, if the map has one. The caller then compares the listed views exactly with
+        ``vectors``. The list must be several times longer than the number of wanted views (decision 0046).
 
         Args:
             descriptor: descriptor of the query view.
             k: length of the list. All views are returned if the index has no more than k.
         """
-        return np.arange(len(self)) if k >= len(self) else self._coarse.search(descriptor, k)
+        if k >= len(self):
+            return np.arange(len(self))
+        # The coarse copy subtracts the mean from views and queries. Only views may lose it: then a similarity differs from
+        # the exact one by the same constant for all views.
+        found: NDArray[np.int64] = self._coarse.search((descriptor + self._mean)[None], k)[1][0]
+        return found
 
     def vectors(self, views: Int64[NDArray[np.int64], " n"]) -> Descriptors:
         """Return the exact descriptors of some views.

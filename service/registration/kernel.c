@@ -47,9 +47,13 @@ typedef struct {
     double anchor[3], up[3]; /* mean of the priors of position and height (surfels' frame, m); normal of the ground there */
     double information[UNKNOWNS * UNKNOWNS];
     double inliers, seen, weight;
+    /* steps of the solver; 1 if its last step was small; half the weighted squared residuals before its last step */
+    double iterations, converged, error;
 } State;
 
 #define HEIGHT 60.0 /* m: how far surfaces may rise above or fall below the camera (streetfix_render) */
+#define SETTLED_M 1e-3 /* a pose has converged if its last step was smaller than this, m, */
+#define SETTLED_RAD 1.7e-3 /* and turned it by less than this, rad (0.1 degrees) */
 #define AHEAD 32 /* points per batch; their memory is prefetched together, or the kernel would mostly wait for memory (decision 0025) */
 #define LANES 8  /* partial sums side by side; the same number on every machine, so all machines give the same answer */
 
@@ -208,9 +212,9 @@ static inline void tell(const Query *q, const Options *o, const State *s, double
         const double y0 = b->y[0][k], y1 = b->y[1][k], y2 = b->y[2][k];
         const double there = b->known[k], use = dx * dx + dy * dy + dz * dz > reach2 ? 0.0 : there;
         const double r = nx * dx + ny * dy + nz * dz;
-        const double c = nx * (s->R[0] * (double)rx[k] + s->R[1] * (double)ry[k] + s->R[2] * (double)rz[k])
-                       + ny * (s->R[3] * (double)rx[k] + s->R[4] * (double)ry[k] + s->R[5] * (double)rz[k])
-                       + nz * (s->R[6] * (double)rx[k] + s->R[7] * (double)ry[k] + s->R[8] * (double)rz[k]);
+        const double c = nx * (s->R[0] * (double)rx[k] + s->R[1] * (double)ry[k] + s->R[2] * (double)rz[k]) +
+                         ny * (s->R[3] * (double)rx[k] + s->R[4] * (double)ry[k] + s->R[5] * (double)rz[k]) +
+                         nz * (s->R[6] * (double)rx[k] + s->R[7] * (double)ry[k] + s->R[8] * (double)rz[k]);
         const double along_y = y0 * nx + y1 * ny + y2 * nz;
         b->gr[0][k] = nx, b->gr[1][k] = ny, b->gr[2][k] = nz;
         b->gr[3][k] = y1 * nz - y2 * ny;
@@ -249,10 +253,11 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
     Batch batch;
     double known = 0;
     for (int64_t i = 0; i < q->count; i++) known += q->weight[i];
+    s->iterations = s->converged = 0;
     for (int64_t it = 0; it < o->iterations; it++) {
         double share = o->iterations > 1 ? (double)it / (double)(o->iterations - 1) : 1.0;
         double robust = o->robust_first * pow(o->robust_last / o->robust_first, share);
-        double sums[UNKNOWNS][UNKNOWNS + 1][LANES] = {{{0}}}, e_scale = exp(s->log_scale), total = 0;
+        double sums[UNKNOWNS][UNKNOWNS + 1][LANES] = {{{0}}}, e_scale = exp(s->log_scale), total = 0, squares = 0;
         for (int64_t first = 0; first < q->count; first += AHEAD) {
             const int64_t left = q->count - first, count = left < AHEAD ? left : AHEAD;
             look_up(g, surfels, q, s, e_scale, first, count, &batch);
@@ -264,6 +269,7 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
                 add_products(weighted, batch.r, sums[a][UNKNOWNS]);
             }
             for (int64_t k = 0; k < count; k++) total += batch.known[k] * q->weight[first + k];
+            for (int64_t k = 0; k < count; k++) squares += batch.w[k] * batch.r[k] * batch.r[k];
         }
         double H[UNKNOWNS][UNKNOWNS], b[UNKNOWNS];
         for (int a = 0; a < UNKNOWNS; a++) {
@@ -277,13 +283,16 @@ static inline void align_one(const Grid *g, const Surfel *surfels, const Query *
         }
         for (int a = 0; a < UNKNOWNS; a++) memcpy(s->information + a * UNKNOWNS, H[a], sizeof H[a]);
         s->seen = total;
+        s->error = 0.5 * squares;
         add_priors(o, s, known, H, b);
         if (!solve(H, b)) return;
         for (int k = 0; k < 3; k++) s->t[k] += b[k];
         turn_left(s->R, b + 3);
         s->log_scale += b[6];
         s->offset += b[7];
+        s->iterations = (double)(it + 1);
         double moved = b[0] * b[0] + b[1] * b[1] + b[2] * b[2], turned = b[3] * b[3] + b[4] * b[4] + b[5] * b[5];
+        s->converged = moved < SETTLED_M * SETTLED_M && turned < SETTLED_RAD * SETTLED_RAD;
         if (it > 3 && robust <= 1.01 * o->robust_last && moved < 1e-8 && turned < 1e-10) return;
     }
 }
@@ -318,8 +327,8 @@ static inline void score_one(const Grid *g, const Surfel *surfels, const Query *
     s->weight = total;
 }
 
-WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, double tolerance,
-                          double height_min, int64_t count, State *states)
+WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, double tolerance, double height_min,
+                          int64_t count, State *states)
 {
     for (int64_t k = 0; k < count; k++) {
         if (o->iterations > 0) align_one(g, surfels, q, o, states + k);
@@ -328,7 +337,8 @@ WIDE void streetfix_align(const Grid *g, const Surfel *surfels, const Query *q, 
 }
 
 /* Adds weight x residual x gradient of all points of each patch to ``pulls`` (patches, 8), which the caller sets to 0. */
-void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch, double *pulls)
+void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const Options *o, const State *s, const int32_t *patch,
+                     double *pulls)
 {
     Batch batch;
     const double e_scale = exp(s->log_scale);
@@ -337,8 +347,7 @@ void streetfix_pulls(const Grid *g, const Surfel *surfels, const Query *q, const
         look_up(g, surfels, q, s, e_scale, first, count, &batch);
         tell(q, o, s, o->robust_last, e_scale, first, &batch);
         for (int64_t k = 0; k < count; k++)
-            for (int a = 0; a < UNKNOWNS; a++)
-                pulls[UNKNOWNS * patch[first + k] + a] += batch.w[k] * batch.r[k] * batch.gr[a][k];
+            for (int a = 0; a < UNKNOWNS; a++) pulls[UNKNOWNS * patch[first + k] + a] += batch.w[k] * batch.r[k] * batch.gr[a][k];
     }
 }
 
@@ -391,9 +400,9 @@ void streetfix_fill(const Grid *g, const Surfel *surfels, int64_t count, double 
 
 /* Renders the depth (z, m) of the surfels, each a small square that faces the camera; 1e9 where nothing is mapped. ``tiles`` (n, 4):
  * centre x, y, first surfel, number of surfels. Tiles beyond ``tile_reach`` are skipped. R and t are T_map_camera. */
-void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_count, double tile_reach, const double *R,
-                      const double *t, double fx, double fy, double cx, double cy, int64_t width, int64_t height,
-                      double half_size, double reach, float *depth)
+void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_count, double tile_reach, const double *R, const double *t,
+                      double fx, double fy, double cx, double cy, int64_t width, int64_t height, double half_size, double reach,
+                      float *depth)
 {
     for (int64_t i = 0; i < width * height; i++) depth[i] = 1e9f;
     const float r[9] = {(float)R[0], (float)R[1], (float)R[2], (float)R[3], (float)R[4],
@@ -409,7 +418,8 @@ void streetfix_render(const Surfel *surfels, const double *tiles, int64_t tile_c
         double ahead = R[2] * ex + R[5] * ey, beside = R[0] * ex + R[3] * ey;
         double half = tile_reach - reach + HEIGHT * fabs(R[8]), wide = tile_reach - reach + HEIGHT * fabs(R[6]);
         if (ahead < -half || beside - right * ahead > hypot(1, right) * fmax(half, wide) ||
-            left * ahead - beside > hypot(1, left) * fmax(half, wide)) continue;
+            left * ahead - beside > hypot(1, left) * fmax(half, wide))
+            continue;
         const Surfel *m = surfels + (int64_t)tile[2], *end = m + (int64_t)tile[3];
         for (; m < end; m++) {
             float dx = m->xyz[0] - tx, dy = m->xyz[1] - ty, dz = m->xyz[2] - tz;
@@ -465,9 +475,12 @@ void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t 
         const double fresh = seen < mapped ? o->new / (mapped > 2.0 ? mapped : 2.0) : 0.0;
         likelihood += log(o->hit * hit + fresh + ((seen > mapped ? o->gone : 0.0) + o->any) / o->span_m);
         const double beyond = o->certain * sigma[i] + o->margin_m;
-        if (low >= (float)o->nothing_m) unmapped++;
-        else if (seen > (double)high + beyond) through++;
-        else if (seen < (double)low - beyond) front++;
+        if (low >= (float)o->nothing_m)
+            unmapped++;
+        else if (seen > (double)high + beyond)
+            through++;
+        else if (seen < (double)low - beyond)
+            front++;
     }
     found[0] = likelihood;
     found[1] = through;
@@ -476,6 +489,7 @@ void streetfix_agree(const float *drawn, int64_t height, int64_t width, int64_t 
 }
 
 /* service/compiled.py compares this table with Python's structures when it loads the library. */
+/* clang-format off */
 const LayoutEntry streetfix_layout[] = {
     SURFEL_LAYOUT,
     LAYOUT_STRUCT(Grid), LAYOUT_FIELD(Grid, ox), LAYOUT_FIELD(Grid, oy), LAYOUT_FIELD(Grid, oz),
@@ -491,10 +505,11 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(State), LAYOUT_FIELD(State, R), LAYOUT_FIELD(State, t), LAYOUT_FIELD(State, log_scale),
     LAYOUT_FIELD(State, offset), LAYOUT_FIELD(State, anchor), LAYOUT_FIELD(State, up),
     LAYOUT_FIELD(State, information), LAYOUT_FIELD(State, inliers), LAYOUT_FIELD(State, seen),
-    LAYOUT_FIELD(State, weight),
+    LAYOUT_FIELD(State, weight), LAYOUT_FIELD(State, iterations), LAYOUT_FIELD(State, converged), LAYOUT_FIELD(State, error),
     LAYOUT_STRUCT(Beam), LAYOUT_FIELD(Beam, hit), LAYOUT_FIELD(Beam, new), LAYOUT_FIELD(Beam, gone),
     LAYOUT_FIELD(Beam, any), LAYOUT_FIELD(Beam, rough_m), LAYOUT_FIELD(Beam, span_m), LAYOUT_FIELD(Beam, certain),
     LAYOUT_FIELD(Beam, margin_m), LAYOUT_FIELD(Beam, nothing_m), LAYOUT_FIELD(Beam, scale), LAYOUT_FIELD(Beam, offset),
     LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(BLOCK), LAYOUT_CONSTANT(AHEAD),
     LAYOUT_END,
 };
+/* clang-format on */

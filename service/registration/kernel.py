@@ -27,11 +27,13 @@ LIBRARY = Path(__file__).with_name("_kernel.so")
 
 #: A surfel: position (m, surfels' frame), unit normal, thickness across the surface (m), number of survey points.
 SURFEL = np.dtype([("xyz", "<f4", (3,)), ("normal", "<f4", (3,)), ("thickness_m", "<f4"), ("points", "<u4")])
-#: State of one start: pose of the level frame, scale, offset, centre and up axis of the priors, information, score.
+#: State of one start: pose of the level frame, scale, offset, centre and up axis of the priors, information, score, and how the
+#: solver ended.
 STATE = np.dtype(
     [("R", "<f8", (3, 3)), ("t", "<f8", (3,)), ("log_scale", "<f8"), ("offset", "<f8"), ("anchor", "<f8", (3,)), ("up", "<f8", (3,)),
      ("information", "<f8", (UNKNOWNS, UNKNOWNS)),
-     ("inliers", "<f8"), ("seen", "<f8"), ("weight", "<f8")]
+     ("inliers", "<f8"), ("seen", "<f8"), ("weight", "<f8"),
+     ("iterations", "<f8"), ("converged", "<f8"), ("error", "<f8")]
 )  # fmt: skip
 
 

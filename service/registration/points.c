@@ -43,12 +43,14 @@ typedef struct {
 } Blocks;
 
 /* service/compiled.py compares this table with Python's structures when it loads the library. */
+/* clang-format off */
 const LayoutEntry streetfix_layout[] = {
     LAYOUT_STRUCT(Blocks), LAYOUT_FIELD(Blocks, width), LAYOUT_FIELD(Blocks, size), LAYOUT_FIELD(Blocks, skip),
     LAYOUT_FIELD(Blocks, rows), LAYOUT_FIELD(Blocks, columns), LAYOUT_FIELD(Blocks, edge), LAYOUT_FIELD(Blocks, noise),
     LAYOUT_FIELD(Blocks, reach),
     LAYOUT_END,
 };
+/* clang-format on */
 
 /* z (rows, columns): depth of each block from its median inverse depth, m; 0 if fewer than half of the pixels read are measured, on an
  * edge, or beyond the reach. */

@@ -139,12 +139,16 @@ static inline int64_t discs_of(const Ahead *m, const Sides *s, const View *v, co
         const float off = nx[i] * x + ny[i] * y + nz[i] * z;
         /* Half extent of the disc along each axis. The projection of this box bounds the disc's pixels. */
         const float wide = radius * sqrtf(at_least(1.0f - nx[i] * nx[i], 0)), tall = radius * sqrtf(at_least(1.0f - ny[i] * ny[i], 0));
-        const float deep = radius * sqrtf(at_least(1.0f - nz[i] * nz[i], 0)), close = 1.0f / at_least(z - deep, half), away = 1.0f / (z + deep);
-        const float u0 = (x - wide) * (x > wide ? away : close) * s->fx + s->cx, u1 = (x + wide) * (x > -wide ? close : away) * s->fx + s->cx;
-        const float v0 = (y - tall) * (y > tall ? away : close) * s->fy + s->cy, v1 = (y + tall) * (y > -tall ? close : away) * s->fy + s->cy;
+        const float deep = radius * sqrtf(at_least(1.0f - nz[i] * nz[i], 0)), close = 1.0f / at_least(z - deep, half),
+                    away = 1.0f / (z + deep);
+        const float u0 = (x - wide) * (x > wide ? away : close) * s->fx + s->cx,
+                    u1 = (x + wide) * (x > -wide ? close : away) * s->fx + s->cx;
+        const float v0 = (y - tall) * (y > tall ? away : close) * s->fy + s->cy,
+                    v1 = (y + tall) * (y > -tall ? close : away) * s->fy + s->cy;
         left[i] = from(u0), right[i] = up_to(u1, width), top[i] = from(v0), bottom[i] = up_to(v1, height);
         /* The discs of far surfels may lie between the centres of pixels. */
-        shown[i] = (off * off >= grazing2 * (x * x + y * y + z * z)) & (u1 >= 0) & (v1 >= 0) & (left[i] <= right[i]) & (top[i] <= bottom[i]);
+        shown[i] =
+            (off * off >= grazing2 * (x * x + y * y + z * z)) & (u1 >= 0) & (v1 >= 0) & (left[i] <= right[i]) & (top[i] <= bottom[i]);
     }
     int64_t count = 0;
     for (int i = 0; i < m->count; i++) {
@@ -159,7 +163,7 @@ static inline int64_t discs_of(const Ahead *m, const Sides *s, const View *v, co
  * the first one on a ray. Of these, the disc with the least distance between its centre and its point on the ray counts. ``surfels`` and
  * ``numbers`` (count) come from streetfix_gather. ``seen`` has room for all of them, ``first`` and ``middle`` for one value per pixel. */
 WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t surfel_count, const View *v, const Discs *o, Disc *seen,
-                    float *first, float *middle, int32_t *met)
+                         float *first, float *middle, int32_t *met)
 {
     const int64_t pixels = v->width * v->height;
     for (int64_t i = 0; i < pixels; i++) {
@@ -236,6 +240,7 @@ typedef struct {
 enum { RESIDUAL = UNKNOWNS, OWN, ROWS, LANES = 8, MOST_PIXELS = 256 };
 
 /* service/compiled.py compares this table with Python's structures when it loads the library. */
+/* clang-format off */
 const LayoutEntry streetfix_layout[] = {
     SURFEL_LAYOUT,
     LAYOUT_STRUCT(View), LAYOUT_FIELD(View, R), LAYOUT_FIELD(View, t), LAYOUT_FIELD(View, fx), LAYOUT_FIELD(View, fy),
@@ -251,6 +256,7 @@ const LayoutEntry streetfix_layout[] = {
     LAYOUT_CONSTANT(UNKNOWNS), LAYOUT_CONSTANT(MOST_PIXELS),
     LAYOUT_END,
 };
+/* clang-format on */
 
 /* The pixels of a patch, padded with zeros to a multiple of LANES. */
 typedef struct {
@@ -268,8 +274,16 @@ static inline void add_pixel(const Surfel *m, const View *v, const Asked *q, dou
     const double near = along / off, k = q->scale * near * near / along;
     const double arm[3] = {v->t[0] + z * ray[0] - q->about[0], v->t[1] + z * ray[1] - q->about[1], v->t[2] + z * ray[2] - q->about[2]};
     const double r = inverse - (q->scale * near - q->offset * q->unit);
-    const double g[ROWS] = {k * nx, k * ny, k * nz, k * (arm[1] * nz - arm[2] * ny), k * (arm[2] * nx - arm[0] * nz),
-                            k * (arm[0] * ny - arm[1] * nx), q->scale * near, -q->unit, r, 1.0};
+    const double g[ROWS] = {k * nx,
+                            k * ny,
+                            k * nz,
+                            k * (arm[1] * nz - arm[2] * ny),
+                            k * (arm[2] * nx - arm[0] * nz),
+                            k * (arm[0] * ny - arm[1] * nx),
+                            q->scale * near,
+                            -q->unit,
+                            r,
+                            1.0};
     const double rough = q->surface * near * near, variance = q->noise * q->noise + rough * rough;
     const double k2 = q->robust * q->robust * variance, damp = k2 / (k2 + r * r), w = damp * damp / variance;
     for (int a = 0; a < ROWS; a++) {
@@ -290,9 +304,10 @@ static inline double product(const double *one, const double *other, int count)
 
 /* Adds the normal equations of one image to H (8, 8) and b (8). Writes the gradient of each patch to ``pulls`` (patches, 8): the sum of
  * weight x residual x derivative. The shared error of each patch is one unknown with a prior, marginalised by the Schur complement.
- * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST_PIXELS pixels. Returns the number of pixels used. */
-WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t *met, const float *inverse, const uint8_t *movable, const Asked *q,
-                            double *H, double *b, double *pulls)
+ * ``inverse`` (height, width): measured 1 / z, 0 for none. A patch has at most MOST_PIXELS pixels. Adds half the
+ * weighted squared residuals to ``error``. Returns the number of pixels used. */
+WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t *met, const float *inverse, const uint8_t *movable,
+                            const Asked *q, double *H, double *b, double *pulls, double *error)
 {
     Batch batch;
     int64_t pixels = 0;
@@ -325,6 +340,7 @@ WIDE int64_t streetfix_pull(const Surfel *surfels, const View *v, const int32_t 
                 pulls[a] = product(batch.weighted[RESIDUAL], batch.rows[a], whole) - share * own[a] * own[RESIDUAL];
                 b[a] += pulls[a];
             }
+            *error += 0.5 * (product(batch.weighted[RESIDUAL], batch.rows[RESIDUAL], whole) - share * own[RESIDUAL] * own[RESIDUAL]);
             pixels += count;
         }
     return pixels;

@@ -135,7 +135,7 @@ def _library() -> ctypes.CDLL:
         {"UNKNOWNS": UNKNOWNS, "MOST_PIXELS": MOST_PATCH**2},
     )
     library.streetfix_pull.argtypes = [
-        c_void_p, POINTER(View), c_void_p, c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p
+        c_void_p, POINTER(View), c_void_p, c_void_p, c_void_p, POINTER(_Asked), c_void_p, c_void_p, c_void_p, POINTER(c_double)
     ]  # fmt: skip
     library.streetfix_pull.restype = c_int64
     return library
@@ -162,12 +162,13 @@ class _State:
 
 @dataclass(frozen=True, slots=True)
 class _Pull:
-    """Normal equations of all pixels, scatter of the patches' gradients (0 if not requested), and number of pixels used."""
+    """Normal equations of all pixels, scatter of the patches' gradients (0 if not requested), number of pixels used, and error."""
 
     H: Float64[NDArray[np.float64], "8 8"]
     b: Float64[NDArray[np.float64], "8"]
     scatter: Float64[NDArray[np.float64], "8 8"]
     pixels: int
+    error: float
 
 
 def met_by(
@@ -213,6 +214,7 @@ def adjust(
     sigma = np.r_[np.full(3, settings.position_m), np.full(3, settings.turn_rad), settings.scale, settings.offset_px]
     prior, moved = np.diag(sigma**-2.0), np.zeros(UNKNOWNS)
     moved[6:] = state.log_scale, state.offset  # priors of scale and offset: mean 0; of the pose: the start
+    converged, iterations = False, 0
     for _ in range(settings.rounds):
         before = moved
         met = [sights.meet(state.camera_of(picture), picture.camera) for picture in pictures]
@@ -223,14 +225,14 @@ def adjust(
             told, wanted = pull.H / settings.alike + prior, pull.b / settings.alike - prior @ moved
             step = np.zeros(UNKNOWNS)
             step[free] = np.linalg.solve(told[np.ix_(free, free)], wanted[free])
-            state, moved = state.moved(step), moved + step
+            state, moved, iterations = state.moved(step), moved + step, iterations + 1
         went = np.linalg.norm((moved - before)[:6].reshape(2, 3), axis=1)
-        if went[0] < settings.still_m and went[1] < settings.still_rad:
+        if converged := bool(went[0] < settings.still_m and went[1] < settings.still_rad):
             break
     pull = _pull(cloud, pictures, met, state, settings, scattered=True)
     pose = replace(
         found, R_map_level=state.R, camera_m=state.t + cloud.origin_m, scale=float(np.exp(state.log_scale)),
-        offset=state.offset, information=pull.H,
+        offset=state.offset, information=pull.H, converged=converged, iterations=iterations, error=pull.error,
     )  # fmt: skip
     return pose, pull.scatter
 
@@ -240,6 +242,7 @@ def _pull(
     scattered: bool = False,
 ) -> _Pull:  # fmt: skip
     H, b, scatter, pixels = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros(UNKNOWNS), np.zeros((UNKNOWNS, UNKNOWNS)), 0
+    error = c_double(0.0)
     for picture, surfels in zip(pictures, met, strict=True):
         camera, rig = picture.camera, picture.focal_baseline_px_m
         down, across = (-(-side // settings.patch) for side in (camera.height, camera.width))
@@ -252,11 +255,11 @@ def _pull(
         view = View.of(state.camera_of(picture), camera)
         pixels += _library().streetfix_pull(
             cloud.surfels.ctypes.data, byref(view), surfels.ctypes.data, picture.inverse.ctypes.data, picture.movable.ctypes.data,
-            byref(asked), H.ctypes.data, b.ctypes.data, pulls.ctypes.data,
+            byref(asked), H.ctypes.data, b.ctypes.data, pulls.ctypes.data, byref(error),
         )  # fmt: skip
         if scattered:
             scatter += _scattered(pulls)
-    return _Pull(H, b, scatter, int(pixels))
+    return _Pull(H, b, scatter, int(pixels), error.value)
 
 
 def _scattered(pulls: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
-from service.geometry.rigid import Rotation, rotation_z
+from service.geometry.rigid import Rotation, Transform, rotation_z, transform_from
 from service.registration.kernel import STATE, QueryPoints, SolverOptions, align
 from service.registration.surfel_map import SurfelMap
 
@@ -98,6 +98,9 @@ class Registered:
         inliers: weighted share of the query's points that lie on the map, from 0 to 1.
         information: information matrix without the priors. Order: translation (m), rotation (rad), log scale, disparity offset (px).
         hypothesis: number of the hypothesis that the start belonged to.
+        converged: whether the last step of the last stage was smaller than 1 mm and 0.1 degrees.
+        iterations: solver steps of the last stage.
+        error: half the sum of the weighted squared residuals before the last step, without the priors.
     """
 
     R_map_level: Rotation
@@ -107,6 +110,23 @@ class Registered:
     inliers: float
     information: Float64[NDArray[np.float64], "8 8"]
     hypothesis: int
+    converged: bool = False
+    iterations: int = 0
+    error: float = 0.0
+
+    @property
+    def T_map_level(self) -> Transform:
+        """Pose of the query's level frame in the map frame."""
+        return transform_from(self.R_map_level, self.camera_m)
+
+    def of_frame(self, T_reference_level: Transform) -> "Registered":
+        """Return the pose of another frame's level frame, if this pose is that of the reference.
+
+        Args:
+            T_reference_level: pose of the frame's level frame in the level frame of the reference.
+        """
+        R = self.R_map_level @ T_reference_level[:3, :3]
+        return replace(self, R_map_level=R, camera_m=self.camera_m + self.R_map_level @ T_reference_level[:3, 3])
 
 
 def register(
@@ -173,7 +193,7 @@ def registered_of(state: Any, hypothesis: int, origin_m: Float64[NDArray[np.floa
     """
     return Registered(
         state["R"].copy(), state["t"] + origin_m, float(np.exp(state["log_scale"])), float(state["offset"]), float(state["inliers"]),
-        state["information"].copy(), hypothesis,
+        state["information"].copy(), hypothesis, bool(state["converged"]), int(state["iterations"]), float(state["error"]),
     )  # fmt: skip
 
 

@@ -10,8 +10,8 @@ typedef struct {
     uint32_t points;
 } Surfel;
 
-#define SURFEL_LAYOUT                                                                                                      \
-    LAYOUT_STRUCT(Surfel), LAYOUT_FIELD(Surfel, xyz), LAYOUT_FIELD(Surfel, normal), LAYOUT_FIELD(Surfel, thickness_m),       \
+#define SURFEL_LAYOUT                                                                                                  \
+    LAYOUT_STRUCT(Surfel), LAYOUT_FIELD(Surfel, xyz), LAYOUT_FIELD(Surfel, normal), LAYOUT_FIELD(Surfel, thickness_m), \
         LAYOUT_FIELD(Surfel, points)
 
 #endif

@@ -1,14 +1,24 @@
-"""A thread pool with a bounded queue. It refuses a task at once if the queue is full."""
+"""What a process accepts: tasks on its worker threads, and bytes of memory for all requests, REST and gRPC.
+
+Both have a limit. A request that does not fit is refused at once. A request reserves its memory before it allocates. So a flood of
+large requests causes refusals and not a killed container.
+"""
 
 import threading
 import traceback
+import weakref
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
-from service.errors import BusyError
+from service.errors import BusyError, TooLargeError
+from service.runtime.heap import LARGE_BYTES, Trimmer
 
 T = TypeVar("T")
+
+MIB = 2**20
 
 
 class Admission:
@@ -113,6 +123,181 @@ class Admission:
         self._told_waiting(max(0, self._taken - self._working))
 
 
+class MemoryBudget:
+    """Bytes that all requests together may hold. It is thread-safe.
+
+    Args:
+        limit: bytes.
+        messages: number of gRPC messages of the largest size that may be read at once, outside the limit.
+    """
+
+    def __init__(self, limit: int, messages: int = 0) -> None:
+        self.limit = limit
+        self.messages = messages
+        self._lock = threading.Lock()
+        self._held = 0
+        # Finalizers of images may run while this thread holds the lock. So they only append here and never take the lock.
+        self._returned: deque[int] = deque()
+        self._told: Callable[[float], None] = lambda _: None
+        self._trimmer = Trimmer()
+
+    @property
+    def held(self) -> int:
+        """Number of bytes that are reserved now."""
+        with self._lock:
+            self._take_back()
+            return self._held
+
+    def watch(self, told: Callable[[float], None]) -> None:
+        """Report the reserved bytes now and after every change.
+
+        Args:
+            told: called with the number of bytes.
+        """
+        self._told = told
+        told(self.held)
+
+    def hold(self) -> "Hold":
+        """Create an empty reservation that can grow."""
+        return Hold(self)
+
+    def reserve(self, count: int) -> bool:
+        """Reserve bytes if they fit; return whether they did.
+
+        Args:
+            count: bytes.
+        """
+        with self._lock:
+            self._take_back()
+            if self._held + count > self.limit:
+                return False
+            self._held += count
+            self._told(self._held)
+            return True
+
+    def give_back(self, count: int) -> None:
+        """Release reserved bytes.
+
+        Args:
+            count: bytes.
+        """
+        with self._lock:
+            self._take_back()
+            self._held -= count
+            self._told(self._held)
+        self.freed(count)
+
+    def freed(self, count: int) -> None:
+        """Return freed memory to the system if it is large.
+
+        Args:
+            count: bytes that were freed.
+        """
+        if count >= LARGE_BYTES:
+            self._trimmer.soon()
+
+    def give_back_later(self, count: int) -> None:
+        """Release reserved bytes at the next access to the budget. Safe to call from a finalizer, because it takes no lock.
+
+        Args:
+            count: bytes.
+        """
+        self._returned.append(count)
+
+    def _take_back(self) -> None:
+        while self._returned:
+            self._held -= self._returned.popleft()
+
+
+class Hold:
+    """Bytes that one request holds.
+
+    Use it as a context manager. The bytes are released when the context and all work that was passed to ``until`` have ended.
+
+    Args:
+        budget: in which the bytes are reserved.
+
+    Attributes:
+        bytes: reserved now.
+    """
+
+    def __init__(self, budget: MemoryBudget) -> None:
+        self._budget = budget
+        self._lock = threading.Lock()
+        self._users = 1  # the request itself, and the work for it
+        self.bytes = 0
+
+    def __enter__(self) -> Self:
+        """Return the hold; nothing is reserved yet."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Release the bytes once all work is over."""
+        self._one_less()
+
+    def grow(self, count: int) -> None:
+        """Reserve more bytes before they are allocated.
+
+        Args:
+            count: additional bytes.
+
+        Raises:
+            TooLargeError: the request alone exceeds the budget.
+            BusyError: other requests hold too much now.
+        """
+        if self._budget.reserve(count):
+            self.bytes += count
+            return
+        needed, limit = self.bytes + count, self._budget.limit
+        if needed > limit:
+            raise TooLargeError(
+                f"the request needs {in_mib(needed)} of memory, more than the {in_mib(limit)} that this service has for requests; send "
+                "smaller pictures or fewer at once, or let its operator give it more (STREETFIX_REQUEST_MEMORY_MIB)"
+            )
+        raise BusyError(
+            f"the memory for requests is taken (this one needs {in_mib(needed)} of {in_mib(limit)}); try again in a second"
+        )
+
+    def shrink_to(self, count: int) -> None:
+        """Release the bytes above a count.
+
+        Args:
+            count: bytes to keep.
+        """
+        if count < self.bytes:
+            self._budget.give_back(self.bytes - count)
+            self.bytes = count
+
+    def until(self, work: "Future[Any]") -> None:
+        """Keep the bytes at least until some work is over, even if the caller disconnects.
+
+        Args:
+            work: future of the work.
+        """
+        with self._lock:
+            self._users += 1
+        work.add_done_callback(lambda _: self._one_less())
+
+    def leave_with(self, owner: Any) -> None:
+        """Transfer the bytes to an object. They are released when the object is deleted.
+
+        Args:
+            owner: any object that supports weak references.
+        """
+        if self.bytes:
+            weakref.finalize(owner, self._budget.give_back_later, self.bytes).atexit = False
+        self.bytes = 0
+
+    def _one_less(self) -> None:
+        with self._lock:
+            self._users -= 1
+            over = self._users == 0
+        if over:
+            self.shrink_to(0)
+
+
 def forget_locals(error: BaseException) -> None:
     """Clear the local variables in the tracebacks of an error, its causes and contexts.
 
@@ -128,3 +313,12 @@ def forget_locals(error: BaseException) -> None:
         seen.add(id(one))
         traceback.clear_frames(one.__traceback__)
         one = one.__cause__ or one.__context__
+
+
+def in_mib(count: float) -> str:
+    """Return a number of bytes as text in MiB.
+
+    Args:
+        count: bytes.
+    """
+    return f"{count / MIB:.0f} MiB"

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 from service.errors import BundleError, RequestError, StreetfixError
 from service.geometry.camera import PinholeCamera
 from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits
+from service.imaging.level import GivenHeight
 from service.imaging.view_grid import ViewGrid
 from service.localization.answer import Answer
-from service.localization.decoding import DepthFormat, decoded_query
-from service.localization.frames import Frame
 from service.localization.localizer import Localizer
-from service.localization.prior import Prior
-from service.localization.query import NEIGHBOURS, Query
 from service.maps.reader import MapBundle
+from service.option_limits import NEIGHBOURS
+from service.retrieval.frame import Frame
+from service.retrieval.prior import Prior
+from service.retrieval.query import DepthFormat, Query, decoded_query
 from service.runtime.admission import Admission
 from service.runtime.last_answers import LastAnswers
 from service.runtime.map_registry import MapRegistry
@@ -52,6 +53,7 @@ class EncodedQuery:
         baseline_m: of the stereo camera, for disparity.
         max_range_m: depths beyond this range count as not measured; None sets no limit.
         down_camera: direction of gravity in the camera frame, (3,); None if unknown.
+        camera_height: height of the camera above the ground; None: it is found in the depth image.
         T_vehicle_camera: from the camera frame to the vehicle frame, (4, 4), metres; None if the vehicle pose is not wanted.
         neighbours: number of distinct places that vote and that the answer lists.
         refine: whether to register the images on the map cloud.
@@ -70,6 +72,7 @@ class EncodedQuery:
     baseline_m: float | None = None
     max_range_m: float | None = None
     down_camera: NDArray[np.float64] | None = None
+    camera_height: GivenHeight | None = None
     T_vehicle_camera: NDArray[np.float64] | None = None
     neighbours: int = NEIGHBOURS
     refine: bool = True
@@ -104,7 +107,8 @@ class Engine:
         self.memory = budget_of(settings, threads=self.threads)
         self.metrics = Metrics(self.admission, registry, self.memory)
         self.last_answers = LastAnswers()
-        self.tracing = Tracing.open(settings.traces_endpoint, share=settings.traces_share)
+        endpoint = settings.traces_endpoint
+        self.tracing = None if endpoint is None else Tracing.open(endpoint, share=settings.traces_share)
         self.is_draining = False
 
     @classmethod
@@ -247,6 +251,7 @@ class Engine:
         return replace(
             decoded_query(encoded.rgb, encoded.depth, encoded.camera, depth_format, grid=grid, limits=image_limits),
             down_camera=encoded.down_camera,
+            camera_height=encoded.camera_height,
             T_vehicle_camera=encoded.T_vehicle_camera,
             neighbours=encoded.neighbours,
             refine=encoded.refine,

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.errors import BundleError, NotReadyError, UnknownMapError
-from service.localization.encoder import Provider
 from service.localization.localizer import Localizer
 from service.maps.manifest import FILE as MANIFEST_FILE
 from service.maps.manifest import Manifest, dataset_error
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Provider
 from service.runtime.serving_table import Key, MapVersion, ServingTable, Table
 
 _log = logging.getLogger("streetfix.maps")

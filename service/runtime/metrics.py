@@ -17,9 +17,8 @@ from prometheus_client.registry import Collector
 
 from service.localization.answer import Answer, Timings
 from service.maps.reader import MapBundle
-from service.runtime.admission import Admission
+from service.runtime.admission import Admission, MemoryBudget
 from service.runtime.map_registry import MOST_REFUSED, MapRegistry
-from service.runtime.memory import MemoryBudget
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512, 1.0, 2.0, 5.0, 10.0, 30.0)

@@ -4,8 +4,9 @@ Later sources override earlier ones: defaults, TOML file, environment ``STREETFI
 """
 
 import os
+import re
 import tomllib
-from ipaddress import ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,11 +21,13 @@ from pydantic_settings import (
 
 from service.errors import RequestError
 from service.imaging.picture_headers import DEFAULT_LIMITS
-from service.localization.encoder import Provider
-from service.localization.query import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
+from service.option_limits import FALSE_ACCEPT_RATE, LEAST_FALSE_ACCEPT_RATE
+from service.retrieval.encoder import Provider
 from service.runtime.environment import CLIENT_KEY, CONFIG, did_you_mean, require_known, setting_names
-from service.runtime.hosts import require_host_pattern
 from service.runtime.readable import why_unreadable
+
+_LABEL = r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?"
+_HOST_PATTERN = re.compile(rf"\*|(\*\.)?{_LABEL}(\.{_LABEL})*")
 
 
 class Limits(BaseModel):
@@ -168,7 +171,7 @@ class Settings(BaseSettings):
     @field_validator("allowed_hosts")
     @classmethod
     def _host_patterns(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(require_host_pattern(each) for each in value)
+        return tuple(_host_pattern(each) for each in value)
 
 
 def is_loopback(host: str) -> bool:
@@ -177,12 +180,29 @@ def is_loopback(host: str) -> bool:
     Args:
         host: name or IP address. Names other than ``localhost`` do not count as loopback.
     """
-    if host == "localhost":
-        return True
+    address = _address(host)
+    return host == "localhost" or (address is not None and address.is_loopback)
+
+
+def _host_pattern(value: str) -> str:
+    """Return a host pattern in lower case: a name, ``*.name`` or ``*``. An IP address passes too; addresses are always allowed.
+
+    Raises:
+        ValueError: the value has a scheme, a port or a path, or is no name.
+    """
+    value = value.lower().rstrip(".")
+    if _HOST_PATTERN.fullmatch(value) or _address(value.strip("[]")) is not None:
+        return value
+    raise ValueError(
+        f"{value!r} is no host name; write names without scheme and port, as maps.example.org or *.example.org"
+    )
+
+
+def _address(text: str) -> IPv4Address | IPv6Address | None:
     try:
-        return ip_address(host).is_loopback
-    except ValueError:  # a name may resolve to any address
-        return False
+        return ip_address(text)
+    except ValueError:  # a name, which may resolve to any address
+        return None
 
 
 def load_settings(config: Path | None = None, **flags: object) -> Settings:
@@ -238,10 +258,13 @@ def _with_file(path: Path | None) -> type[Settings]:
 
         @classmethod
         def settings_customise_sources(
-            cls, settings_cls: type[BaseSettings], init_settings: PydanticBaseSettingsSource,
-            env_settings: PydanticBaseSettingsSource, dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
+            cls,
+            settings_cls: type[BaseSettings],
+            init_settings: PydanticBaseSettingsSource,
+            env_settings: PydanticBaseSettingsSource,
+            dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
             file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
-        ) -> tuple[PydanticBaseSettingsSource, ...]:  # fmt: skip
+        ) -> tuple[PydanticBaseSettingsSource, ...]:
             """Return the sources, the strongest first."""
             with file.open("rb"):  # pydantic-settings would ignore a missing file silently
                 return init_settings, env_settings, TomlConfigSettingsSource(settings_cls, file)

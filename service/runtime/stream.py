@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from service.errors import RequestError
 from service.geometry.rigid import Transform, inverse
-from service.localization.frames import Frame
 from service.localization.localizer import Localizer
+from service.retrieval.frame import Frame
 from service.runtime.engine import EncodedQuery, Engine, Located
 
 #: Maximum number of frames that an answer uses. Five frames resolve a street of repeating blocks (decision log).

@@ -68,30 +68,32 @@ class RequestSpan:
         self._span.end()
 
 
+#: Span of a request that is not traced.
+NO_SPAN = RequestSpan()
+
+
 class Tracing:
     """Creates the spans of requests. Use ``open`` to send them to an OpenTelemetry collector.
 
     Args:
-        tracer: of OpenTelemetry; None traces nothing.
+        tracer: of OpenTelemetry.
     """
 
-    def __init__(self, tracer: "Tracer | None" = None) -> None:
+    def __init__(self, tracer: "Tracer") -> None:
         self._tracer = tracer
 
     @classmethod
-    def open(cls, endpoint: str | None, *, share: float, exporter: "SpanExporter | None" = None) -> "Tracing":
+    def open(cls, endpoint: str, *, share: float, exporter: "SpanExporter | None" = None) -> "Tracing":
         """Send spans by OTLP over HTTP.
 
         Args:
-            endpoint: of the collector, as ``http://127.0.0.1:4318/v1/traces``; None traces nothing.
+            endpoint: of the collector, as ``http://127.0.0.1:4318/v1/traces``.
             share: 0 to 1, of the requests without a trace context that are traced. For the others the caller decides.
             exporter: used instead of OTLP; None exports by OTLP.
 
         Raises:
             ExtraMissingError: the extra is not installed.
         """
-        if endpoint is None:
-            return cls()
         try:
             from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
             from opentelemetry.sdk.resources import Resource
@@ -115,14 +117,9 @@ class Tracing:
             face: request handler, ``rest`` or ``grpc``.
             traceparent: W3C trace context of the request; None if it has none.
         """
-        if self._tracer is None:
-            return _NOTHING
         from opentelemetry.trace import SpanKind
         from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
         context = TraceContextTextMapPropagator().extract({} if traceparent is None else {"traceparent": traceparent})
         span = self._tracer.start_span(face, context=context, kind=SpanKind.SERVER, attributes={"streetfix.face": face})
         return RequestSpan(self._tracer, span)
-
-
-_NOTHING = RequestSpan()

@@ -16,12 +16,12 @@ from typer.main import get_command
 
 from benchmarks.docs_blocks import PAGES, Block, blocks_of, commands_of, pages
 from service.cli.main import app_for
-from service.localization.hypotheses import ClusterSettings
-from service.localization.query import FALSE_ACCEPT_RATE
-from service.localization.scoring import SupportWeights
-from service.localization.starts import StartSettings
+from service.option_limits import FALSE_ACCEPT_RATE
 from service.registration.points import PointSettings
 from service.registration.register import RegistrationSettings
+from service.retrieval.hypotheses import ClusterSettings
+from service.retrieval.starts import StartSettings
+from service.scoring.scorer import SupportWeights
 
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -68,7 +68,12 @@ def test_the_files_that_the_architecture_names_exist() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text()
     named_files = re.findall(r"`([a-z0-9_/]+\.py)`", text)
     assert len(named_files) > 40
-    folders = [ROOT / "service", ROOT / "service" / "localization", ROOT / "model_training"]
+    folders = [
+        ROOT / "service",
+        ROOT / "service" / "scoring",
+        ROOT / "service" / "localization",
+        ROOT / "model_training",
+    ]
     assert [name for name in named_files if not any((folder / name).is_file() for folder in folders)] == []
     of_service, of_training = (
         {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}

@@ -61,10 +61,12 @@ def flat(answer: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, list):
             return [plain(each) for each in value]
         if isinstance(value, str):
-            return value.removeprefix("LOCALIZATION_STATUS_").removeprefix("STREET_SECTION_").lower()
+            for prefix in ("LOCALIZATION_STATUS_", "STREET_SECTION_", "CAMERA_HEIGHT_ORIGIN_"):
+                value = value.removeprefix(prefix)
+            return value.lower()
         return float(value) if isinstance(value, int) else value
 
-    return plain(answer)  # type: ignore[no-any-return]
+    return plain(answer)
 
 
 def of_message(message: pb.LocalizeResponse) -> dict[str, Any]:
@@ -77,7 +79,7 @@ def posted(client: httpx.Client, path: str, parts: dict[str, bytes]) -> Any:
     return response.json()
 
 
-def pair(parts: dict[str, bytes]) -> dict[str, bytes]:
+def pair(parts: dict[str, bytes]) -> dict[str, Any]:
     return {"rgb": parts["rgb"], "depth": parts["depth"]}
 
 
@@ -93,6 +95,10 @@ def numbered(parts: dict[str, bytes], count: int, document: dict[str, Any]) -> d
         ({"options": {"refine": False, "neighbours": 3}}, {"options": pb.Options(refine=False, neighbours=3)}),
         ({"gravity": {"x": 0.02, "y": 1, "z": 0}}, {"gravity": pb.Vector3(x=0.02, y=1)}),
         ({"T_vehicle_camera": AHEAD}, {"vehicle_from_camera": AHEAD}),
+        ({"T_vehicle_camera": AHEAD | {"position": {"x": 0, "y": 0, "z": 1.6}}, "vehicle_base_on_ground": True},
+         {"vehicle_from_camera": AHEAD | {"position": {"x": 0, "y": 0, "z": 1.6}}, "vehicle_base_on_ground": True}),
+        ({"camera": {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5, "height_m": 1.52, "height_std_m": 0.02}},
+         {"camera": pb.Camera(width=64, height=48, fx=32, fy=32, cx=31.5, cy=23.5, height_m=1.52, height_std_m=0.02)}),
         ({"map": "tiny", "prior": {"position": {"x": 20, "y": 2}, "heading_deg": 90}},
          {"map": "tiny", "prior": pb.Prior(position=pb.PriorPosition(x=20, y=2), heading_deg=90)}),
     ],
@@ -101,9 +107,12 @@ def test_one_pair(faces: Any, parts_of: Parts, changed: dict[str, Any], message:
     client, stub = faces
     parts = parts_of(**changed)
     rest = posted(client, "/v1/localize", parts)
-    request = pb.LocalizeRequest(**pair(parts), camera=CAMERA, depth_format=DEPTH, **message)
+    request = pb.LocalizeRequest(**pair(parts), **{"camera": CAMERA, "depth_format": DEPTH} | message)
     assert of_message(stub.Localize(request)) == flat(rest)
     assert rest["pose"]["position"]["x"] == pytest.approx(20, abs=0.3)
+    is_given = "vehicle_base_on_ground" in changed or "camera" in changed
+    assert rest["camera_height"]["origin"] == ("given" if is_given else "estimated")
+    assert rest["camera_height"]["height_m"] == pytest.approx(1.5, abs=0.1)
 
 
 def test_a_sequence(faces: Any, parts_of: Parts) -> None:

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.main import get_command
@@ -9,7 +10,7 @@ from typer.main import get_command
 from benchmarks import figures
 from benchmarks.figures import CODE, documents, figure, with_figures, without_figures
 from service.cli.main import app_for
-from service.localization.query import FALSE_ACCEPT_RATE
+from service.option_limits import FALSE_ACCEPT_RATE
 from service.runtime.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -45,10 +46,11 @@ def test_no_such_figure_is_typed(page: Path) -> None:
 
 def test_no_help_text_tells_another_default_than_the_settings_have() -> None:
     checked = 0
-    for option in get_command(app_for(["serve"])).commands["serve"].params:
+    commands: Any = get_command(app_for(["serve"]))  # a group of commands
+    for option in commands.commands["serve"].params:
         told = re.search(r"\[default: ([^\]]+)\]", getattr(option, "help", None) or "")
-        default = Settings.model_fields[option.name].default if told and option.name in Settings.model_fields else None
-        if default is not None:
+        default = Settings.model_fields[option.name].default if option.name in Settings.model_fields else None
+        if told and default is not None:
             assert type(default)(told[1]) == default, option.name
             checked += 1
     assert checked >= 5

@@ -14,12 +14,13 @@ import pytest
 import uvicorn
 
 from service.client import Client, GrpcClient, NotLocalizedError, Options
+from service.confidence.features import FEATURES
 from service.contract.schema import LocalizeAnswer
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.grpc.server import GrpcServer
 from service.http.app import create_app
-from service.maps.calibration import FEATURES, terms
+from service.maps.calibration import terms
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine

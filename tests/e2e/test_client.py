@@ -84,6 +84,7 @@ def test_every_client_gets_the_same_answer(served: Served, pictures: Any) -> Non
     assert answers[0].status == "LOCALIZED"
     assert answers[0].street is not None
     assert answers[0].street.name == "End of street 2"
+    assert answers[0].pose is not None
     assert np.hypot(answers[0].pose.position.x - 20.0, answers[0].pose.position.y - 100.0) < 0.5
 
 

@@ -8,20 +8,38 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from model_training.mapping.voxel_map import VoxelMap
+from service.confidence.features import FEATURES
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from, transform_points
 from service.imaging.query_view import QueryViews
 from service.imaging.view_grid import ViewGrid
-from service.localization.frames import Frame
-from service.localization.query import Query
-from service.localization.search import ViewMatches
-from service.maps.calibration import FEATURES, Calibration, terms
+from service.maps.calibration import Calibration, terms
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
 from service.registration.surfel_map import SurfelMap
+from service.retrieval.frame import Frame
+from service.retrieval.knn import ViewMatches
+from service.retrieval.query import Query
+from tests.unit.street_scene import (  # noqa: F401  # fixtures for the tests of several packages
+    candidate,
+    points_at,
+    pose,
+    scene_of,
+    seen,
+    settle,
+    start_at,
+    street,
+    street_map,
+    streets_at,
+)
+
+# The same examples on every machine, and no clock: a busy one is no defect of the code.
+settings.register_profile("steady", deadline=None, derandomize=True)
+settings.load_profile("steady")
 
 BERLIN = {"latitude_deg": 52.52, "longitude_deg": 13.405, "height_m": 70.0}
 
@@ -37,9 +55,16 @@ def matches_of(xyz: Any, heading_deg: Any, similarity: Any, *, R_map_place: Any 
 
 
 def frame_of(
-    matches: ViewMatches, *, depth_m: Any = None, camera: PinholeCamera | None = None, R_level_camera: Any = R_BODY_OPTICAL,
-    height_m: float = 1.4, T_reference_camera: Any = None, descriptors: Any = ((1.0, 0.0),), noise: float = 1e-4,
-) -> Frame:  # fmt: skip
+    matches: ViewMatches,
+    *,
+    depth_m: Any = None,
+    camera: PinholeCamera | None = None,
+    R_level_camera: Any = R_BODY_OPTICAL,
+    height_m: float = 1.4,
+    T_reference_camera: Any = None,
+    descriptors: Any = ((1.0, 0.0),),
+    noise: float = 1e-4,
+) -> Frame:
     """A picture pair that was looked up with these matches; the pictures themselves are black and empty unless given."""
     camera = camera or PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
     depth_m = np.zeros((camera.height, camera.width), np.float32) if depth_m is None else depth_m
@@ -85,14 +110,14 @@ def calibration_of() -> Callable[..., Calibration]:
 
 def refused_answer(answer: dict[str, Any], status: str = "AMBIGUOUS", **changed: Any) -> dict[str, Any]:
     """A LOCALIZED answer of the contract as it would be if it were not: its pose is one of two hypotheses, 60 m apart."""
-    pose = answer["pose"]
-    elsewhere = pose | {"position": pose["position"] | {"y": pose["position"]["y"] + 60.0}}
+    guess = answer["pose"]
+    elsewhere = guess | {"position": guess["position"] | {"y": guess["position"]["y"] + 60.0}}
     hypotheses = [
         {"confirmed": False, "pose": each, "share": 0.5, "inliers": 0.5, "similarity": 0.25}
-        for each in (pose, elsewhere)
+        for each in (guess, elsewhere)
     ]
     spread = {
-        "mean": pose["position"] | {"y": pose["position"]["y"] + 30.0}, "covariance": [1.0, 0, 0, 0, 900.0, 0, 0, 0, 1.0],
+        "mean": guess["position"] | {"y": guess["position"]["y"] + 30.0}, "covariance": [1.0, 0, 0, 0, 900.0, 0, 0, 0, 1.0],
         "heading_std_deg": 20.0, "hypotheses_weight": 0.75,
     }  # fmt: skip
     reasons = [{"check": "baseline", "evidence": {"log_noise": 4.0, "points": -3.5}, "remedy": "check the baseline"}]

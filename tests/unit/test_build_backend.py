@@ -16,6 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def backend() -> ModuleType:
     spec = importlib.util.spec_from_file_location("build_backend", ROOT / "native" / "build_backend.py")
+    assert spec is not None
+    assert spec.loader is not None
     found = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(found)
     return found

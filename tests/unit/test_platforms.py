@@ -1,5 +1,6 @@
 """Where the service does not run, it says so, once and in one line."""
 
+import platform
 import subprocess
 import sys
 import tomllib
@@ -16,15 +17,15 @@ OTHERS = [("win32", "AMD64"), ("linux", "riscv64"), ("linux", "armv7l"), ("freeb
 
 @pytest.mark.parametrize(("system", "machine"), [("linux", "x86_64"), ("linux", "aarch64"), ("darwin", "arm64")])
 def test_linux_and_macos_are_supported(monkeypatch, system, machine):
-    monkeypatch.setattr(platforms.sys, "platform", system)
-    monkeypatch.setattr(platforms.platform, "machine", lambda: machine)
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(platform, "machine", lambda: machine)
     platforms.require_supported()
 
 
 @pytest.mark.parametrize(("system", "machine"), OTHERS)
 def test_others_are_refused_by_name(monkeypatch, system, machine):
-    monkeypatch.setattr(platforms.sys, "platform", system)
-    monkeypatch.setattr(platforms.platform, "machine", lambda: machine)
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(platform, "machine", lambda: machine)
     with pytest.raises(
         UnsupportedPlatformError, match=rf"not run on {system} \({machine}\): it runs on Linux \(x86-64"
     ):

@@ -35,8 +35,8 @@ class Localization:
     def __init__(self) -> None:
         self._pipeline = Pipeline(Path(os.environ[BUNDLE]))
 
-    @bentoml.api(route=PATH)
-    def localize(self, rgb: Path, depth: Path, request: LocalizeRequest):  # BentoML has no schema of a response
+    @bentoml.api(route=PATH)  # type: ignore[untyped-decorator]  # BentoML is in its own environment
+    def localize(self, rgb: Path, depth: Path, request: LocalizeRequest):  # type: ignore[no-untyped-def]  # no schema of a response
         """Localize one query.
 
         Args:

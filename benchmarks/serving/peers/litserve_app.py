@@ -15,7 +15,7 @@ import litserve  # isort: skip
 from fastapi import Response  # isort: skip
 
 
-class Localization(litserve.LitAPI):
+class Localization(litserve.LitAPI):  # type: ignore[misc]  # LitServe is in its own environment
     """Service that takes the parts of a request and returns JSON."""
 
     def setup(self, device: str) -> None:  # noqa: ARG002  # LitServe's signature
@@ -26,7 +26,7 @@ class Localization(litserve.LitAPI):
         """
         self._pipeline = Pipeline(Path(sys.argv[1]))
 
-    def decode_request(self, request):  # FastAPI would take an annotation for the schema of a body
+    def decode_request(self, request):  # type: ignore[no-untyped-def]  # FastAPI would take an annotation for a body's schema
         """Read the three parts of the multipart body.
 
         Args:

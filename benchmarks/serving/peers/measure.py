@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -72,7 +73,7 @@ def peer_rows(
 
     def start(name: str) -> Server | Host:
         if name == OWN:
-            return Server(site.bundle, core=core, **({} if core is None else {"threads": 1}))
+            return Server(site.bundle, core=core) if core is None else Server(site.bundle, core=core, threads=1)
         command = [str(pythons[name]), "-m", f"benchmarks.serving.peers.{name}_app", str(site.bundle)]
         return Host(command, sent["retrieval"][0], core=core)
 
@@ -82,8 +83,14 @@ def peer_rows(
 
 
 def measured(
-    names: Sequence[str], start: Start, sent: dict[str, list[Payload]], failed: dict[str, str], *, seconds: float, rounds: int
-) -> tuple[dict[str, Figures], float]:  # fmt: skip
+    names: Sequence[str],
+    start: Start,
+    sent: dict[str, list[Payload]],
+    failed: dict[str, str],
+    *,
+    seconds: float,
+    rounds: int,
+) -> tuple[dict[str, Figures], float]:
     """Measure the servers; return their figures by name and the common request rate.
 
     Args:
@@ -138,7 +145,7 @@ def measured(
         each(turn, saturate)
     rate = SHARE * min(median(found[name].per_s["full"]) for name in names if name not in failed)
     for turn in range(rounds):
-        each(turn, lambda name, server, seed=turn: arrive(name, server, seed, rate))  # the same arrivals for all
+        each(turn, partial(arrive, seed=turn, rate=rate))  # the same arrivals for all
     return found, rate
 
 

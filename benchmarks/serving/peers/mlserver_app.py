@@ -11,7 +11,7 @@ import os
 import sys
 from pathlib import Path
 
-from benchmarks.serving.peers.pipeline import PATH, Pipeline  # first: it limits the pools
+from benchmarks.serving.peers.pipeline import PATH, Pipeline, parts_of  # first: it limits the pools
 from benchmarks.serving.peers.ports import free_port
 
 from fastapi import Request, Response  # isort: skip
@@ -19,7 +19,7 @@ from mlserver import MLModel  # isort: skip
 from mlserver.handlers import custom_handler  # isort: skip
 
 
-class Localization(MLModel):
+class Localization(MLModel):  # type: ignore[misc]  # MLServer is in its own environment
     """Service that takes the parts of a request and returns JSON."""
 
     async def load(self) -> bool:
@@ -27,7 +27,7 @@ class Localization(MLModel):
         self._pipeline = Pipeline(Path(self.settings.parameters.uri))
         return True
 
-    @custom_handler(rest_path=PATH)
+    @custom_handler(rest_path=PATH)  # type: ignore[untyped-decorator]  # MLServer is in its own environment
     async def localize(self, request: Request) -> Response:
         """Localize one query.
 
@@ -35,8 +35,8 @@ class Localization(MLModel):
             request: multipart request.
         """
         async with request.form() as form:
-            parts = [await form[name].read() for name in ("rgb", "depth", "request")]
-        return Response(self._pipeline.answer(*parts), media_type="application/json")
+            rgb, depth, asked = [await part.read() for part in parts_of(form)]
+        return Response(self._pipeline.answer(rgb, depth, asked), media_type="application/json")
 
 
 def main() -> None:

@@ -3,7 +3,10 @@
 It runs in a peer's environment, so it imports the core and the contract, but no request handler.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
+
+from starlette.datastructures import FormData, UploadFile
 
 from service.runtime.threads import limit_pools, limit_pools_before_import
 
@@ -12,14 +15,30 @@ limit_pools_before_import()
 from service.contract.convert import answer_from, parsed, query_from  # noqa: E402  # after the pools' limits
 from service.contract.schema import LocalizeRequest  # noqa: E402  # after the pools' limits
 from service.imaging.decode import decode_depth, decode_rgb  # noqa: E402
-from service.localization.encoder import Encoder  # noqa: E402
 from service.localization.localizer import Localizer  # noqa: E402
-from service.localization.query import Query  # noqa: E402
 from service.maps.reader import MapBundle  # noqa: E402
+from service.retrieval.encoder import Encoder  # noqa: E402
+from service.retrieval.query import Query  # noqa: E402
 from service.runtime.engine import Located  # noqa: E402
 
 #: Path of every peer, so that one load generator sends the same bytes to all.
 PATH = "/v1/localize"
+
+
+def parts_of(form: FormData) -> Iterator[UploadFile]:
+    """Yield the parts of a multipart request: RGB image, depth image, request.
+
+    Args:
+        form: the parsed body.
+
+    Raises:
+        TypeError: a part is not a file.
+    """
+    for name in ("rgb", "depth", "request"):
+        part = form[name]
+        if not isinstance(part, UploadFile):
+            raise TypeError(f"{name}: a text field, not a file; send the part with a file name")
+        yield part
 
 
 class Pipeline:

@@ -12,7 +12,7 @@ import sys
 import threading
 from pathlib import Path
 
-from benchmarks.serving.peers.pipeline import PATH, Pipeline  # first: it limits the pools
+from benchmarks.serving.peers.pipeline import PATH, Pipeline, parts_of  # first: it limits the pools
 
 FLAGS = {
     "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1", "RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_HAPROXY_METRICS_ENABLED": "0",
@@ -38,8 +38,8 @@ class Localization:
     async def __call__(self, request: Request) -> Response:
         """Localize one query."""
         async with request.form() as form:
-            parts = [await form[name].read() for name in ("rgb", "depth", "request")]
-        return Response(self._pipeline.answer(*parts), media_type="application/json")
+            rgb, depth, asked = [await part.read() for part in parts_of(form)]
+        return Response(self._pipeline.answer(rgb, depth, asked), media_type="application/json")
 
 
 def main() -> None:
@@ -49,7 +49,7 @@ def main() -> None:
         num_cpus=1, include_dashboard=False, log_to_driver=False, _node_ip_address="127.0.0.1", _temp_dir=str(Path.cwd() / "ray")
     )  # fmt: skip
     serve.start(http_options={"host": "127.0.0.1", "port": int(port)}, logging_config={"enable_access_log": False})
-    serve.run(Localization.bind(bundle), route_prefix=PATH)
+    serve.run(Localization.bind(bundle), route_prefix=PATH)  # type: ignore[attr-defined]  # the decorator adds it
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: told.set())
     told.wait()

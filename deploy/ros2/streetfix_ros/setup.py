@@ -14,7 +14,7 @@ setup(
         (f"share/{NAME}/launch", ["launch/streetfix.launch.py"]),
         (f"share/{NAME}/config", ["config/streetfix.yaml"]),
     ],
-    install_requires=["setuptools", "streetfix"],
+    install_requires=["setuptools", "streetfix[server]"],
     zip_safe=True,
     maintainer="The Streetfix developers",
     maintainer_email="streetfix@example.com",

@@ -7,8 +7,8 @@ from starlette.requests import Request
 
 from service.contract import schema
 from service.contract.convert import last_answer_from
-from service.http.auth import require_operator
-from service.http.routes.localize import problems
+from service.http.described import problems
+from service.http.middleware import require_operator
 from service.runtime.engine import Engine
 from service.runtime.last_answers import MOST
 

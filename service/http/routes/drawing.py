@@ -6,8 +6,8 @@ from fastapi import APIRouter, Query
 from starlette.responses import Response
 
 from service.console.cloud import LEVELS, Clouds, places_bytes
-from service.http.asking import Asking
-from service.http.routes.localize import problems
+from service.http.body import Asking
+from service.http.described import problems
 
 _BYTES = "application/octet-stream"
 _BINARY = {_BYTES: {"schema": {"type": "string", "format": "binary"}}}

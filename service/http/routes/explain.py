@@ -8,10 +8,8 @@ from service.console.explain import explain
 from service.console.message import explanation_message
 from service.contract import schema
 from service.contract.convert import parsed, query_from
-from service.http.asking import Asking
-from service.http.body import Body
-from service.http.parts import MOST_PARTS, require_parts
-from service.http.routes.localize import LOCALIZE_BODY, problems
+from service.http.body import MOST_PARTS, Asking, Body, require_parts
+from service.http.described import LOCALIZE_BODY, problems
 
 
 def router_for(asking: Asking) -> APIRouter:

@@ -5,7 +5,7 @@ from starlette.responses import Response
 
 from service.contract import schema
 from service.errors import NotReadyError
-from service.http.routes.localize import problems
+from service.http.described import problems
 from service.runtime.engine import Engine
 from service.runtime.map_registry import MOST_REFUSED, NO_MAP
 from service.runtime.metrics import CONTENT_TYPE

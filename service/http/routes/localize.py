@@ -3,79 +3,21 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from http import HTTPStatus
-from typing import Any
 
 from fastapi import APIRouter
+from pydantic import BaseModel, Field
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.contract import schema
 from service.contract.convert import answer_from, fields_under, parsed, query_from, sequence_from
 from service.errors import StreetfixError
-from service.http.asking import Asking
-from service.http.body import Body
-from service.http.geopose import GEOPOSE, sure_geopose, wants_geopose
-from service.http.outcome import BatchAnswer, Outcome
-from service.http.parts import MOST_PARTS, document_of, numbered_pictures, require_parts
-from service.http.problems import MEDIA_TYPE, problem_of
+from service.http.body import MOST_PARTS, Asking, Body, document_of, numbered_pictures, require_parts
+from service.http.described import LOCALIZE_BODY, numbered_body, problems
+from service.http.geopose import GEOPOSE, sure_geopose
+from service.http.problems import Problem, problem_of
 from service.runtime.engine import Engine, Located
 from service.runtime.tracing import RequestSpan
-
-LOCALIZE_BODY: dict[str, Any] = {
-    "required": True,
-    "content": {
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["rgb", "depth", "request"],
-                "additionalProperties": False,
-                "properties": {
-                    "rgb": {"type": "string", "format": "binary", "description": "JPEG, PNG or WebP"},
-                    "depth": {
-                        "type": "string",
-                        "format": "binary",
-                        "description": "16-bit PNG, TIFF, NPY or raw16 (SFD1: zstd or lz4, the cheapest). With depth.encoding: "
-                        "CARLA's 24-bit PNG (carla), or ROS' compressedDepth (compressed_depth)",
-                    },
-                    "request": {"$ref": "#/components/schemas/LocalizeRequest"},
-                },
-            },
-            "encoding": {
-                "rgb": {"contentType": "image/jpeg, image/png, image/webp"},
-                "depth": {"contentType": "image/png, image/tiff, application/octet-stream"},
-                "request": {"contentType": "application/json"},
-            },
-        }
-    },
-}
-
-
-def _numbered(document: str) -> dict[str, Any]:
-    """OpenAPI body of several image pairs: rgb0, depth0, rgb1, depth1 and so on, and the JSON."""
-    pictures: dict[str, Any] = {}
-    for kind, formats in (("rgb", "as rgb of /v1/localize"), ("depth", "as depth of /v1/localize")):
-        for number in range(schema.MOST_FRAMES):
-            pictures[f"{kind}{number}"] = {"type": "string", "format": "binary", "description": formats}
-    properties = pictures | {"request": {"$ref": f"#/components/schemas/{document}"}}
-    content = {
-        "type": "object",
-        "required": ["rgb0", "depth0", "request"],
-        "additionalProperties": False,
-        "properties": properties,
-    }
-    encoding = {"request": {"contentType": "application/json"}}
-    return {"required": True, "content": {"multipart/form-data": {"schema": content, "encoding": encoding}}}
-
-
-def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Build the OpenAPI responses for the problems of a route.
-
-    Args:
-        statuses: HTTP status codes of the problems.
-    """
-    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    return {status: {"description": HTTPStatus(status).phrase, "content": content} for status in statuses}
 
 
 def router_for(asking: Asking) -> APIRouter:
@@ -109,7 +51,7 @@ def router_for(asking: Asking) -> APIRouter:
         summary="Localize frames of a traversal, or the cameras of a rig, as one",
         response_model=schema.LocalizeAnswer,
         responses=problems(404, 413, 415, 422, 503, 504),
-        openapi_extra={"requestBody": _numbered("SequenceRequest")},
+        openapi_extra={"requestBody": numbered_body("SequenceRequest")},
     )
     async def localize_sequence(request: Request) -> Response:
         """Return the pose of the first frame.
@@ -125,7 +67,7 @@ def router_for(asking: Asking) -> APIRouter:
         summary="Localize several image pairs, each on its own",
         response_model=BatchAnswer,
         responses=problems(413, 415, 422, 503, 504),
-        openapi_extra={"requestBody": _numbered("BatchRequest")},
+        openapi_extra={"requestBody": numbered_body("BatchRequest")},
     )
     async def localize_batch(request: Request) -> Response:
         """Return an outcome for each request, in their order.
@@ -147,6 +89,19 @@ def router_for(asking: Asking) -> APIRouter:
         return await asking(request, answer)
 
     return router
+
+
+class Outcome(BaseModel):
+    """An answer, or what went wrong."""
+
+    answer: schema.LocalizeAnswer | None
+    problem: Problem | None
+
+
+class BatchAnswer(BaseModel):
+    """Outcomes in the order of the requests."""
+
+    outcomes: list[Outcome] = Field(description="one of each is null")
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,3 +183,25 @@ def _written(located: Located, given: Given) -> bytes:
     if not given.geopose_alone:
         return answer.model_dump_json(by_alias=True).encode()
     return sure_geopose(answer).model_dump_json().encode()
+
+
+def wants_geopose(accept: str) -> bool:
+    """Return whether a caller prefers GeoPose to the JSON answer of this service.
+
+    Args:
+        accept: value of the header. The highest quality wins; the first entry breaks ties.
+    """
+    best, wanted = 0.0, False
+    for entry in accept.split(","):
+        name, *parameters = (word.strip().lower() for word in entry.split(";"))
+        quality = 1.0
+        for parameter in parameters:
+            key, _, value = parameter.partition("=")
+            if key.strip() == "q":
+                try:
+                    quality = float(value)
+                except ValueError:
+                    quality = 0.0
+        if quality > best and name in (GEOPOSE, "application/json", "application/*", "*/*"):
+            best, wanted = quality, name == GEOPOSE
+    return wanted

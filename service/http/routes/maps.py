@@ -10,9 +10,9 @@ from starlette.responses import Response
 from service.contract import schema
 from service.contract.convert import map_entry_from, parsed
 from service.contract.coverage import coverage_geojson
-from service.http.auth import require_operator
 from service.http.body import read_body
-from service.http.routes.localize import problems
+from service.http.described import problems
+from service.http.middleware import require_operator
 from service.runtime.engine import Engine
 
 GEOJSON = "application/geo+json"

@@ -12,10 +12,9 @@ from starlette.responses import Response
 
 from service.contract.convert import answer_from, parsed
 from service.contract.oscp import GeoPoseAnswer, GeoPoseRequest, accuracy_of, query_of
-from service.http.asking import Asking
-from service.http.body import Body
+from service.http.body import Asking, Body
+from service.http.described import problems
 from service.http.geopose import sure_geopose
-from service.http.routes.localize import problems
 
 #: Copies of a JSON body in memory: its bytes, its strings, and the images decoded from them.
 _COPIES = 3
@@ -56,7 +55,8 @@ def router_for(asking: Asking) -> APIRouter:
         `*/*`, or `application/json`, as the reference clients send. The service refuses any other version.
 
         Intrinsics follow COLMAP: the corner of the first pixel is (0, 0). DEPTH is a 16-bit PNG in millimetres or a float TIFF in
-        metres. The axes of the accelerometer follow W3C. `map` selects one of several maps.
+        metres. The axes of the accelerometer follow W3C. `heightAboveGround` of the camera's parameters is a field of this service:
+        the height of the camera above the ground, metres. `map` selects one of several maps.
 
         If the answer is not LOCALIZED, the response is the problem `no-pose`, because the protocol cannot express uncertainty.
         """

@@ -7,7 +7,7 @@ from starlette.responses import FileResponse, Response
 
 from service.console.samples import Samples
 from service.contract import schema
-from service.http.routes.localize import problems
+from service.http.described import problems
 from service.runtime.settings import Settings
 
 _MEDIA_TYPES = ("image/jpeg", "image/png", "image/webp", "image/tiff", "application/octet-stream")

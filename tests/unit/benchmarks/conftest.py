@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from model_training.evaluation.predict import RANKED, Predictions
-from service.maps.calibration import FEATURES
+from service.confidence.features import FEATURES
 
 
 def make_predictions(T_true, T_answer=None, *, confidence=0.5, localized=True) -> Predictions:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import pytest
 
@@ -81,7 +82,7 @@ def test_what_the_service_lists_must_have_the_newest_bundle_of_the_disk() -> Non
     assert oracle.adopt("id2", {"id2", "strange"}, known) is not None
 
 
-def answer(version: str, began_s: float, ended_s: float, **changed: object) -> Outcome:
+def answer(version: str, began_s: float, ended_s: float, **changed: Any) -> Outcome:
     return replace(Outcome(began_s, ended_s, "rest", "maps", "answer", version), **changed)
 
 

@@ -5,6 +5,7 @@ import ast
 import pytest
 
 from benchmarks.house.docstrings import code_lines, lacking
+from benchmarks.house.installation import distributions_of
 from benchmarks.house.prose import prose_of_docstrings, prose_of_markdown, reading_ease
 
 
@@ -65,7 +66,10 @@ def test_what_a_docstring_leaves_out(source, told):
 
 
 def test_the_instance_is_no_argument():
-    function = ast.parse('class C:\n    def f(self):\n        """Do it."""').body[0].body[0]
+    (kind,) = ast.parse('class C:\n    def f(self):\n        """Do it."""').body
+    assert isinstance(kind, ast.ClassDef)
+    (function,) = kind.body
+    assert isinstance(function, ast.FunctionDef)
     assert lacking(function, is_method=True) is None
 
 
@@ -73,3 +77,10 @@ def test_lines_of_code_are_without_docstrings_comments_and_blank_lines(tmp_path)
     path = tmp_path / "module.py"
     path.write_text('"""Two\nlines."""\n\nx = 1  # one\n\n\ndef f():\n    """Do it."""\n    # why\n    return x\n')
     assert code_lines(path) == 3
+
+
+def test_an_installation_brings_requirements_of_requirements_and_of_extras():
+    found = distributions_of(["httpx>=0.27"])
+    assert {"httpx", "httpcore", "h11", "anyio"} <= found
+    assert "h2" not in found  # of an extra that nobody asked for
+    assert "lazrs" in distributions_of(["laspy[lazrs]"])

@@ -1,7 +1,9 @@
 import json
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +19,11 @@ from benchmarks.paper.rows import METHODS, PAPER_IMAGES, all_rows, errors_of, fi
 from benchmarks.paper.tables import PAPER_MED_M, PAPER_MEDIAN, PAPER_MSE, TABLE_II
 from benchmarks.provenance import Run
 from benchmarks.report import Report
-from model_training.baselines.answers import PlaceAnswers
-from model_training.baselines.learning import CurvePoint
-from model_training.baselines.paper_data.pairs import Pairs
-from model_training.baselines.paper_data.plan import TEST_TRAVERSAL, TRAINING_TRAVERSAL, pairs_plan
 from model_training.training.loop import TrainingConfig
+from research.baselines.answers import PlaceAnswers
+from research.baselines.learning import CurvePoint
+from research.baselines.paper_data.pairs import Pairs
+from research.baselines.paper_data.plan import TEST_TRAVERSAL, TRAINING_TRAVERSAL, pairs_plan
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, heading_of_body, heading_of_camera, rotation_z
 
@@ -203,7 +205,7 @@ def test_a_budget_buys_as_many_steps_as_a_pilot_says_and_a_run_that_began_keeps_
             report(None)
 
     monkeypatch.setattr(ours, "train", train)
-    monkeypatch.setattr(ours.time, "process_time", lambda: clock["s"])
+    monkeypatch.setattr(time, "process_time", lambda: clock["s"])
     config = config_within(100.0, tmp_path / "pack", TrainingConfig(), tmp_path / "run")
     assert config == TrainingConfig(steps=int((1 - ours.SPARED) * 200))
 
@@ -225,7 +227,7 @@ def test_a_lidar_above_the_camera_looks_where_it_looks() -> None:
     assert above[:3, 3] == pytest.approx([5.0, 6.0, 1.8])
 
 
-def asked_as(knn: float, softmax: float) -> dict[str, object]:
+def asked_as(knn: float, softmax: float) -> dict[str, dict[str, Any]]:
     each = {"knn": {"5": [knn, 1.0]}, "softmax": [softmax, 1.0], "n": 1000}
     return dict.fromkeys(SETS, each)
 

@@ -3,13 +3,15 @@ import signal
 import subprocess
 import sys
 from contextlib import nullcontext
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from benchmarks.report import Report
-from benchmarks.serving.peers import hosts, measure, venvs
+from benchmarks.serving.peers import measure, venvs
 from benchmarks.serving.peers.hosts import Host
 from benchmarks.serving.peers.measure import Figures, measured, require_same, write_rows
 from benchmarks.serving.peers.venvs import PIPELINE, REQUIREMENTS, PeerError, python_of
@@ -69,7 +71,7 @@ def test_the_pipelines_libraries_are_the_versions_that_run_here(tmp_path, monkey
     )
     python_of("ray", tmp_path)
     (installed,) = [each for each in commands if each[0] == "pip"]
-    assert {f"{each}=={venvs.version(each)}" for each in PIPELINE} < set(installed)
+    assert {f"{each}=={version(each)}" for each in PIPELINE} < set(installed)
     assert set(REQUIREMENTS["ray"]) < set(installed)
     del commands[:]
     assert python_of("ray", tmp_path) == tmp_path / "ray" / "bin" / "python"
@@ -89,7 +91,7 @@ def test_a_package_that_cannot_be_installed_is_told(monkeypatch):
     def fails(command, **_):
         raise subprocess.CalledProcessError(1, command, stderr="no wheel of\n ray for this Python")
 
-    monkeypatch.setattr(venvs.subprocess, "run", fails)
+    monkeypatch.setattr(subprocess, "run", fails)
     with pytest.raises(PeerError, match="uv pip failed: no wheel of ray for this Python"):
         venvs.uv("pip", "install", "ray")
 
@@ -194,7 +196,7 @@ def start(name):
     return nullcontext(SimpleNamespace(name=name, url="right"))
 
 
-SENDING = {"full": ["full"], "retrieval": ["retrieval"]}
+SENDING: dict[str, Any] = {"full": ["full"], "retrieval": ["retrieval"]}
 
 
 def test_all_are_asked_the_same_rate_and_the_same_arrivals(loaded):
@@ -258,7 +260,7 @@ def test_a_peer_that_ends_says_its_last_words():
 def test_a_peer_that_never_answers_is_stopped(monkeypatch):
     started = []
     popen = subprocess.Popen
-    monkeypatch.setattr(hosts.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+    monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
     loading = [sys.executable, "-c", "import time; print('still loading', flush=True); time.sleep(60)"]
     with pytest.raises(PeerError, match=r"no answer within 4 s, the last was ConnectError: still loading"):
         Host(loading, SENT, core=None, patience_s=4.0)

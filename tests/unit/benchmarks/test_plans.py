@@ -3,8 +3,10 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `training`")
 
 from benchmarks.plans import (  # after the skip
+    HEIGHTS_M,
     SEQUENCE,
     hard_plan,
+    height_plan,
     large_plan,
     lidar_16_plan,
     more_plan,
@@ -22,7 +24,7 @@ OWN = (
     [unseen_plan(k) for k in range(3)]
     + [large_plan(k) for k in range(3)]
     + [more_plan(k) for k in range(3)]
-    + [hard_plan(), lidar_16_plan(), repeating_plan()]
+    + [hard_plan(), lidar_16_plan(), repeating_plan(), *(height_plan(height_m) for height_m in HEIGHTS_M)]
 )
 
 

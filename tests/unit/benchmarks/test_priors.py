@@ -27,4 +27,6 @@ def test_a_wrong_prior_is_wrong_by_more_than_it_says(kind, least, most):
 
 def test_the_next_block_is_a_block_further():
     T = np.eye(4)
-    np.testing.assert_allclose(next_block(T, np.random.default_rng(0)).position_m, [BLOCK_M, 0.0])
+    position_m = next_block(T, np.random.default_rng(0)).position_m
+    assert position_m is not None
+    np.testing.assert_allclose(position_m, [BLOCK_M, 0.0])

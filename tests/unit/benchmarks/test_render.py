@@ -16,7 +16,7 @@ RUN = {
 
 def test_conditions_stand_beside_the_clear_day_with_the_stage_that_loses_most():
     head = "full.condition."
-    values = {
+    values: dict[str, float | None] = {
         f"{head}clear.within_1_m": 0.98, f"{head}clear.recall_at_10_5m": 1.0,
         f"{head}night.within_1_m": 0.90, f"{head}night.recall_at_10_5m": 0.99, f"{head}night.forced_within_1_m": 0.92,
         f"{head}fog.within_1_m": 0.80, f"{head}fog.recall_at_10_5m": 0.85, f"{head}fog.forced_within_1_m": 0.82,

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.native import sanitizers
+from benchmarks.provenance import ROOT
 
 try:
     sanitizers.runtime()
@@ -26,7 +27,7 @@ DEFECTS = {
 
 @pytest.mark.parametrize("path", sanitizers.TESTS)
 def test_every_listed_test_file_exists(path: str) -> None:
-    assert (sanitizers.ROOT / path).is_file()
+    assert (ROOT / path).is_file()
 
 
 @with_sanitizers
@@ -35,7 +36,8 @@ def test_a_defect_is_reported(tmp_path: Path, defect: str) -> None:
     source, library = tmp_path / "wrong.c", tmp_path / "_wrong.so"
     source.write_text(DEFECTS[defect])
     # As the build has them.
-    flags = re.search(r"-O1 -g .*-fsanitize=[a-z,-]+", (sanitizers.ROOT / "native" / "CMakeLists.txt").read_text())
+    flags = re.search(r"-O1 -g .*-fsanitize=[a-z,-]+", (ROOT / "native" / "CMakeLists.txt").read_text())
+    assert flags is not None
     subprocess.run(["gcc", *flags[0].split(), "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
     found = sanitizers.reports_of(tmp_path, ["-c", f"import ctypes; ctypes.CDLL({str(library)!r}).wrong(0)"])
     assert found

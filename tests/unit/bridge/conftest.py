@@ -57,7 +57,7 @@ def answer_of(refused_of: Callable[..., dict[str, Any]]) -> Callable[..., Locali
             "covariance": np.diag([0.01, 0.02, 0.03, 0.001, 0.002, 0.003]).reshape(-1).tolist(),
         }  # fmt: skip
         content = {
-            "status": "LOCALIZED", "confidence": 0.95,
+            "status": "LOCALIZED", "confidence": 0.95, "camera_height": {"height_m": 0.31, "origin": "given"},
             "street": {"id": "s2", "name": "End", "street": "4", "section": "end", "class_index": 6, "vote": 0.5},
             "pose": pose, "vehicle_pose": None, "geopose": None, "hypotheses": [], "spread": None, "reasons": [], "neighbours": [],
             "map": {"name": "tiny", "version": "abc"},

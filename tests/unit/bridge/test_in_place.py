@@ -6,6 +6,7 @@ import pytest
 from service.bridge.in_place import InPlace
 from service.errors import RequestError
 from service.geometry.camera import PinholeCamera
+from service.imaging.level import GivenHeight
 
 
 @pytest.mark.parametrize(
@@ -24,3 +25,10 @@ def test_a_camera_beyond_the_contracts_bounds_is_refused_without_a_service_too(
     with pytest.raises(RequestError) as caught:
         localize(rgb, depth_m, camera)
     assert caught.value.field == field
+
+
+def test_a_camera_height_that_is_given_counts_without_a_service_too(bundle_path: Path, pictures: Any) -> None:
+    for given, origin in ((None, "estimated"), (GivenHeight(1.52, 0.02), "given")):
+        answer = InPlace(bundle_path, given)(*pictures)
+        assert answer.camera_height is not None
+        assert (answer.camera_height.origin, round(answer.camera_height.height_m, 1)) == (origin, 1.5)

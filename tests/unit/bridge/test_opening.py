@@ -11,7 +11,9 @@ from service.bridge.bridge import Topics
 from service.bridge.opening import opened, until_signalled
 from service.bridge.pose import CAMERA_AS_BODY
 from service.bridge.settings import BridgeSettings
+from service.client import Client
 from service.errors import RequestError
+from service.geometry.camera import PinholeCamera
 
 
 def test_every_setting_reaches_the_bridge() -> None:
@@ -46,6 +48,9 @@ def test_a_map_answers_without_a_service(bundle_path: Path) -> None:
         ({"mount": "1,2"}, "--mount: '1,2' is not X,Y,Z"),
         ({"queue": -1}, "--queue: -1 is no number of images; give 1 or more, or 0 to keep all"),
         ({"url": "nowhere"}, "url: 'nowhere' is no address"),
+        ({"camera_height_m": 40.0}, "--camera-height-m: 40 m is no height of a camera; give 0.05 to 30 m"),
+        ({"base_on_ground": True}, "--base-on-ground: .* give --mount, or --camera-height-m"),
+        ({"base_on_ground": True, "mount": "0,0,0,0,0,0,1"}, "--mount: with --base-on-ground, its Z of 0 m"),
         ({"map": Path("m"), "map_name": "n"}, "--map has one map alone"),
         ({"map": Path("m"), "cert": Path("c")}, "--cert is for a service"),
     ],
@@ -64,3 +69,26 @@ def test_a_signal_sets_the_event_once_and_the_handlers_come_back(number: signal.
         assert over.is_set()
         assert signal.getsignal(number) == before
     assert signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize(
+    ("changed", "height"),
+    [
+        ({}, {}),
+        ({"base_on_ground": True}, {"camera_height_m": 0.42, "camera_height_std_m": 0.1}),
+        ({"camera_height_m": 0.3}, {"camera_height_m": 0.3, "camera_height_std_m": 0.05}),
+        ({"base_on_ground": True, "camera_height_m": 0.3}, {"camera_height_m": 0.3, "camera_height_std_m": 0.05}),
+    ],
+)
+def test_the_camera_height_of_the_settings_is_sent(
+    monkeypatch: pytest.MonkeyPatch, changed: dict[str, object], height: dict[str, float]
+) -> None:
+    asked: list[dict[str, object]] = []
+    monkeypatch.setattr(Client, "localize", lambda *_, **about: asked.append(about))
+    settings = replace(BridgeSettings(mount="0.1,0,0.42,-0.5,0.5,-0.5,0.5"), **changed)  # type: ignore[arg-type]
+    with opened(settings) as bridge:
+        bridge.localize(
+            np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), PinholeCamera(6, 4, 3.0, 3.0, 2.5, 1.5)
+        )
+    unsaid = {"map": None, "camera_height_m": None, "camera_height_std_m": None}
+    assert asked == [unsaid | height]

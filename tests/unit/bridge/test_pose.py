@@ -43,7 +43,9 @@ def test_an_uncertain_heading_moves_what_lies_behind_the_camera_aside(answer_of:
 
 
 def test_an_answer_without_covariance_is_told_as_a_wide_one(answer_of: Answer) -> None:
-    pose = answer_of().pose.model_copy(update={"covariance": None})
+    whole = answer_of().pose
+    assert whole is not None
+    pose = whole.model_copy(update={"covariance": None})
     C = pose_of(answer_of(pose=pose), CAMERA_AS_BODY, stamp_ns=0, frame_id="map").covariance
     assert C[0, 0] >= 1.0
     assert np.linalg.eigvalsh(C).min() > 0

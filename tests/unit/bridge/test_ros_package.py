@@ -18,6 +18,7 @@ import yaml
 from service.bridge import in_place
 from service.bridge.settings import about, parameters
 from service.contract.schema import LocalizeAnswer
+from service.imaging.level import GivenHeight
 
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "deploy" / "ros2" / "streetfix_ros"
@@ -133,18 +134,24 @@ def test_the_node_declares_every_parameter_and_says_what_it_means(ros: Any, node
 
 
 def test_the_node_answers_images_until_a_signal(
-    ros: Any, node: dict[str, Any], monkeypatch: pytest.MonkeyPatch,
-    image_of: Callable[..., Any], info_of: Callable[..., Any], answer_of: Callable[..., LocalizeAnswer],
-) -> None:  # fmt: skip
-    opened = list[Path]()
+    ros: Any,
+    node: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    image_of: Callable[..., Any],
+    info_of: Callable[..., Any],
+    answer_of: Callable[..., LocalizeAnswer],
+) -> None:
+    opened, heights = list[Path](), list[GivenHeight | None]()
 
-    def of(bundle: Path) -> Callable[..., LocalizeAnswer]:
+    def of(bundle: Path, height: GivenHeight | None) -> Callable[..., LocalizeAnswer]:
         opened.append(bundle)
+        heights.append(height)
         return lambda *_: answer_of()
 
     monkeypatch.setattr(in_place, "InPlace", of)
     ros.given = {
         "map": "maps/site", "pose_topic": "/pose", "frame": "earth", "mount": "0,0,0,-0.5,0.5,-0.5,0.5",
+        "base_on_ground": True, "camera_height_m": 0.3,
         "reliable": True, "queue": 0,
     }  # fmt: skip
 
@@ -156,7 +163,7 @@ def test_the_node_answers_images_until_a_signal(
 
     ros.turns, ros.no_more = [see], lambda: signal.raise_signal(signal.SIGINT)
     assert node["main"](["--ros-args"]) == 0
-    assert opened == [Path("maps/site")]
+    assert (opened, heights) == ([Path("maps/site")], [GivenHeight(0.3, 0.05)])
     (pose,) = ros.published["/pose"]
     assert (pose.header.frame_id, pose.pose.pose.position.x) == ("earth", 10.0)
     assert {(each.qos.reliability, each.qos.history) for each in ros.subscriptions.values()} == {("reliable", "all")}

@@ -54,7 +54,9 @@ def test_the_default_parameters_are_the_default_settings() -> None:
 
 def test_parameters_that_are_given_become_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/robot")
-    given = {"map": "~/maps/site", "mount": "0,0,0,0,0,0,1", "rate": 0.0, "rectified": True, "frame": "earth"}
+    given: dict[str, str | float | int | bool] = {
+        "map": "~/maps/site", "mount": "0,0,0,0,0,0,1", "rate": 0.0, "rectified": True, "frame": "earth",
+    }  # fmt: skip
     assert settings_from(parameters() | given, environ={}) == BridgeSettings(
         map=Path("/home/robot/maps/site"), mount="0,0,0,0,0,0,1", rate=0.0, rectified=True, frame="earth"
     )

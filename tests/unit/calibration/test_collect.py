@@ -1,4 +1,5 @@
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,9 +8,9 @@ from model_training.calibration import collect
 from model_training.calibration.collect import asked_of, in_the_map, of_another_city, preset_of, walls_and_rooms
 from model_training.calibration.rigs import RIGS
 from model_training.evaluation.predict import RANKED, Predictions
+from service.confidence.features import FEATURES
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
-from service.maps.calibration import FEATURES
 
 
 def predictions(errors_m, *, up_m=0.0):
@@ -54,6 +55,11 @@ class City:
         return ["clear_precise", "clear_stereo", "rain_precise"] + ["untold_stereo"] * (not with_truth)
 
 
+#: Stand-ins that ``collect`` only passes on.
+LOCALIZER: Any = "localizer"
+CITY: Any = City()
+
+
 @pytest.fixture
 def predicted(monkeypatch):
     """What was asked of whom, in order; each set is answered by as many right answers as its name has letters."""
@@ -88,7 +94,7 @@ def test_query_sets_are_asked_as_they_are_named_or_else_all_that_have_truth(pred
 
 def test_sets_of_the_maps_own_city_keep_their_names_and_those_of_another_only_their_preset(predicted):
     names = ("clear_precise", "rain_stereo")
-    own, other = in_the_map("localizer", City(), print, names), of_another_city("localizer", City(), print, names)
+    own, other = in_the_map(LOCALIZER, CITY, print, names), of_another_city(LOCALIZER, CITY, print, names)
     assert [set(each.kind.tolist()) for each in own] == [{"clear_precise"}, {"rain_stereo"}]
     assert [set(each.kind.tolist()) for each in other] == [{"other_city.precise"}, {"other_city.stereo"}]
     assert all(each.known.all() and each.right.all() for each in own)
@@ -97,8 +103,8 @@ def test_sets_of_the_maps_own_city_keep_their_names_and_those_of_another_only_th
 
 def test_kinds_of_another_rig_are_told_by_its_name(predicted):
     names = ("clear_precise", "clear_stereo")
-    own = in_the_map("localizer", City(), print, names, rig=RIGS[0])
-    other = of_another_city("localizer", City(), print, names, rig=RIGS[0])
+    own = in_the_map(LOCALIZER, CITY, print, names, rig=RIGS[0])
+    other = of_another_city(LOCALIZER, CITY, print, names, rig=RIGS[0])
     assert [set(each.kind.tolist()) for each in own] == [{"narrow_clear_precise"}, {"narrow_clear_stereo"}]
     assert [set(each.kind.tolist()) for each in other] == [{"narrow_other_city.precise"}, {"narrow_other_city.stereo"}]
 
@@ -117,8 +123,13 @@ class Wherever:
         return SimpleNamespace(evidence=None if number % 4 == 1 else np.full(len(FEATURES), float(number)))
 
 
+def wherever() -> Any:
+    """Return one in the place of a localizer."""
+    return Wherever()
+
+
 def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
-    localizer, told = Wherever(), []
+    localizer, told = wherever(), []
     camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
     found = walls_and_rooms(localizer, camera, 3, lambda *told_of: told.append(told_of), count=4)
     assert [set(each.kind.tolist()) for each in found] == [
@@ -133,7 +144,7 @@ def test_walls_and_rooms_are_nowhere_and_told_by_kind_and_preset():
 
 
 def test_another_rig_sees_the_same_walls_and_rooms():
-    whole, cut = Wherever(), Wherever()
+    whole, cut = wherever(), wherever()
     camera = PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5)
     walls_and_rooms(whole, camera, 3, lambda *_: None, count=2)
     found = walls_and_rooms(cut, camera, 3, lambda *_: None, count=2, rig=RIGS[0])
@@ -146,7 +157,7 @@ def test_another_rig_sees_the_same_walls_and_rooms():
 
 def test_every_city_draws_walls_and_rooms_of_its_own():
     def first(seed):
-        localizer = Wherever()
+        localizer = wherever()
         walls_and_rooms(localizer, PinholeCamera(32, 24, 16.0, 16.0, 15.5, 11.5), seed, lambda *_: None, count=1)
         return np.concatenate([query.depth_m for query in localizer.asked])
 

@@ -5,9 +5,10 @@ from hypothesis import strategies as st
 
 from model_training.calibration import fit as fitting
 from model_training.calibration.fit import RATES, Asked, _thresholds, expected_calibration_error, fit, pooled
+from service.confidence.features import FEATURES, RIVALRY, UNWEIGHED
 from service.errors import DatasetError
-from service.localization.query import FALSE_ACCEPT_RATE
-from service.maps.calibration import FEATURES, RIVALRY, UNWEIGHED, Logistic, probability, read_calibration, terms
+from service.maps.calibration import Logistic, probability, read_calibration, terms
+from service.option_limits import FALSE_ACCEPT_RATE
 
 COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
 INLIERS, MARGIN = FEATURES.index("inliers"), FEATURES.index("margin")

@@ -1,5 +1,6 @@
 import re
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ pytest.importorskip("torch", reason="needs the extra `training`")
 from model_training.calibration import make  # after the skip
 from model_training.calibration.fit import Asked, fit, pooled
 from model_training.calibration.make import confidences, cross_checks
-from service.maps.calibration import FEATURES
+from model_training.calibration.plans import PAIR_RIGS
+from service.confidence.features import FEATURES
 
 COUNT, MARGIN = len(FEATURES), FEATURES.index("margin")
 
@@ -45,6 +47,7 @@ def test_every_city_is_predicted_from_the_others_with_both_presets():
     for index in range(3):
         head, *presets = lines[3 * index : 3 * index + 3]
         error = re.fullmatch(rf"city {index + 1} from the others: expected calibration error (0\.\d{{4}})", head)
+        assert error is not None
         assert float(error[1]) < 0.1
         for preset, line in zip(("precise", "stereo"), presets, strict=True):
             shares = re.fullmatch(
@@ -52,6 +55,7 @@ def test_every_city_is_predicted_from_the_others_with_both_presets():
                 r"other_city (0\.\d{4}), removed_streets (0\.\d{4}), wall (0\.\d{4}), room (0\.\d{4})",
                 line,
             )
+            assert shares is not None
             assert max(map(float, shares.groups())) < 0.05
 
 
@@ -156,7 +160,7 @@ def test_a_sparse_map_has_a_place_every_five_metres_and_any_other_every_metre(wo
 
 
 def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work):
-    street = SimpleNamespace(name="blocks", folder=work.folder / "blocks")
+    street: Any = SimpleNamespace(name="blocks", folder=work.folder / "blocks")
     first = make._asked_repeating(work.folder, work.encoder, street, anew=False, report=print)
     again = make._asked_repeating(work.folder, work.encoder, street, anew=False, report=print)
     assert work.asked == [("in_the_map", "blocks", "blocks", ())]
@@ -167,7 +171,7 @@ def test_repeating_blocks_are_asked_of_their_own_map_and_kept(work):
 def test_a_stereo_rig_asks_its_own_cities_and_the_other_of_them(work, monkeypatch):
     monkeypatch.setattr(make, "simulate", lambda *_, **__: None)
     monkeypatch.setattr(make, "Dataset", lambda folder: _dataset(folder.name, folder.parent))
-    car = make.PAIR_RIGS[0]
+    car = PAIR_RIGS[0]
     found = make._asked_pairs(work.folder, work.encoder, car, anew=False, report=print)
     one, two = "calibration-car-1", "calibration-car-2"
     assert work.asked == [

@@ -5,7 +5,7 @@ import pytest
 
 from model_training.calibration.rigs import RIGS, Rig
 from service.geometry.camera import PinholeCamera
-from service.localization.query import Query
+from service.retrieval.query import Query
 
 CAMERA = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
 

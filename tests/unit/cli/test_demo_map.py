@@ -19,8 +19,17 @@ from service.maps.writer import write_bundle
 PLAN = CityDemo(streets=("1",), queries=5, depth="precise", seed=0)
 
 
-def quiet(*_: object) -> None:
-    pass
+class Quiet:
+    """A report that writes nothing."""
+
+    def __call__(self, stage: str, done: int, total: int, /) -> None:
+        pass
+
+    def describe(self, stage: str, text: str, /) -> None:
+        pass
+
+
+quiet = Quiet()
 
 
 class Workshop:

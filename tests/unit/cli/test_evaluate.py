@@ -49,9 +49,13 @@ def raw_is(monkeypatch: pytest.MonkeyPatch, small_map: Path, two_sets: Path) -> 
 
 
 def test_the_raw_range_image_has_its_recall_over_all_and_in_each_set(
-    raw_is: Callable[..., None], two_sets: Path, small_map: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    raw_is: Callable[..., None],
+    two_sets: Path,
+    small_map: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.setenv("COLUMNS", "120")
     raw_is(cosine="1110010000", masked_l2="1000011100")
     assert run("evaluate", small_map, two_sets, "--raw-baseline", "--json", tmp_path / "found.json") == 0

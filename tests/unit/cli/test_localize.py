@@ -57,14 +57,14 @@ REFUSED: dict[str, Any] = {
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> dict[str, Path]:
+def files(tmp_path: Path) -> dict[str, Any]:
     for name, data in {"rgb": b"r", "depth": b"d", "camera": b'{"camera": {}, "map": "a"}'}.items():
         (tmp_path / name).write_bytes(data)
     return {name: tmp_path / name for name in ("rgb", "depth", "camera")}
 
 
 @pytest.fixture
-def given(files: dict[str, Path]) -> list[str]:
+def given(files: dict[str, Any]) -> list[str]:
     """The same as options; the camera has a focal length."""
     files["camera"].write_text('{"camera": {"fx": 32, "fy": 30, "cx": 31.5}}')
     return [part for name, path in files.items() for part in (f"--{name}", str(path))]
@@ -123,14 +123,14 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[httpx.Response], lis
     return put
 
 
-def test_the_parts_are_posted_with_the_map_of_the_flag(files: dict[str, Path], answering: Callable[..., Any]) -> None:
+def test_the_parts_are_posted_with_the_map_of_the_flag(files: dict[str, Any], answering: Callable[..., Any]) -> None:
     posted = answering(httpx.Response(200, json=ANSWER))
     assert localize("http://x:1/", **files, map_name="b") == ANSWER
     assert posted[0]["url"] == "http://x:1/v1/localize"
     assert json.loads(posted[0]["files"]["request"][1]) == {"camera": {}, "map": "b"}
 
 
-def test_a_problem_is_told_with_field_and_request_id(files: dict[str, Path], answering: Callable[..., Any]) -> None:
+def test_a_problem_is_told_with_field_and_request_id(files: dict[str, Any], answering: Callable[..., Any]) -> None:
     problem = {"title": "T.", "detail": "what and why", "code": "request", "field": "camera.fx", "request_id": "r1"}
     answering(httpx.Response(422, json=problem))
     with pytest.raises(RefusedError) as caught:
@@ -142,14 +142,14 @@ def test_a_problem_is_told_with_field_and_request_id(files: dict[str, Path], ans
     "response", [httpx.Response(200, text="<html>"), httpx.Response(200, json=[]), httpx.Response(200, json={})]
 )
 def test_something_else_at_the_address_is_told_so(
-    files: dict[str, Path], answering: Callable[..., Any], response: httpx.Response
+    files: dict[str, Any], answering: Callable[..., Any], response: httpx.Response
 ) -> None:
     answering(response)
     with pytest.raises(UnreachableError, match="no Streetfix"):
         localize("http://x", **files)
 
 
-def test_nobody_at_the_address_is_told_with_the_remedy(files: dict[str, Path]) -> None:
+def test_nobody_at_the_address_is_told_with_the_remedy(files: dict[str, Any]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with pytest.raises(UnreachableError, match="streetfix serve BUNDLE"):
@@ -157,12 +157,12 @@ def test_nobody_at_the_address_is_told_with_the_remedy(files: dict[str, Path]) -
 
 
 @pytest.mark.parametrize("url", ["", "localhost:8000", "http://[", "ftp://x"])
-def test_an_address_that_is_none_is_told_so(files: dict[str, Path], url: str) -> None:
+def test_an_address_that_is_none_is_told_so(files: dict[str, Any], url: str) -> None:
     with pytest.raises(RequestError, match="give http://HOST:PORT"):
         localize(url, **files)
 
 
-def test_a_file_that_is_missing_is_named(files: dict[str, Path]) -> None:
+def test_a_file_that_is_missing_is_named(files: dict[str, Any]) -> None:
     files["depth"].unlink()
     with pytest.raises(RequestError, match=r"depth: it cannot be read .*check --depth"):
         localize("http://x", **files)
@@ -180,7 +180,7 @@ def test_a_file_that_is_missing_is_named(files: dict[str, Path]) -> None:
     ],
 )
 def test_what_is_known_beforehand_is_sent_as_the_contract_has_it(
-    files: dict[str, Path], answering: Callable[..., Any], flags: list[str], prior: dict[str, Any] | None
+    files: dict[str, Any], answering: Callable[..., Any], flags: list[str], prior: dict[str, Any] | None
 ) -> None:
     posted = answering(httpx.Response(200, json=ANSWER))
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
@@ -193,7 +193,7 @@ def test_what_is_known_beforehand_is_sent_as_the_contract_has_it(
         Prior.model_validate(request["prior"])
 
 
-def test_a_prior_of_the_flags_goes_above_the_files(files: dict[str, Path], answering: Callable[..., Any]) -> None:
+def test_a_prior_of_the_flags_goes_above_the_files(files: dict[str, Any], answering: Callable[..., Any]) -> None:
     files["camera"].write_text('{"camera": {}, "prior": {"heading_deg": 5}}')
     posted = answering(httpx.Response(200, json=ANSWER))
     for prior in (None, {"position": {"x": 1.0, "y": 2.0}}):
@@ -204,7 +204,7 @@ def test_a_prior_of_the_flags_goes_above_the_files(files: dict[str, Path], answe
 
 @pytest.mark.parametrize("near", ["", "12", "12;40", "1,2,3,4", "here", "1,", ",", "12,-40,", "1,2m"])
 def test_a_place_that_is_none_is_refused_with_an_example_and_nothing_is_sent(
-    files: dict[str, Path], answering: Callable[..., Any], near: str, capsys: pytest.CaptureFixture[str]
+    files: dict[str, Any], answering: Callable[..., Any], near: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     posted = answering(httpx.Response(200, json=ANSWER))
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
@@ -217,7 +217,7 @@ def test_a_place_that_is_none_is_refused_with_an_example_and_nothing_is_sent(
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"fx": 1}'])
-def test_a_camera_file_that_is_none_is_refused(files: dict[str, Path], text: str) -> None:
+def test_a_camera_file_that_is_none_is_refused(files: dict[str, Any], text: str) -> None:
     files["camera"].write_text(text)
     with pytest.raises(RequestError, match="camera"):
         localize("http://x", **files)
@@ -275,9 +275,13 @@ def test_people_are_not_told_of_other_places_when_it_is_sure_or_when_there_are_n
     [({}, 0), (REFUSED, 3), (REFUSED | {"status": "OUT_OF_MAP", "hypotheses": []}, 3)],
 )
 def test_the_exit_code_says_whether_there_is_a_pose(
-    files: dict[str, Path], answering: Callable[..., Any], capsys: pytest.CaptureFixture[str], changed: dict[str, Any],
-    code: int, flags: list[str],
-) -> None:  # fmt: skip
+    files: dict[str, Any],
+    answering: Callable[..., Any],
+    capsys: pytest.CaptureFixture[str],
+    changed: dict[str, Any],
+    code: int,
+    flags: list[str],
+) -> None:
     answering(httpx.Response(200, json=ANSWER | changed))
     given = [part for name, path in files.items() for part in (f"--{name}", str(path))]
     assert run(*given, *flags, "--no-try-focal") == code
@@ -329,9 +333,13 @@ def test_an_earlier_service_gives_no_reasons() -> None:
     ],
 )
 def test_a_focal_length_that_fits_the_map_clearly_better_is_named_first(
-    given: list[str], by_focal: Callable[..., Any], capsys: pytest.CaptureFixture[str], halved: dict[str, Any],
-    doubled: dict[str, Any], factor: float | None,
-) -> None:  # fmt: skip
+    given: list[str],
+    by_focal: Callable[..., Any],
+    capsys: pytest.CaptureFixture[str],
+    halved: dict[str, Any],
+    doubled: dict[str, Any],
+    factor: float | None,
+) -> None:
     asked = by_focal({32: (200, refused_with()), 16: (200, halved), 64: (200, doubled)})
     assert run(*given, "--json") == 3
     assert json.loads(capsys.readouterr().out) == refused_with() | {"focal_length_factor": factor}
@@ -347,8 +355,12 @@ def test_a_focal_length_that_fits_the_map_clearly_better_is_named_first(
 
 @pytest.mark.parametrize(("answer", "flags"), [(ANSWER, []), (refused_with(), ["--no-try-focal"])])
 def test_no_other_focal_length_is_tried_for_a_good_answer_or_where_that_is_switched_off(
-    given: list[str], by_focal: Callable[..., Any], capsys: pytest.CaptureFixture[str], answer: dict[str, Any], flags: list[str]
-) -> None:  # fmt: skip
+    given: list[str],
+    by_focal: Callable[..., Any],
+    capsys: pytest.CaptureFixture[str],
+    answer: dict[str, Any],
+    flags: list[str],
+) -> None:
     asked = by_focal({32: (200, answer)})
     run(*given, "--json", *flags)
     assert json.loads(capsys.readouterr().out) == answer
@@ -367,7 +379,7 @@ def test_a_focal_length_that_is_refused_is_told_and_the_answer_stands(
 
 
 def test_an_answer_of_an_older_service_that_has_a_pose_in_doubt_is_refused(
-    files: dict[str, Path], answering: Callable[..., Any]
+    files: dict[str, Any], answering: Callable[..., Any]
 ) -> None:
     answering(httpx.Response(200, json=ANSWER | {"status": "OUT_OF_MAP"}))
     with pytest.raises(UnreachableError, match="of another contract"):
@@ -385,7 +397,7 @@ def test_people_read_one_standard_deviation_of_position_and_heading() -> None:
 
 
 def test_a_folder_given_as_the_name_of_a_map_is_named(
-    files: dict[str, Path], answering: Callable[..., Any], bundle_path: Path, tmp_path: Path
+    files: dict[str, Any], answering: Callable[..., Any], bundle_path: Path, tmp_path: Path
 ) -> None:
     problem = {"title": "T.", "detail": "there is no such map; mounted: tiny", "code": "unknown-map", "field": "map"}
     (dataset := tmp_path / "town").mkdir()
@@ -402,3 +414,36 @@ def test_a_folder_given_as_the_name_of_a_map_is_named(
         assert caught.value.message == f"--map: {message}\n  there is no such map; mounted: tiny"
     with pytest.raises(RefusedError, match="there is no such map"):
         localize("http://x", **files, map_name="no-folder")
+
+
+@pytest.mark.parametrize(
+    ("in_file", "given", "sent"),
+    [
+        ({"height_m": 0.4, "height_std_m": 0.1}, {}, {"height_m": 0.4, "height_std_m": 0.1}),
+        ({}, {"camera_height_m": 0.3}, {"height_m": 0.3}),
+        ({"height_m": 0.4, "height_std_m": 0.1}, {"camera_height_m": 0.3}, {"height_m": 0.3, "height_std_m": 0.1}),
+        ({"height_m": 0.4}, {"camera_height_std_m": 0.02}, {"height_m": 0.4, "height_std_m": 0.02}),
+    ],
+)  # fmt: skip
+def test_the_camera_height_of_the_options_overrides_the_file(
+    files: dict[str, Any], answering: Callable[..., Any], in_file: Any, given: Any, sent: Any
+) -> None:
+    files["camera"].write_text(json.dumps({"camera": {"fx": 32} | in_file}))
+    posted = answering(httpx.Response(200, json=ANSWER))
+    localize("http://x", **files, **given)
+    assert json.loads(posted[0]["files"]["request"][1])["camera"] == {"fx": 32} | sent
+
+
+def test_a_deviation_without_a_height_is_refused(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*given, "--camera-height-std", "0.02") == 1
+    assert "--camera-height-std: there is no height that it belongs to" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rest", [{}, REFUSED])
+@pytest.mark.parametrize(
+    ("origin", "why"), [("given", ""), ("estimated", ""), ("assumed", "; the depth image shows no ground")]
+)
+def test_the_height_of_the_camera_is_printed_with_its_origin(rest: Any, origin: str, why: str) -> None:
+    out = io.StringIO()
+    print_answer(ANSWER | rest | {"camera_height": {"height_m": 0.312, "origin": origin}}, Console(file=out, width=200))
+    assert f"0.31 m above the ground ({origin}{why}" in out.getvalue()

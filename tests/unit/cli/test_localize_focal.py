@@ -82,8 +82,13 @@ def test_a_right_focal_length_is_not_suspected(ask: Any, query: int) -> None:
 
 @pytest.mark.parametrize(("focal", "factor"), [(2.0, 0.5), (0.5, 2.0)])
 def test_evaluate_names_it_too(
-    stock_map: Path, small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], focal: float, factor: float
-) -> None:  # fmt: skip
+    stock_map: Path,
+    small_dataset: Dataset,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    focal: float,
+    factor: float,
+) -> None:
     folder = shutil.copytree(small_dataset.folder, tmp_path / "told_wrong")
     description = json.loads((folder / "dataset.json").read_text())
     for camera in description["sensors"]["cameras"]:

@@ -107,7 +107,7 @@ def care(mount: Callable[..., None]) -> None:
     @app.command()
     def merge() -> None:
         """Need what is not there."""
-        import a_package_that_is_not_there  # noqa: F401  # type: ignore[import-not-found]  # that is the point
+        import a_package_that_is_not_there  # type: ignore[import-not-found]  # noqa: F401  # that is the point
 
     mount(map=app)
 
@@ -141,7 +141,7 @@ def test_a_missing_package_names_the_extra(
     mount: Callable[..., None], capsys: pytest.CaptureFixture[str], name: str, extra: str
 ) -> None:
     def needs_much() -> None:
-        import a_package_that_is_not_there  # noqa: F401  # type: ignore[import-not-found]  # that is the point
+        import a_package_that_is_not_there  # noqa: F401  # that is the point
 
     mount(**{name: needs_much})
     assert run(name.replace("_", "-")) == 1

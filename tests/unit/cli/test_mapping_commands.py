@@ -8,13 +8,13 @@ import pytest
 
 from model_training.datasets.dataset import Dataset
 from service.cli.main import main
-from service.localization.encoder import Encoder
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
 
 SMALL = ("--size", "60x60", "--spacing", "20", "--camera", "96x72", "--workers", "1")
 
 
-def run(*arguments: str) -> int:
+def run(*arguments: str | Path) -> int:
     with pytest.raises(SystemExit) as end:
         main([str(argument) for argument in arguments])
     return int(end.value.code or 0)
@@ -78,8 +78,8 @@ def test_simulate_takes_weather_and_mounting_on_the_track_too(tmp_path: Path) ->
 
 def test_simulate_replaces_single_numbers_of_the_sensors(tmp_path: Path) -> None:
     given = ("--set", "lidar.channels=16", "--set", "lidar.max_range_m=25", "--set", "depth.noise_px=0.3")
-    given += ("--rgb", "small", "--set", "rgb.noise=2", "--sun-elevation", "20")
-    assert run("simulate", "--out", tmp_path / "set", *given, "--queries", "1", "--on-track", "1", *SMALL) == 0
+    more = ("--rgb", "small", "--set", "rgb.noise=2", "--sun-elevation", "20")
+    assert run("simulate", "--out", tmp_path / "set", *given, *more, "--queries", "1", "--on-track", "1", *SMALL) == 0
     plan = plan_in(tmp_path / "set")
     assert plan["lidar_parameters"] == {"channels": 16, "max_range_m": 25.0}
     assert [query["rgb_parameters"] for query in plan["queries"]] == [{"noise": 2.0}] * 2

@@ -2,8 +2,10 @@ import os
 import subprocess
 import sys
 import threading
+from typing import Any
 
 import pytest
+from rich.console import Console
 
 from model_training.cli import progress
 from model_training.cli.progress import Lines, lines
@@ -25,8 +27,8 @@ def clock():
 @pytest.fixture
 def told(clock):
     """Lines into a list, kept beside them."""
-    written = []
-    reporter = Lines(written.append, clock=clock)
+    written: list[str] = []
+    reporter: Any = Lines(written.append, clock=clock)
     reporter.written = written
     return reporter
 
@@ -137,7 +139,7 @@ def test_into_a_pipe_go_lines_without_control_characters():
 
 
 def test_a_terminal_gets_bars(monkeypatch):
-    class Terminal(progress.Console):
+    class Terminal(Console):
         is_terminal = True
         is_dumb_terminal = False
 

@@ -15,6 +15,7 @@ import pytest
 from service.client import AsyncClient, Client, Frame, Options, PinholeCamera, Prior, PriorPosition, PriorWgs84, rest
 from service.client.retry import RetryPolicy
 from service.client.tls import ClientTls
+from service.contract.schema import Camera as SchemaCamera
 from service.errors import (
     ForeignServiceError,
     NoAnswerInTimeError,
@@ -66,7 +67,7 @@ def parts_of(request: httpx.Request) -> dict[str, bytes]:
     """Of a multipart body, by Python's own parser of mail."""
     head = f"Content-Type: {request.headers['content-type']}\r\n\r\n".encode()
     message = email.message_from_bytes(head + request.content, policy=email.policy.HTTP)
-    parts = [part for part in message.walk() if not part.is_multipart()]
+    parts: list[Any] = [part for part in message.walk() if not part.is_multipart()]
     return {str(part.get_param("name", header="content-disposition")): part.get_payload(decode=True) for part in parts}
 
 
@@ -93,6 +94,31 @@ def test_depth_goes_by_the_codec_that_was_chosen(ask: Asking, answer_json: Json,
 
     ask(handler, "localize", RGB, DEPTH, CAMERA, given=given)
     assert parts_of(seen[0])["depth"][12:16] == frame
+
+
+def test_files_are_sent_unchanged_and_leave_the_scale_to_the_service(ask: Asking, answer_json: Json) -> None:
+    seen: list[httpx.Request] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer_json())
+
+    ask(handler, "localize", b"a JPEG", b"a PNG", CAMERA)
+    ask(handler, "localize_sequence", [Frame(rgb=b"a JPEG", depth=DEPTH, camera=CAMERA)])
+    ask(handler, "localize", RGB, b"a PNG", CAMERA, depth_scale_m=0.0002)
+    files, sequence, scaled = map(parts_of, seen)
+    assert (files["rgb"], files["depth"]) == (b"a JPEG", b"a PNG")
+    assert json.loads(files["request"])["depth"]["scale_m"] is None
+    assert (sequence["rgb0"], sequence["depth0"][:4]) == (b"a JPEG", b"SFD1")
+    assert (scaled["rgb"][:2], scaled["depth"]) == (b"\xff\xd8", b"a PNG")
+    assert json.loads(scaled["request"])["depth"]["scale_m"] == 0.0002
+
+
+@pytest.mark.parametrize(("rgb", "depth", "field"), [(b"", DEPTH, "rgb"), (RGB, b"", "depth")])
+def test_an_empty_file_is_refused(ask: Asking, rgb: Any, depth: Any, field: str) -> None:
+    with pytest.raises(RequestError, match=f"{field}: the file is empty") as caught:
+        ask(lambda _: httpx.Response(500), "localize", rgb, depth, CAMERA)
+    assert caught.value.field == field
 
 
 def test_the_parts_are_what_the_contract_asks_for(ask: Asking, answer_json: Json) -> None:
@@ -418,3 +444,63 @@ def test_all_that_is_exported_is_there() -> None:
 
     assert package.__all__ == sorted(package.__all__)
     assert all(hasattr(package, name) for name in package.__all__)
+
+
+@pytest.mark.parametrize(
+    ("camera", "about", "height"),
+    [
+        (CAMERA, {}, {}),
+        (CAMERA, {"camera_height_m": 0.3}, {"height_m": 0.3}),
+        (CAMERA, {"camera_height_m": 0.3, "camera_height_std_m": 0.02}, {"height_m": 0.3, "height_std_m": 0.02}),
+        (SchemaCamera(width=6, height=4, fx=3, fy=3, cx=2.5, cy=1.5, height_m=0.4), {}, {"height_m": 0.4}),
+        (SchemaCamera(width=6, height=4, fx=3, fy=3, cx=2.5, cy=1.5, height_m=0.4), {"camera_height_m": 0.3}, {"height_m": 0.3}),
+    ],
+)  # fmt: skip
+def test_a_camera_height_is_sent_only_where_it_is_known(
+    ask: Asking, answer_json: Json, camera: Any, about: dict[str, Any], height: dict[str, float]
+) -> None:
+    """An earlier service refuses fields that it does not know."""
+    seen: list[httpx.Request] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer_json(camera_height={"height_m": 0.3, "origin": "given"}))
+
+    answer = ask(handler, "localize", RGB, DEPTH, camera, **about)
+    ask(handler, "localize_sequence", [Frame(rgb=RGB, depth=DEPTH, camera=camera, **about)])
+    alone, sequence = (json.loads(parts_of(each)["request"]) for each in seen)
+    for sent in (alone["camera"], sequence["frames"][0]["camera"]):
+        assert {name: value for name, value in sent.items() if name.startswith("height_")} == height
+    assert "vehicle_base_on_ground" not in alone | sequence
+    assert (answer.camera_height.height_m, answer.camera_height.origin) == (0.3, "given")
+
+
+def test_a_vehicle_frame_on_the_ground_is_sent(ask: Asking, answer_json: Json) -> None:
+    seen: list[httpx.Request] = []
+
+    def handler(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer_json())
+
+    ask(handler, "localize", RGB, DEPTH, CAMERA, T_vehicle_camera=np.eye(4), vehicle_base_on_ground=True)
+    frame = Frame(rgb=RGB, depth=DEPTH, camera=CAMERA)
+    ask(handler, "localize_sequence", [frame], T_vehicle_camera=np.eye(4), vehicle_base_on_ground=True)
+    assert [json.loads(parts_of(each)["request"])["vehicle_base_on_ground"] for each in seen] == [True, True]
+
+
+def test_an_earlier_service_tells_no_camera_height(ask: Asking, answer_json: Json) -> None:
+    assert ask(lambda _: httpx.Response(200, json=answer_json()), "localize", RGB, DEPTH, CAMERA).camera_height is None
+
+
+@pytest.mark.parametrize(
+    ("about", "field"),
+    [
+        ({"camera_height_std_m": 0.1}, "camera_height_std_m"),
+        ({"camera_height_m": 0.01}, "camera.height_m"),
+        ({"camera_height_m": 1.0, "camera_height_std_m": 3.0}, "camera.height_std_m"),
+    ],
+)
+def test_a_height_that_is_none_is_refused_before_it_is_sent(ask: Asking, about: dict[str, Any], field: str) -> None:
+    with pytest.raises(RequestError) as caught:
+        ask(lambda _: httpx.Response(500), "localize", RGB, DEPTH, CAMERA, **about)
+    assert caught.value.field == field

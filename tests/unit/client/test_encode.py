@@ -1,5 +1,6 @@
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -30,6 +31,14 @@ def test_jpeg_loses_little_and_keeps_the_order_of_colours() -> None:
     red = np.zeros((16, 16, 3), np.uint8)
     red[..., 0] = 200
     assert np.abs(decode_rgb(encode_rgb(red)).astype(int) - red).max() <= 3
+
+
+@pytest.mark.parametrize("quality", [50, 90, 95])
+def test_a_jpeg_has_the_pixels_that_opencv_would_write(quality: int) -> None:
+    rgb = cv2.resize(RGB, (80, 60), interpolation=cv2.INTER_CUBIC).astype(np.uint8)
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    written = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
+    np.testing.assert_array_equal(decode_rgb(encode_rgb(rgb, quality=quality)), decode_rgb(written))
 
 
 def test_a_slice_of_another_picture_is_sent_as_it_looks() -> None:

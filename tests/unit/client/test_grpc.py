@@ -72,7 +72,7 @@ class Told(LocalizationServiceServicer):
 def served() -> Iterator[tuple[Told, str]]:
     told = Told()
     server = grpc.server(ThreadPoolExecutor(2))
-    add_LocalizationServiceServicer_to_server(told, server)  # type: ignore[no-untyped-call]  # generated code
+    add_LocalizationServiceServicer_to_server(told, server)
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
     yield told, f"127.0.0.1:{port}"
@@ -102,7 +102,8 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
     T[:3, 3] = (1.0, 2.0, 3.0)
     client.localize(
         RGB, DEPTH, CAMERA, map="m", gravity=[0.0, 1.0, 0.0], T_vehicle_camera=T, options=Options(refine=False), max_range_m=40.0,
-        prior=Prior(position=PriorPosition(x=1.0, y=2.0, std_m=3.0), heading_deg=90.0),
+        prior=Prior(position=PriorPosition(x=1.0, y=2.0, std_m=3.0), heading_deg=90.0), camera_height_m=0.3, camera_height_std_m=0.02,
+        vehicle_base_on_ground=True,
     )  # fmt: skip
     read = request_from(told.asked[0])
     assert (read.map, read.options.refine, read.depth.max_range_m, read.depth.scale_m) == ("m", False, 40.0, 0.001)
@@ -110,7 +111,8 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
     assert read.T_vehicle_camera is not None
     assert read.T_vehicle_camera.position == schema.Position(x=1, y=2, z=3)
     assert read.prior == Prior(position=PriorPosition(x=1.0, y=2.0, std_m=3.0), heading_deg=90.0, heading_std_deg=20.0)
-    assert read.camera.fx == 3.0
+    assert (read.camera.fx, read.camera.height_m, read.camera.height_std_m) == (3.0, 0.3, 0.02)
+    assert read.vehicle_base_on_ground
     assert told.asked[0].depth.startswith(b"SFD1")
     assert told.metadata["authorization"] == "Bearer k"
 
@@ -124,6 +126,8 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
         {"street": {"id": "s", "name": "N", "street": "1", "section": None, "class_index": 0, "vote": 1.0}},
         {"geopose": {"position": {"lat": 52.5, "lon": 13.4, "h": 70.0}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1}}},
         {"vehicle_pose": POSE},
+        {"camera_height": {"height_m": 0.3, "origin": "given"}},
+        {"status": "AMBIGUOUS", "camera_height": {"height_m": 1.5, "origin": "assumed"}},
         {"hypotheses": [{"confirmed": True, "pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
         {"neighbours": [{"place": 3, "distance": 0.5, "similarity": 0.5, "street": None, "position": ORIGIN, "heading_deg": 0.0}]},
     ],
@@ -148,6 +152,7 @@ def test_a_sequence_and_a_batch(client: GrpcClient, told: Told, answer_json: Jso
     frames = [Frame(rgb=RGB, depth=DEPTH, camera=CAMERA, T_reference_camera=T) for T in (None, np.eye(4))]
     assert client.localize_sequence(frames) == answer
     read = sequence_request_from(told.asked[0])
+    assert (read.vehicle_base_on_ground, read.frames[0].camera.height_m) == (False, None)
     assert [frame.T_reference_camera is None for frame in read.frames] == [True, False]
     first, second = client.localize_batch([Frame(rgb=RGB, depth=DEPTH, camera=CAMERA)] * 2)
     assert first == answer
@@ -228,7 +233,7 @@ def test_a_message_beyond_grpcs_limit_is_not_sent_again(client: GrpcClient, told
 
 
 def test_details_that_contradict_their_call_are_no_problem_of_ours() -> None:
-    class Odd(grpc.RpcError, grpc.Call):  # type: ignore[misc]  # as grpc's own errors are made
+    class Odd(grpc.RpcError, grpc.Call):  # as grpc's own errors are made
         def code(self) -> grpc.StatusCode:
             return grpc.StatusCode.NOT_FOUND
 

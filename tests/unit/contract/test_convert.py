@@ -5,19 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.confidence.spread import Spread
 from service.contract import convert, schema
-from service.contract.convert import answer_from, parsed, query_from
-from service.contract.schema import LocalizeRequest
+from service.contract.convert import answer_from, parsed, query_from, sequence_from
+from service.contract.schema import LocalizeRequest, SequenceRequest
 from service.errors import RequestError
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
+from service.imaging.level import GivenHeight
 from service.localization.localizer import Localizer
-from service.localization.prior import Prior
-from service.localization.query import Query
-from service.localization.scoring import Candidate
 from service.maps.reader import MapBundle
 from service.registration.register import Registered
-from service.registration.rendered import Agreement
+from service.retrieval.prior import Prior
+from service.retrieval.query import Query
 from service.runtime.engine import Located
+from service.scoring.candidates import Candidate
+from service.scoring.rendered_depth import Agreement
 
 BOTH = {"position": {"x": 1, "y": 2}, "wgs84": {"latitude_deg": 0, "longitude_deg": 0}}
 
@@ -230,3 +232,104 @@ def test_vectors_without_a_length_are_refused(size):
     origin = schema.Position(x=0.0, y=0.0, z=0.0)
     with pytest.raises(RequestError, match=r"orientation: a quaternion of length"):
         convert.transform_of(schema.RigidTransform(position=origin, orientation=quaternion), "T_vehicle_camera")
+
+
+def at_height(z_m, x_m=0.0):
+    return {"position": {"x": x_m, "y": 0, "z": z_m}, "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}}
+
+
+def test_a_camera_height_is_passed_on_with_its_deviation(parts_of, camera_document):
+    assert query_of(parts_of()).camera_height is None
+    assert query_of(parts_of(camera=camera_document | {"height_m": 0.3})).camera_height == GivenHeight(0.3, 0.05)
+    precise = camera_document | {"height_m": 0.3, "height_std_m": 0.02}
+    assert query_of(parts_of(camera=precise)).camera_height == GivenHeight(0.3, 0.02)
+
+
+@pytest.mark.parametrize(
+    "changed", [{"height_m": 0.04}, {"height_m": 31}, {"height_m": 1, "height_std_m": 0}, {"height_std_m": 2.1}]
+)
+def test_a_height_of_no_camera_is_refused(parts_of, camera_document, changed):
+    with pytest.raises(RequestError) as caught:
+        query_of(parts_of(camera=camera_document | changed))
+    assert caught.value.field == f"camera.{list(changed)[-1]}"
+
+
+def test_a_vehicle_frame_on_the_ground_tells_the_height_of_its_camera(parts_of, camera_document):
+    T = at_height(0.42)
+    assert query_of(parts_of(T_vehicle_camera=T)).camera_height is None
+    assert query_of(parts_of(T_vehicle_camera=T, vehicle_base_on_ground=True)).camera_height == GivenHeight(0.42, 0.1)
+    measured = camera_document | {"height_m": 0.45}
+    both = parts_of(T_vehicle_camera=T, vehicle_base_on_ground=True, camera=measured)
+    assert query_of(both).camera_height == GivenHeight(0.45, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("changed", "field", "remedy"),
+    [
+        ({}, "vehicle_base_on_ground", "send it, or send camera.height_m instead"),
+        ({"T_vehicle_camera": at_height(0.0)}, "T_vehicle_camera.position.z", "send T_vehicle_camera of a frame on the ground"),
+        ({"T_vehicle_camera": at_height(-1.2)}, "T_vehicle_camera.position.z", "would be -1.2 m above the ground"),
+        ({"T_vehicle_camera": at_height(30.5)}, "T_vehicle_camera.position.z", "0.05 to 30 m are read"),
+    ],
+)  # fmt: skip
+def test_a_vehicle_frame_that_tells_no_height_is_refused(parts_of, changed, field, remedy):
+    frame = make_frame()
+    alone = json.dumps(frame | {"vehicle_base_on_ground": True} | changed).encode()
+    together = json.dumps({"frames": [frame], "vehicle_base_on_ground": True} | changed).encode()
+    for ask in (
+        lambda: query_from(parsed(alone, LocalizeRequest), rgb=b"", depth=b""),
+        lambda: sequence_from(parsed(together, SequenceRequest), [(b"", b"")]),
+    ):
+        with pytest.raises(RequestError) as caught:
+            ask()
+        assert caught.value.field == field
+        assert remedy in caught.value.message
+
+
+def make_frame(**camera):
+    return {"camera": {"width": 64, "height": 48, "fx": 32, "fy": 32, "cx": 31.5, "cy": 23.5} | camera}
+
+
+def heights_of(frames, **changed):
+    document = json.dumps({"frames": frames} | changed).encode()
+    queries, _ = sequence_from(parsed(document, SequenceRequest), [(b"", b"")] * len(frames))
+    return [query.camera_height for query in queries]
+
+
+def ahead(right_m, down_m, forward_m):
+    position = {"x": right_m, "y": down_m, "z": forward_m}
+    return {"T_reference_camera": {"position": position, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}}
+
+
+def test_each_camera_of_a_sequence_has_its_own_height():
+    frames = [make_frame(height_m=0.3), make_frame() | ahead(0, 0, 1), make_frame(height_m=2.0) | ahead(0, -1.7, 0)]
+    assert heights_of(frames) == [GivenHeight(0.3, 0.05), None, GivenHeight(2.0, 0.05)]
+
+
+def test_a_vehicle_frame_on_the_ground_tells_the_heights_of_near_cameras_only():
+    """The second camera is 0.2 m below the first one and beside it. The others are too far ahead, and under the ground."""
+    frames = [
+        make_frame(),
+        make_frame() | ahead(0.5, 0.2, 0.5),
+        make_frame() | ahead(0, 0, 5),
+        make_frame() | ahead(0, 0.5, 0),
+    ]
+    found = heights_of(frames, T_vehicle_camera=at_height(0.5), vehicle_base_on_ground=True)
+    assert found[0] == GivenHeight(0.5, 0.1)
+    assert (found[1].height_m, found[1].std_m) == pytest.approx((0.3, 0.1))
+    assert found[2:] == [None, None]
+
+
+def test_an_answer_of_any_status_tells_the_height_and_its_origin(localized):
+    found = answer_from(localized).camera_height
+    assert found is not None
+    assert (found.height_m, found.origin) == (pytest.approx(1.5, abs=0.1), "estimated")
+    answer = replace(
+        localized.answer, height_m=0.3, height_origin="given", status="AMBIGUOUS", spread=spread_of(localized)
+    )
+    refused = answer_from(replace(localized, answer=answer))
+    assert (refused.pose, refused.camera_height) == (None, schema.CameraHeight(height_m=0.3, origin="given"))
+
+
+def spread_of(localized):
+    return Spread(localized.answer.T_map_camera_guess[:3, 3], np.eye(3), 0.1, 0.5)

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from service.contract import schema
 from service.contract.convert import parsed, query_from, sequence_from
 from service.errors import StreetfixError
-from service.localization.query import Query
+from service.retrieval.query import Query
 from service.runtime.engine import EncodedQuery
 from service.runtime.settings import Limits, Settings
 
@@ -66,9 +66,14 @@ def named(document: Json) -> set[tuple[str, ...]]:
     return {tuple(key for key in path if isinstance(key, str)) for path in leaves(document)}
 
 
-ALONE = [FRAME | ABOUT | {"prior": prior} for prior in (POSITION, WGS84)]
-SEQUENCE = {"frames": [FRAME, FRAME | {"T_reference_camera": T}]}
-SEQUENCES = [ABOUT | SEQUENCE | {"prior": prior} for prior in (POSITION, WGS84)]
+#: The height of the camera is said, or follows from the vehicle.
+HIGH = FRAME | {"camera": FRAME["camera"] | {"height_m": 0.3, "height_std_m": 0.02}}
+ON_GROUND = {"vehicle_base_on_ground": True}
+ALONE = [HIGH | ABOUT | {"prior": POSITION}, FRAME | ABOUT | ON_GROUND | {"prior": WGS84}]
+SEQUENCES = [
+    ABOUT | {"frames": [frame, frame | {"T_reference_camera": T}]} | more
+    for frame, more in ((HIGH, {"prior": POSITION}), (FRAME, ON_GROUND | {"prior": WGS84}))
+]
 
 
 def test_the_documents_say_all_that_a_request_may() -> None:
@@ -177,6 +182,6 @@ def used_names() -> frozenset[str]:
 
 
 @pytest.mark.parametrize("kind", dict.fromkeys(classes_of_options()), ids=lambda kind: kind.__name__)
-def test_every_option_is_read_somewhere(kind: type) -> None:
+def test_every_option_is_read_somewhere(kind: Any) -> None:
     names = set(kind.model_fields if issubclass(kind, BaseModel) else kind.__dataclass_fields__)
     assert kind.__name__ == "BeamModel" or names - used_names() == set()  # that one a C struct takes whole (`astuple`)

@@ -6,6 +6,7 @@ import pytest
 
 from service.contract.oscp import GeoPoseRequest, accuracy_of, query_of
 from service.errors import DecodeError, NotYetSupportedError, RequestError
+from service.imaging.level import GivenHeight
 
 RGB, DEPTH = b"a jpeg", b"a png"
 PINHOLE = {"model": "PINHOLE", "modelParams": [300.0, 310.0, 320.0, 240.0]}
@@ -130,6 +131,7 @@ def test_upright_pictures_are_not(upright):
 )  # fmt: skip
 def test_the_accelerometer_says_where_down_is(felt, down):
     query = query_of(request_of(readings={"accelerometerReadings": [{"x": 1, "y": 1, "z": 1}, felt]}), None)
+    assert query.down_camera is not None
     np.testing.assert_allclose(query.down_camera, down, atol=2e-4)
 
 
@@ -146,6 +148,7 @@ def test_a_satellite_fix_is_a_prior():
     ]
     query = query_of(request_of(readings={"geolocationReadings": fixes}), None)
     assert query.prior_wgs84 == (48.1, 11.5)
+    assert query.prior is not None
     assert (query.prior.position_std_m, query.prior.heading_rad) == (12.0, None)
 
 
@@ -156,7 +159,9 @@ def test_an_accuracy_that_is_a_structures_first_value_is_not_known(accuracy):
     geopose = {"position": {"lat": 48, "lon": 11, "h": 0}, "quaternion": NORTH}
     earlier = {"geopose": geopose, "accuracy": {"position": accuracy}}
     for asked in (request_of(readings={"geolocationReadings": [fix]}), request_of(priorPoses=[earlier])):
-        assert query_of(asked, None).prior.position_std_m == 20.0
+        prior = query_of(asked, None).prior
+        assert prior is not None
+        assert prior.position_std_m == 20.0
 
 
 def test_a_picture_may_be_called_what_it_is():
@@ -172,6 +177,7 @@ def test_an_earlier_pose_is_a_better_one_with_its_heading():
     readings = {"geolocationReadings": [{"latitude": 1, "longitude": 2}]}
     query = query_of(request_of(priorPoses=[{"geopose": None}, earlier], readings=readings), None)
     assert query.prior_wgs84 == (48, 11)
+    assert query.prior is not None
     assert query.prior.position_std_m == 5.0  # not 0.1: the robot has moved since
     assert query.prior.heading_rad == pytest.approx(np.pi / 2)
     assert query.prior.heading_std_rad == pytest.approx(np.deg2rad(30))
@@ -182,3 +188,17 @@ def test_accuracies_are_means_of_standard_deviations():
     assert found.position == pytest.approx((0.1 + 0.2 + 0.3) / 3)
     assert found.orientation == pytest.approx(2.0)
     assert (accuracy_of(None).position, accuracy_of(None).orientation) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("added", "expected"),
+    [
+        ({}, None),
+        ({"heightAboveGround": 0.3}, GivenHeight(0.3, 0.05)),
+        ({"heightAboveGround": 0.3, "heightAboveGroundAccuracy": 0.02}, GivenHeight(0.3, 0.02)),
+        ({"heightAboveGroundAccuracy": 0.02}, None),
+    ],
+)
+def test_the_height_of_the_colour_camera_is_read(added, expected):
+    cameras = [reading("RGBA32", RGB, params=PINHOLE | added), reading("DEPTH", DEPTH)]
+    assert query_of(request_of(cameras), None).camera_height == expected

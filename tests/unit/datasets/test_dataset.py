@@ -15,8 +15,12 @@ from model_training.datasets.dataset import (
     write_tum,
 )
 from model_training.datasets.whole_folder import whole_or_not_at_all
+from service.contract.convert import parsed, query_from
+from service.contract.schema import LocalizeRequest
 from service.errors import DatasetError
 from service.geometry.rigid import rotation_z, transform_from
+from service.imaging.level import GivenHeight
+from service.imaging.view_grid import ViewGrid
 
 POSE = "0.000000 1 2 3 0 0 0 1"
 
@@ -73,6 +77,9 @@ DEFECTS = {
     "description lacks the name": ("dataset.json", lambda p: change_json(p, lambda d: d.pop("name")), "dataset.json: name"),
     "description knows more": ("dataset.json", lambda p: change_json(p, lambda d: d.update(extra=1)), "dataset.json: extra"),
     "format of another time": ("dataset.json", lambda p: change_json(p, lambda d: d.update(format=9)), "format 9 is not 1"),
+    "camera underground": ("dataset.json", lambda p: change_json(p, lambda d: d["sensors"]["cameras"][0].update(height_m=0.0)), "height_m"),
+    "deviation alone": ("dataset.json", lambda p: change_json(p, lambda d: d["sensors"]["cameras"][0].update(height_std_m=0.1)),
+                        "has height_std_m, but no height_m"),
     "no camera": ("dataset.json", lambda p: change_json(p, lambda d: d["sensors"].update(cameras=[])), "names no camera"),
     "scan truncated": ("survey/scans/000001.bin", lambda p: p.write_bytes(p.read_bytes()[:-3]), "000001.bin: 77 bytes"),
     "scan empty": ("survey/scans/000000.bin", lambda p: p.write_bytes(b""), "000000.bin: 0 bytes"),
@@ -100,6 +107,29 @@ def test_a_defect_is_named_with_its_file(folder, file, damage, message):
 
 def test_a_whole_dataset_reads_without_complaint(folder):
     read_all(folder)
+
+
+HEIGHTS = [
+    ({}, None),
+    ({"height_m": 0.3}, GivenHeight(0.3, 0.05)),
+    ({"height_m": 0.3, "height_std_m": 0.02}, GivenHeight(0.3, 0.02)),
+]
+
+
+@pytest.mark.parametrize(("given", "expected"), HEIGHTS)
+def test_a_camera_height_is_written_if_known_and_reaches_query_and_request(folder, parts_of, given, expected):
+    change_json(folder / "dataset.json", lambda d: d["sensors"]["cameras"][0].update(given))
+    description = Dataset(folder).description
+    write_description(folder, description)
+    written = json.loads((folder / "dataset.json").read_text())["sensors"]["cameras"][0]
+    assert {name: value for name, value in written.items() if name.startswith("height_")} == given
+    parts = parts_of()
+    for kind, name in (("rgb", "rgb/000000.jpg"), ("depth", "depth/000000.npy")):
+        (folder / "queries" / "drive" / name).write_bytes(parts[kind])
+    (folder / "queries" / "drive" / "depth" / "000000.png").unlink()
+    frame = next(Dataset(folder).queries("drive"))
+    asked = query_from(parsed(json.dumps(frame.request()).encode(), LocalizeRequest), rgb=b"", depth=b"")
+    assert frame.query(ViewGrid()).camera_height == asked.camera_height == expected
 
 
 def test_points_that_are_not_finite_are_left_out(folder):
@@ -138,7 +168,7 @@ def test_frames_carry_the_timestamps_of_their_poses(folder):
 def test_poses_survive_a_file(tmp_path):
     rng = np.random.default_rng(0)
     poses = np.stack([transform_from(rotation_z(a), rng.uniform(-9e3, 9e3, 3)) for a in np.linspace(-3, 3, 20)])
-    write_tum(tmp_path / "poses.txt", np.arange(20) * 0.1, poses)
+    write_tum(tmp_path / "poses.txt", np.arange(20, dtype=np.float64) * 0.1, poses)
     stamps, found = read_tum(tmp_path / "poses.txt")
     np.testing.assert_allclose(stamps, np.arange(20) * 0.1)
     np.testing.assert_allclose(found, poses, atol=1e-8)

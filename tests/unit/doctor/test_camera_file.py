@@ -21,6 +21,7 @@ def write(tmp_path, content):
 def test_a_request_is_read(tmp_path):
     told, request = camera_file.check_camera_file(write(tmp_path, {"camera": GOOD, "depth": {"scale_m": 0.001}}))
     assert told.level == "ok"
+    assert request is not None
     assert (request.camera.width, request.depth.scale_m) == (640, 0.001)
 
 

@@ -4,6 +4,7 @@ import pytest
 from service.doctor.ground import Ground, check_ground, ground_of
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_y
+from service.imaging.level import GivenHeight
 
 CAMERA = PinholeCamera(160, 120, 80.0, 80.0, 79.5, 59.5)
 
@@ -17,11 +18,25 @@ def plane(height_m, pitch_deg=0.0):
 
 
 @pytest.mark.parametrize("height_m", [0.3, 0.7, 1.5, 2.2, 3.5])
-def test_the_height_is_found_also_far_from_what_the_service_assumes(height_m):
+def test_a_height_that_the_service_finds_is_ok(height_m):
     found = ground_of(plane(height_m), CAMERA, None)
     assert found.height_m == pytest.approx(height_m, abs=0.1)
     assert found.share > 0.9
-    assert check_ground(found).level == ("warning" if height_m in (0.3, 3.5) else "ok")
+    told = check_ground(found)
+    assert told.level == "ok"
+    assert ("if the camera is not mounted so" in told.remedy) == (height_m in (0.3, 3.5))
+
+
+def test_a_height_that_the_service_does_not_find_is_a_warning_until_it_is_sent():
+    told = check_ground(ground_of(plane(5.0), CAMERA, None))
+    assert (told.level, float(told.text.split()[0])) == ("warning", pytest.approx(5.0, abs=0.3))
+    assert "finds heights from 0.15 to 4 m: send camera.height_m" in told.remedy
+    assert check_ground(ground_of(plane(5.0), CAMERA, None, GivenHeight(5.1, 0.1))).level == "ok"
+
+
+def test_a_given_height_that_the_image_contradicts_is_a_warning():
+    told = check_ground(ground_of(plane(1.5), CAMERA, None, GivenHeight(0.5, 0.02)))
+    assert (told.level, "but the request gives 0.5 m" in told.text) == ("warning", True)
 
 
 @pytest.mark.parametrize(("pitch_deg", "level"), [(5.0, "ok"), (-4.0, "ok"), (24.0, "warning")])
@@ -56,14 +71,16 @@ def ground(**changed):
 @pytest.mark.parametrize(
     ("changed", "text", "remedy"),
     [
-        ({"share": 0.05}, "no ground is seen: 5% of the pixels", "level camera 1.5 m"),
-        ({"height_m": 0.5, "found_by_service_m": 1.5}, "but the service takes it for 1.50 m", "send gravity"),
-        ({"height_m": 0.4}, "0.40 m above the ground", "depth.scale_m is off by a factor of about 3.8"),
-        ({"height_m": 3.0}, "3.00 m above the ground", "off by a factor of about 0.5"),
+        ({"share": 0.05}, "no ground is seen: 5% of the pixels", "let the image show the ground, and send camera.height_m"),
+        ({"share": 0.05, "origin": "given", "given_m": 0.4}, "no ground is seen", "level camera 0.4 m above the ground"),
+        ({"height_m": 0.5, "found_by_service_m": 1.5, "origin": "assumed"}, "but the service takes it for 1.50 m (assumed)",
+         "send camera.height_m and gravity"),
+        ({"height_m": 0.1, "found_by_service_m": 0.15}, "0.10 m above the ground", "send camera.height_m; if the camera is not mounted so"),
+        ({"height_m": 4.5}, "4.50 m above the ground", "depth.scale_m or fy is wrong"),
         ({"pitch_deg": -16.0}, "16 degrees up", "send gravity"),
         ({"roll_deg": 20.0}, "rolled by 20 degrees", "send gravity"),
     ],
-)
+)  # fmt: skip
 def test_what_is_unusual_is_a_warning(changed, text, remedy):
     found = check_ground(ground(**changed))
     assert found.level == "warning"

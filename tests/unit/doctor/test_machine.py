@@ -1,24 +1,27 @@
+import os
+import platform
+import shutil
 import socket
+import sys
 from pathlib import Path
 
 import pytest
 
-from service import platforms
 from service.doctor import machine
 from service.errors import StreetfixError
 
 
 def test_a_supported_platform_is_ok(monkeypatch):
-    monkeypatch.setattr(platforms.sys, "platform", "linux")
-    monkeypatch.setattr(platforms.platform, "machine", lambda: "aarch64")
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     found = machine.check_platform()
     assert (found.level, found.remedy) == ("ok", "")
     assert found.text.startswith("linux on aarch64, Python 3.")
 
 
 def test_another_platform_is_a_problem_that_says_where_the_service_runs(monkeypatch):
-    monkeypatch.setattr(platforms.sys, "platform", "win32")
-    monkeypatch.setattr(platforms.platform, "machine", lambda: "AMD64")
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(platform, "machine", lambda: "AMD64")
     found = machine.check_platform()
     assert found.level == "problem"
     assert "does not run on win32 (AMD64)" in found.text
@@ -28,8 +31,8 @@ def test_another_platform_is_a_problem_that_says_where_the_service_runs(monkeypa
 def test_a_quota_limits_the_cores(monkeypatch, tmp_path):
     """150 ms of processor time in each 100 ms: one and a half cores, so two threads."""
     (tmp_path / "cpu.max").write_text("150000 100000\n")
-    monkeypatch.setattr(machine.os, "cpu_count", lambda: 8)
-    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     assert machine.check_cores(tmp_path).text == (
         "2 of 8 usable: a service works on 2 requests at once; a quota allows 1.5 cores of processor time"
     )
@@ -45,14 +48,14 @@ def test_a_quota_limits_the_cores(monkeypatch, tmp_path):
     ],
 )
 def test_the_instruction_set_is_information(monkeypatch, tmp_path, kind, flags, told):
-    monkeypatch.setattr(machine.platform, "machine", lambda: kind)
+    monkeypatch.setattr(platform, "machine", lambda: kind)
     (tmp_path / "cpuinfo").write_text(f"processor\t: 0\nflags\t\t: {flags}\n\nprocessor\t: 1\n")
     found = machine.check_instructions(tmp_path / "cpuinfo")
     assert (found.level, found.text) == ("ok", told)
 
 
 def test_without_a_description_of_the_processor_avx2_is_unknown(monkeypatch, tmp_path):
-    monkeypatch.setattr(machine.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     found = machine.check_instructions(tmp_path / "missing")
     assert (found.level, found.text) == ("ok", "x86_64; the system does not tell whether it has AVX2")
 
@@ -65,7 +68,7 @@ def free_of(monkeypatch, mib: dict[str, int]) -> None:
             raise FileNotFoundError(2, "No such file or directory", str(folder))
         return type("Usage", (), {"free": mib[str(folder)] * 2**20})()
 
-    monkeypatch.setattr(machine.shutil, "disk_usage", usage)
+    monkeypatch.setattr(shutil, "disk_usage", usage)
 
 
 def test_shared_memory_is_ok_even_without_dev_shm(monkeypatch):
@@ -145,6 +148,6 @@ def test_an_address_of_another_machine_is_a_problem(monkeypatch):
     def refuse(*_, **__):
         raise OSError(99, "Cannot assign requested address")
 
-    monkeypatch.setattr(machine.socket, "create_server", refuse)
+    monkeypatch.setattr(socket, "create_server", refuse)
     found = machine.check_port("--port", "192.0.2.1", 8000, named=False)
     assert (found.level, found.remedy) == ("problem", "choose another --host or --port")

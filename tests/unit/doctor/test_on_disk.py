@@ -10,10 +10,13 @@ def test_a_good_bundle_opens_and_its_parts_are_told(bundle_path):
     assert told.level == "ok"
     assert told.text.startswith("tiny, version ")
     assert told.text.endswith("12 places")
+    assert bundle is not None
     encoder, localizer = on_disk.check_encoder(bundle)
     assert encoder.text == "reads views of 8 x 16 cells and gives descriptors of 16 numbers"
+    assert localizer is not None
     assert localizer.bundle is bundle
     assert on_disk.check_streets(bundle).text == "3 streets or sections"
+    assert bundle.cloud is not None
     assert on_disk.check_cloud(bundle).text == f"{len(bundle.cloud.surfels)} surfels"
     uncalibrated = on_disk.check_calibration(bundle, 0.02)
     assert uncalibrated.level == "warning"

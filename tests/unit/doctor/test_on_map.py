@@ -87,6 +87,6 @@ def test_a_query_that_the_service_refuses_is_a_problem(pair, localizer):
 
 
 def _prior():
-    from service.localization.prior import Prior
+    from service.retrieval.prior import Prior
 
     return Prior(position_std_m=5.0)

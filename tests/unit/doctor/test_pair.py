@@ -43,6 +43,7 @@ def pair_of(query):
 def test_a_good_pair_is_ok(encoded, depth_m):
     told, pair = check_images(encoded())
     assert (told.level, told.text) == ("ok", "colour 64x48, depth 64x48 of float32, camera 64x48")
+    assert pair is not None
     assert (pair.is_float, pair.scale_m) == (True, 1.0)
     unit, same = check_depth_unit(pair)
     assert (unit.level, same) == ("ok", pair)

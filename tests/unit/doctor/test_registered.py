@@ -42,6 +42,7 @@ def test_depth_beside_the_colour_is_a_warning_that_says_how_far(right_px, down_p
     found = check_registered(*scene(right_px, down_px))
     assert found.level == "warning"
     shift = edge_shift(*scene(right_px, down_px))
+    assert shift is not None
     # An edge counts up to one pixel away, and the first of several best shifts is taken.
     assert (shift.across_px, shift.down_px) == (pytest.approx(-right_px, abs=2), pytest.approx(-down_px, abs=2))
     assert shift.shifted > 0.95
@@ -52,6 +53,7 @@ def test_the_shift_is_in_pixels_of_the_colour_image():
     """The image has 640 columns, and is compared at 320."""
     rgb, depth_m = scene(10, 0)
     shift = edge_shift(rgb.repeat(2, axis=0).repeat(2, axis=1), depth_m)
+    assert shift is not None
     assert shift.across_px == pytest.approx(-20, abs=4)
 
 

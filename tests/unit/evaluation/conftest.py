@@ -32,8 +32,9 @@ def evo_ape(tmp_path: Path) -> Callable[..., Ape]:
             cwd=tmp_path, env=os.environ | {"HOME": str(tmp_path)}, capture_output=True, text=True, check=False, timeout=120,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
-        return Ape(
-            float(re.search(r"rmse\s+([\d.]+)", done.stdout)[1]), int(re.search(r"Compared (\d+)", done.stdout)[1])
-        )
+        error, count = re.search(r"rmse\s+([\d.]+)", done.stdout), re.search(r"Compared (\d+)", done.stdout)
+        assert error is not None
+        assert count is not None
+        return Ape(float(error[1]), int(count[1]))
 
     return run

@@ -75,6 +75,7 @@ def test_forced_errors_accepted_right_and_accepted_wrong_are_each_paired(run_of,
     found = compare(run_of("a", x=a), run_of("b", x=b))
     assert [found.shares["within_1_m"].only_second, found.shares["accepted_but_wrong"].only_first] == [5, 5]
     assert found.shares["forced_within_1_m"].only_first == found.shares["forced_within_1_m"].only_second == 0
+    assert found.errors is not None
     assert found.errors.p < 0.01
     assert found.errors.median_difference_m == pytest.approx(-0.15)
 

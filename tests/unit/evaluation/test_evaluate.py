@@ -19,7 +19,7 @@ from model_training.simulation.plan import QueryPlan, SimulationPlan
 from service.maps.reader import MapBundle
 
 NAME = "drive1_precise"
-STAMPS = 1403636579.75 + 0.5 * np.arange(5)
+STAMPS = 1403636579.75 + 0.5 * np.arange(5, dtype=np.float64)
 
 
 @pytest.fixture

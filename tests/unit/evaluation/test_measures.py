@@ -5,8 +5,8 @@ import pytest
 
 from model_training.evaluation.measures import measure, recall_at
 from model_training.evaluation.predict import RANKED, Predictions, headings_of, joined
+from service.confidence.features import FEATURES
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
-from service.maps.calibration import FEATURES
 
 STREETS = ["Street 1", "Street 2"]
 

@@ -61,6 +61,7 @@ def test_the_bootstrap_is_as_wide_as_the_standard_error_says_and_the_same_each_t
     first, second = rng.random(200), rng.random(200)
     found = paired_errors(first, second)
     assert found == paired_errors(first, second)
+    assert found is not None
     width = found.mean_interval_m[1] - found.mean_interval_m[0]
     assert width == pytest.approx(2 * 1.96 * (second - first).std(ddof=1) / np.sqrt(200), rel=0.08)
 

@@ -1,4 +1,5 @@
 import shutil
+from typing import Any
 
 import cv2
 import numpy as np
@@ -6,12 +7,12 @@ import pytest
 
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.predict import RANKED, predict
+from service.confidence.features import FEATURES
 from service.errors import DatasetError
 from service.localization.localizer import Localizer
-from service.localization.prior import Prior
-from service.localization.query import Query
-from service.maps.calibration import FEATURES
 from service.maps.reader import MapBundle
+from service.retrieval.prior import Prior
+from service.retrieval.query import Query
 
 NAME = "drive1_precise"
 
@@ -105,13 +106,14 @@ def test_a_prior_is_drawn_from_each_querys_truth_with_chance_of_its_own(localize
             asked.append(queries[0].prior.position_m)
             return localizer.localize_frames(queries, poses)
 
-    found = predict(Listening(), small_dataset, NAME, refine=False, workers=1, prior_of=prior_of)
+    listening: Any = Listening()
+    found = predict(listening, small_dataset, NAME, refine=False, workers=1, prior_of=prior_of)
     np.testing.assert_allclose(asked, found.T_true[:, :2, 3])
     np.testing.assert_allclose([xy for xy, _ in told], found.T_true[:, :2, 3])
     assert len({chance for _, chance in told}) == len(told)
     again = list(told)
     told.clear()
-    predict(Listening(), small_dataset, NAME, refine=False, workers=2, prior_of=prior_of)
+    predict(listening, small_dataset, NAME, refine=False, workers=2, prior_of=prior_of)
     assert sorted(chance for _, chance in told) == sorted(chance for _, chance in again)
 
 

@@ -9,8 +9,8 @@ import pytest
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.predict import predict
 from model_training.evaluation.why_refused import causes, out_of_range
+from service.confidence.features import FEATURES
 from service.localization.localizer import Localizer
-from service.maps.calibration import FEATURES
 from service.maps.reader import MapBundle
 
 NAME = "drive1_precise"

@@ -32,7 +32,7 @@ def make_dataset(
     def pose(k: float) -> np.ndarray:
         return transform_from(rotation_z(0.2 * k), np.array([1.5 * k, 0.25 * k, 0.0]))
 
-    stamps = 1_700_000_000 + 0.1 * np.arange(scans)
+    stamps = 1_700_000_000 + 0.1 * np.arange(scans, dtype=np.float64)
     scan_path(folder, 0).parent.mkdir(parents=True)
     for k in range(scans):
         points = rng.uniform(0, 30, (50 + k, 4)).astype(np.float32)

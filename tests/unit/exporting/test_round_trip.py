@@ -24,6 +24,7 @@ def quiet(*_):
 def taken_again(kind, path, out, *, depth="recorded", poses=None):
     recording = open_recording(kind, path, OpenSettings(depth=depth))
     trajectory = recording.trajectory() if poses is None else read_pose_file(poses)
+    assert trajectory is not None
     summary = take(recording, trajectory, out, TakeSettings(queries="drive"))
     assert summary.dropped == ()
     return Dataset(out)

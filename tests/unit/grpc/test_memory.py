@@ -17,8 +17,8 @@ from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 from service.grpc.memory import MessageMemory
 from service.grpc.reading import SERVICE
+from service.runtime.admission import MIB, MemoryBudget
 from service.runtime.engine import Engine
-from service.runtime.memory import MIB, MemoryBudget
 from service.runtime.settings import Limits, Settings
 
 Parts = Callable[..., dict[str, bytes]]
@@ -93,8 +93,9 @@ def test_a_message_that_does_not_fit_is_refused_with_when_to_come_back(
         others.grow(8 * MIB - len(message.SerializeToString()) + 1)
         with pytest.raises(grpc.RpcError) as caught:
             stub.Localize(message)
-        assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
-        assert "google.rpc.RetryInfo" in str(dict(caught.value.trailing_metadata())["grpc-status-details-bin"])
+        error: Any = caught.value  # a call, too
+        assert error.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert "google.rpc.RetryInfo" in str(dict(error.trailing_metadata())["grpc-status-details-bin"])
     assert stub.Localize(message).HasField("pose")
     assert 'streetfix_requests_total{code="busy",face="grpc",method="Localize"} 1.0' in engine.metrics.text().decode()
 
@@ -111,7 +112,7 @@ def test_no_more_messages_are_read_at_once_than_there_is_memory_for(
         over.wait(120)
         yield from ()
 
-    call = channel.stream_unary(f"/{SERVICE}/Localize")
+    call = channel.stream_unary(f"/{SERVICE}/Localize", bytes, bytes)
     slow = [call.future(silent()) for _ in range(2)]
 
     def is_refused() -> bool:
@@ -142,7 +143,7 @@ def test_health_is_answered_while_others_hold_its_turn_and_send_nothing(channel:
         over.wait(30)
         yield from ()
 
-    held = [channel.stream_unary("/grpc.health.v1.Health/Check").future(silent()) for _ in range(4)]
+    held = [channel.stream_unary("/grpc.health.v1.Health/Check", bytes, bytes).future(silent()) for _ in range(4)]
     for _ in range(5):
         answer = health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=10)
         assert answer.status == health_pb2.HealthCheckResponse.SERVING
@@ -160,7 +161,7 @@ def test_reflection_reads_one_message_at_a_time(channel: grpc.Channel) -> None:
         yield from ()
 
     path = "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo"
-    calls = [channel.stream_stream(path)(silent()) for _ in range(4)]
+    calls: list[Any] = [channel.stream_stream(path, bytes, bytes)(silent()) for _ in range(4)]
     ended = []
     for call in calls:
         with pytest.raises((grpc.RpcError, StopIteration)):

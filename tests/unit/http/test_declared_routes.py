@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, FastAPI
 
 from service.errors import BusyError, ForbiddenError
 from service.http.app import create_app
-from service.http.asking import Asking
+from service.http.body import Asking
 from service.http.routes import localize
 from service.runtime.engine import Engine
 

@@ -203,10 +203,10 @@ def test_a_map_without_a_place_on_the_earth_is_told(bundle_path: Path, parts_of:
 def test_doubt_is_a_problem_where_the_format_has_no_word_for_it(
     client: httpx.Client, parts_of: Parts, calibration_of: Callable[..., Calibration], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from service.localization import outcome
-    from service.localization.decide import Decision
+    from service.confidence import decision
+    from service.confidence.decision import Decision
 
-    monkeypatch.setattr(outcome, "decide", lambda *_, **__: Decision("AMBIGUOUS", 0.4))
+    monkeypatch.setattr(decision, "decide", lambda *_, **__: Decision("AMBIGUOUS", 0.4))
     monkeypatch.setattr(MapBundle, "calibration", calibration_of(), raising=False)
     refused = post(client, parts_of(), Accept="application/geopose+json")
     assert (refused.status_code, refused.json()["code"]) == (404, "no-pose")

@@ -10,6 +10,8 @@ import httpx
 import numpy as np
 import pytest
 
+from service.http.geopose import GEOPOSE
+from service.http.routes.localize import wants_geopose
 from service.maps.content import BundleContent
 from service.maps.writer import write_bundle
 from service.runtime.engine import Engine
@@ -39,7 +41,7 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     assert response.status_code == 200
     assert list(answer) == [
         "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "spread", "reasons", "neighbours",
-        "map", "timings_ms",
+        "camera_height", "map", "timings_ms",
     ]  # fmt: skip
     assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
     assert answer["street"] | {"vote": 1} == {
@@ -349,3 +351,32 @@ def test_a_request_that_takes_too_long_is_told_so(
         release.set()
         held.result(30)
         hurried.close()
+
+
+@pytest.mark.parametrize(
+    ("accept", "expected"),
+    [
+        ("", False), ("*/*", False), ("application/json", False), (GEOPOSE, True), (f"{GEOPOSE};version=1.0", True),
+        (f"application/json, {GEOPOSE}", False), (f"{GEOPOSE}, application/json", True), (f"{GEOPOSE};q=0.5, application/json", False),
+        (f"application/json;q=0.5, {GEOPOSE};q=0.9", True), (f"*/*;q=0.1, {GEOPOSE};q=0.2", True), (f"{GEOPOSE};q=0", False),
+        (f"{GEOPOSE};q=lots", False), ("text/html, application/xml;q=0.9, */*;q=0.8", False), (GEOPOSE.upper(), True),
+    ],
+)  # fmt: skip
+def test_qualities_decide_and_of_equal_ones_the_first(accept: str, expected: bool) -> None:
+    assert wants_geopose(accept) == expected
+
+
+@pytest.mark.parametrize(
+    ("changed", "field"),
+    [
+        ({"vehicle_base_on_ground": True}, "vehicle_base_on_ground"),
+        ({"vehicle_base_on_ground": True, "T_vehicle_camera": {"position": {"x": 0, "y": 0, "z": -1},
+                                                               "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}},
+         "T_vehicle_camera.position.z"),
+    ],
+)  # fmt: skip
+def test_a_vehicle_on_the_ground_without_a_height_is_a_problem_that_names_the_field(
+    client: httpx.Client, parts_of: Parts, changed: dict[str, Any], field: str
+) -> None:
+    problem = post(client, parts_of(**changed)).json()
+    assert (problem["status"], problem["code"], problem["field"]) == (422, "request", field)

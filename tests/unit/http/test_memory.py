@@ -15,8 +15,8 @@ import pytest
 from fastapi import FastAPI
 
 from service.http.app import create_app
+from service.runtime.admission import MIB, MemoryBudget
 from service.runtime.engine import Engine
-from service.runtime.memory import MIB, MemoryBudget
 from service.runtime.settings import Limits, Settings
 
 AppClient = Callable[[FastAPI], httpx.Client]

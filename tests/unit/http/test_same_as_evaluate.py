@@ -12,8 +12,8 @@ from model_training.evaluation.evaluate import evaluate
 from model_training.loadtest.payloads import payloads
 from model_training.mapping.build import BuildSettings, build_map
 from service.geometry.rigid import quaternion_xyzw_from
-from service.localization.encoder import Encoder
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
 from service.runtime.engine import Engine
 from service.runtime.settings import Limits, Settings
 
@@ -25,7 +25,9 @@ def rig_dataset(small_dataset, tmp_path_factory):
     """The small dataset as a stereo rig leaves it: JPEGs of four times the size, and a baseline beside the depth."""
     folder = shutil.copytree(small_dataset.folder, tmp_path_factory.mktemp("datasets") / "rig")
     for path in (folder / "queries" / NAME / "rgb").iterdir():
-        picture = cv2.resize(cv2.imread(str(path)), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+        small = cv2.imread(str(path))
+        assert small is not None
+        picture = cv2.resize(small, None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
         path.unlink()
         cv2.imwrite(str(path.with_suffix(".jpg")), picture)
     description = json.loads((folder / "dataset.json").read_text())

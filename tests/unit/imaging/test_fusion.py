@@ -12,9 +12,15 @@ from service.imaging.ihs import ihs_geometric
 GOLDEN = Path(__file__).parents[2] / "golden" / "imaging"
 
 
+def golden(name, flags=cv2.IMREAD_COLOR):
+    picture = cv2.imread(str(GOLDEN / name), flags)
+    assert picture is not None
+    return picture
+
+
 def golden_inputs():
-    rgb = cv2.imread(str(GOLDEN / "rgb.png"))[..., ::-1].copy()
-    depth_m = cv2.imread(str(GOLDEN / "depth.png"), cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(1000)
+    rgb = golden("rgb.png")[..., ::-1].copy()
+    depth_m = golden("depth.png", cv2.IMREAD_UNCHANGED).astype(np.float32) / np.float32(1000)
     return rgb, depth_m
 
 
@@ -53,8 +59,8 @@ def test_fused_planes_are_the_golden_ones():
 
 def test_picture_for_people_is_the_golden_one():
     picture = picture_of(fuse(*golden_inputs()), 40.0).astype(int)
-    golden = cv2.imread(str(GOLDEN / "picture.png"))[..., ::-1].astype(int)
-    assert np.abs(picture - golden).max() <= 1
+    expected = golden("picture.png")[..., ::-1].astype(int)
+    assert np.abs(picture - expected).max() <= 1
 
 
 def test_near_is_brighter_than_far_and_unmeasured_is_black():

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z
 from service.imaging import level as module
-from service.imaging.level import level_camera, nominal_level
+from service.imaging.level import GivenHeight, level_camera, level_query, nominal_level
 
 CAMERA = PinholeCamera(160, 120, 80.0, 80.0, 79.5, 59.5)
 DOWN_AHEAD = np.array([0.0, 1.0, 0.0])
@@ -117,7 +117,7 @@ def test_the_nominal_level_is_a_rotation_whose_third_row_is_up():
     np.testing.assert_allclose(R[2], -down, atol=1e-12)
 
 
-def plain_fit(depth_m, camera, R, height_m):
+def plain_fit(depth_m, camera, R, height_m, height_std_m):
     """The fit as NumPy says it."""
     own = camera.scaled_to(depth_m.shape[1], depth_m.shape[0])
     step = max(1, depth_m.shape[1] // module.STEP_PIXELS)
@@ -128,7 +128,7 @@ def plain_fit(depth_m, camera, R, height_m):
     measured = (z > module.NEAR_M) & (z < module.REACH_M)
     rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
     points = (z[measured, None] * rays[measured]) @ R.T
-    prior = np.diag([1 / module.TILT_PRIOR_RAD**2, 1 / module.TILT_PRIOR_RAD**2, 1 / module.HEIGHT_PRIOR_M**2])
+    prior = np.diag([1 / module.TILT_PRIOR_RAD**2, 1 / module.TILT_PRIOR_RAD**2, 1 / height_std_m**2])
     mean = solution = np.array([0.0, 0.0, -height_m])
     near = points[points[:, 2] < -0.3 * height_m]
     design, z = np.column_stack([near[:, :2], np.ones(len(near))]), near[:, 2]
@@ -141,19 +141,66 @@ def plain_fit(depth_m, camera, R, height_m):
             break
         weighted = design * np.where(keep, certainty, 0.0)[:, None]
         solution = np.linalg.solve(weighted.T @ design + prior, weighted.T @ z + prior @ mean)
-    return solution
+    off, band = z - design @ solution, module.BANDS[-1, 0] + module.BANDS[-1, 1] * reach
+    return [*solution, measured.sum(), (np.abs(off) <= band).sum(), (off < -3 * band).sum()]
 
 
 @settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1), pitch_deg=st.floats(-8, 8), roll_deg=st.floats(-8, 8), noise=st.floats(0, 0.3),
-    size=st.sampled_from([(120, 160), (61, 79), (30, 500), (1, 1)]), holes=st.floats(0, 1),
+    size=st.sampled_from([(120, 160), (61, 79), (30, 500), (1, 1)]), holes=st.floats(0, 1), std_m=st.floats(0.01, 1),
 )  # fmt: skip
-def test_the_compiled_fit_says_what_plain_numpy_says(seed, pitch_deg, roll_deg, noise, size, holes):
+def test_the_compiled_fit_says_what_plain_numpy_says(seed, pitch_deg, roll_deg, noise, size, holes, std_m):
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(size[1], size[0], 80.0, 80.0, size[1] / 2, size[0] / 2)
     depth_m = ground_depth(tilted(pitch_deg=pitch_deg, roll_deg=roll_deg), 1.6, camera=camera)
     depth_m *= rng.normal(1, noise, depth_m.shape).astype(np.float32)
     depth_m[rng.random(depth_m.shape) < holes] = rng.choice([0.0, np.nan, np.inf, -5.0, 1e30])
-    found = module._fit_ground(depth_m, camera, R_BODY_OPTICAL, 1.5)
-    np.testing.assert_allclose(found, plain_fit(depth_m, camera, R_BODY_OPTICAL, 1.5), rtol=1e-7, atol=1e-9)
+    found = module._fit_ground(depth_m, camera, R_BODY_OPTICAL, 1.5, std_m)
+    np.testing.assert_allclose(found, plain_fit(depth_m, camera, R_BODY_OPTICAL, 1.5, std_m), rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("height_m", [0.2, 0.3, 0.45, 0.8, 1.2, 1.5, 1.7, 2.0, 2.5, 3.0, 3.6])
+@pytest.mark.parametrize("pitch_deg", [-2, 2])
+def test_the_height_of_a_camera_is_found_between_a_fifth_of_a_metre_and_four(height_m, pitch_deg):
+    level, origin = level_query(ground_depth(tilted(pitch_deg=pitch_deg), height_m), CAMERA)
+    assert origin == "estimated"
+    bias_m = 0.14 if 1.5 < height_m < 2 else 0.05  # near the usual height its prior counts
+    assert level.height_m == pytest.approx(height_m, abs=bias_m)
+    assert level.is_ground
+
+
+def test_near_the_usual_height_the_answer_is_that_of_the_usual_prior():
+    depth_m = ground_depth(tilted(pitch_deg=1), 1.55)
+    usual = level_camera(depth_m, CAMERA, down_camera=None, nominal_height_m=1.5)
+    level, _ = level_query(depth_m, CAMERA)
+    assert level.height_m == usual.height_m
+    np.testing.assert_array_equal(level.R_level_camera, usual.R_level_camera)
+
+
+@pytest.mark.parametrize("height_m", [0.25, 1.5, 3.5])
+def test_a_given_height_is_the_prior_and_without_ground_the_result(height_m):
+    nothing = np.zeros((120, 160), np.float32)
+    level, origin = level_query(nothing, CAMERA, given=GivenHeight(height_m, 0.05))
+    assert (level.height_m, origin) == (pytest.approx(height_m), "given")
+    level, _ = level_query(ground_depth(tilted(), height_m), CAMERA, given=GivenHeight(height_m + 0.05, 0.05))
+    assert height_m <= level.height_m <= height_m + 0.05
+    sure, _ = level_query(ground_depth(tilted(), height_m), CAMERA, given=GivenHeight(height_m + 0.05, 1e-4))
+    assert sure.height_m == pytest.approx(height_m + 0.05, abs=2e-3)
+
+
+def test_without_ground_the_usual_height_is_assumed():
+    level, origin = level_query(np.zeros((120, 160), np.float32), CAMERA)
+    assert (level.height_m, origin) == (pytest.approx(1.5), "assumed")
+    wall = np.full((120, 160), 6.0, np.float32)
+    level, origin = level_query(wall, CAMERA)
+    assert (level.height_m, origin) == (pytest.approx(1.5, abs=0.05), "assumed")
+
+
+def test_a_plane_with_points_below_it_is_no_ground():
+    """The roof of a car fills the near half of the image; the ground beside it lies 1.4 m lower."""
+    roof, ground = ground_depth(tilted(), 0.6), ground_depth(tilted(), 2.0)
+    depth_m = np.where(np.arange(160) < 60, roof, ground).astype(np.float32)
+    level, origin = level_query(depth_m, CAMERA)
+    assert origin == "estimated"
+    assert level.height_m == pytest.approx(2.0, abs=0.05)

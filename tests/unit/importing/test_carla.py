@@ -3,6 +3,7 @@
 import csv
 import json
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -105,9 +106,13 @@ def test_what_was_recorded_is_read_again_in_our_convention(recorded):
     assert (len(scans), len(pictures), folder.count()) == (3, 3, 6)
     np.testing.assert_array_equal(scans[0].points, [[1, -2, 3, 0.5], [4, -5, 6, 0.25]])
     np.testing.assert_array_equal(pictures[0].rgb[0, 0], [3, 2, 1])
+    assert pictures[0].depth is not None
     np.testing.assert_allclose(pictures[0].depth, 1000 * 83 * 256 / (2**24 - 1), rtol=1e-6)
     np.testing.assert_allclose(pictures[0].T_vehicle_camera[:3, 3], [0.5, -0.25, 1.5])
-    np.testing.assert_allclose(folder.trajectory().T_map_vehicle[2], T_from_carla(20, 2, 0, 0, 0, 90), atol=1e-12)
+    trajectory = folder.trajectory()
+    assert trajectory is not None
+    np.testing.assert_allclose(trajectory.T_map_vehicle[2], T_from_carla(20, 2, 0, 0, 0, 90), atol=1e-12)
+    assert folder.lidar.T_vehicle_sensor is not None
     assert folder.lidar.T_vehicle_sensor[2][3] == 1.8
     assert "3 frames of Town01" in folder.notes.lines
 
@@ -266,7 +271,7 @@ def serve(carla, monkeypatch):
     return made
 
 
-QUICK = {"timeout_s": 0.01, "lidar": SMALL.lidar, "camera": SMALL.camera}
+QUICK: dict[str, Any] = {"timeout_s": 0.01, "lidar": SMALL.lidar, "camera": SMALL.camera}
 
 
 def run(out, **changed):
@@ -297,8 +302,9 @@ def test_a_drive_is_recorded_frame_by_frame_and_older_data_are_skipped(serve, tm
     assert [float(row["x"]) for row in rows] == [41.0, 42.0, 43.0]
     scans = [event for event in open_carla(tmp_path / "out").events() if isinstance(event, RecordedScan)]
     assert [scan.points[0, 0] for scan in scans] == [41.0, 42.0, 43.0]
-    blue = cv2.imread(str(tmp_path / "out" / "rgb" / "00000042.png"))[0, 0, 0]
-    assert blue == 42
+    picture = cv2.imread(str(tmp_path / "out" / "rgb" / "00000042.png"))
+    assert picture is not None
+    assert picture[0, 0, 0] == 42  # blue
     assert json.loads((tmp_path / "out" / "recording.json").read_text())["town"] == "Town03"
     assert world.log[:3] == ["traffic True", "seed 7", "synchronous True"]
     assert_put_back(world)

@@ -1,5 +1,7 @@
 """KITTI's raw and odometry layouts: scans, pairs, calibration, times and poses, and what is said of what is broken."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -127,7 +129,9 @@ def only_grey(drive):
     for colour, grey in (("2", "0"), ("3", "1")):
         folder = drive / (f"image_0{colour}" if raw else f"image_{colour}")
         for path in folder.rglob("*.png"):
-            cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+            picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            assert picture is not None
+            cv2.imwrite(str(path), picture)
         folder.rename(drive / (f"image_0{grey}" if raw else f"image_{grey}"))
     calibration = drive.parent / "calib_cam_to_cam.txt" if raw else drive / "calib.txt"
     names = ("P_rect_00", "P_rect_01") if raw else ("P0", "P1")
@@ -360,7 +364,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path, kind, why):
 
 
 def test_a_scan_that_vanishes_during_an_import_is_an_error_and_a_picture_is_left_out(raw):
-    recording = open_recording("kitti-raw", raw, OpenSettings(depth="stored"))
+    recording: Any = open_recording("kitti-raw", raw, OpenSettings(depth="stored"))
     events = recording.events()
     assert [type(next(events)) for _ in range(2)] == [RecordedScan, RecordedPicture]
     frame = recording.frames[1]

@@ -128,7 +128,9 @@ def cut(path):
 
 
 def crop(path):
-    cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:, 1:])
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    cv2.imwrite(str(path), picture[:, 1:])
 
 
 def write_nan(path):
@@ -178,6 +180,7 @@ def test_the_recording_is_imported_with_exact_truth(kitti_recording, tmp_path):
     query = list(dataset.queries("frames"))[6]
     points_map = transform_points(dataset.survey_poses()[6], dataset.scan(6)[:, :3].astype(np.float64))
     u, v = np.rint(pixels_of_query(query, points_map)).astype(int).T
+    assert query.T_map_camera is not None
     z = transform_points(inverse(query.T_map_camera), points_map)[:, 2]
     np.testing.assert_allclose(query.depth_m()[v, u], z, atol=1e-3)  # the scan was made from this depth
 

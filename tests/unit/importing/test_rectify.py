@@ -46,6 +46,7 @@ def test_depth_is_never_mixed_between_two_surfaces(picture_at, dtype):
     depth = np.where(np.arange(SIZE[1]) < 80, 2, 9).astype(dtype)[None].repeat(SIZE[0], 0)
     picture = picture_at(0, rgb=np.zeros((*SIZE, 3), np.uint8), camera=camera_of(PLUMB_BOB), depth=depth)
     flat = rectified(picture)
+    assert flat.depth is not None
     assert flat.depth.dtype == dtype
     assert set(np.unique(flat.depth)) <= {0, 2, 9}
 

@@ -1,4 +1,5 @@
 import json
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,6 +51,7 @@ def test_tums_pairs_are_in_time_and_their_depth_in_its_own_steps(tum):
     scans = [e for e in folder.events() if isinstance(e, RecordedScan)]
     pictures = [e for e in folder.events() if isinstance(e, RecordedPicture)]
     assert [p.stamp_s for p in pictures] == [0.0, 1.0]
+    assert pictures[0].depth is not None
     np.testing.assert_allclose(pictures[0].depth * pictures[0].depth_scale_m, 2.0)
     x, y, z, grey = scans[0].points.T
     np.testing.assert_allclose(x, 2.0, rtol=1e-6)  # ahead of the camera's body
@@ -59,7 +61,9 @@ def test_tums_pairs_are_in_time_and_their_depth_in_its_own_steps(tum):
 
 
 def test_tums_truth_is_of_the_optical_frame_and_becomes_that_of_the_body(tum):
-    T = open_tum_rgbd(tum, CAMERA).trajectory().T_map_vehicle
+    trajectory = open_tum_rgbd(tum, CAMERA).trajectory()
+    assert trajectory is not None
+    T = trajectory.T_map_vehicle
     np.testing.assert_allclose(T[2], [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]], atol=1e-9)
 
 
@@ -90,10 +94,12 @@ def test_tums_layout_needs_a_camera_and_does_without_truth(tum):
 def test_open3ds_folder_has_its_own_camera_and_poses(open3d):
     folder = open_open3d(open3d, None)
     assert (folder.camera.fx, folder.camera.cx, folder.camera.cy) == (8.0, 3.5, 2.5)
-    events = list(folder.events())
+    events: list[Any] = list(folder.events())
     assert [type(e).__name__ for e in events] == ["RecordedScan", "RecordedPicture"] * 2
     np.testing.assert_allclose(events[1].depth * events[1].depth_scale_m, 2.0)
-    moved = folder.trajectory().T_map_vehicle
+    trajectory = folder.trajectory()
+    assert trajectory is not None
+    moved = trajectory.T_map_vehicle
     np.testing.assert_allclose(moved[1, :3, 3] - moved[0, :3, 3], [1, 0, 0])
     np.testing.assert_allclose(moved[0, :3, 0], [0, 0, 1], atol=1e-12)  # ahead is where the optical axis points
 
@@ -126,16 +132,19 @@ def test_pictures_that_are_broken_or_of_another_size_are_counted_alike(open3d):
     for k in range(2):
         path = open3d / "depth" / f"{k:05d}.png"
         path.write_bytes(path.read_bytes()[:30])
-    bad = list(open_open3d(open3d, None).events())
+    bad: list[Any] = list(open_open3d(open3d, None).events())
     assert [type(e) for e in bad] == [Unusable, Unusable]
     assert len({e.why for e in bad}) == 1
     assert bad[0].why.startswith("its depth cannot be read")
     smaller = PinholeCamera(4, 6, 8.0, 8.0, 3.5, 2.5)
     write_pair(open3d / "color" / "00000.jpg", open3d / "depth" / "00000.png", 2000)
-    assert "sizes differ" in next(open_open3d(open3d, smaller).events()).why
+    first = next(open_open3d(open3d, smaller).events())
+    assert isinstance(first, Unusable)
+    assert "sizes differ" in first.why
 
 
 def test_a_picture_without_any_depth_gives_no_scan(open3d):
     write_pair(open3d / "color" / "00000.jpg", open3d / "depth" / "00000.png", 0)
     first = next(open_open3d(open3d, None).events())
+    assert isinstance(first, Unusable)
     assert (first.kind, first.why) == ("scan", "no depth in it")

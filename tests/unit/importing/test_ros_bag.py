@@ -1,6 +1,7 @@
 """Bags that lack something, or are damaged, and what is made of their poses."""
 
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -217,7 +218,8 @@ def test_pictures_of_mixed_sizes_and_encodings_are_counted(ros, drive, tmp_path)
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.9, 0.999])
 def test_a_bag_that_was_cut_off_gives_its_good_frames_or_the_remedy(ros, drive, tmp_path, storage, share):
-    (file,) = [*(ros.write(tmp_path / "bag", drive(count=60), storage=storage)).glob("*.[md][cb]*")]
+    folder: Path = ros.write(tmp_path / "bag", drive(count=60), storage=storage)
+    (file,) = folder.glob("*.[md][cb]*")
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
     try:

@@ -254,5 +254,6 @@ def test_odometry_reads_usable_scans_alone(recording_of, scan_at, picture_at):
     first, second = scans_of(recording_of(events))
     assert (first.stamp_s, second.stamp_s) == (1.0, 2.0)
     np.testing.assert_array_equal(first.points, [[1, 2, 3, 4]])
+    assert first.offsets_s is not None
     assert first.offsets_s.tolist() == [0.1]
     assert second.offsets_s is None

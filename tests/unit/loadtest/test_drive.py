@@ -21,6 +21,12 @@ class Fake:
         self.asked, self._replies, self._takes_s = [], replies, takes_s
         self.at_once = self.most_at_once = 0
 
+    async def __aenter__(self):
+        return self
+
+    async def __aexit__(self, kind, error, trace):
+        pass
+
     async def ask(self, payload, timeout_s):  # noqa: ARG002  # as the real ones are asked
         number = next(k for k, each in enumerate(PAYLOADS) if each is payload)
         self.asked.append(number)

@@ -4,13 +4,14 @@ import importlib
 import sys
 from contextlib import contextmanager
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 
 
 @pytest.fixture
 def robot(small_dataset, monkeypatch):
-    locust = ModuleType("locust")
+    locust: Any = ModuleType("locust")
     locust.HttpUser, locust.constant, locust.task = object, lambda seconds: seconds, lambda function: function
     monkeypatch.setitem(sys.modules, "locust", locust)
     monkeypatch.setenv("STREETFIX_CLIENT_DATASET", str(small_dataset.folder))

@@ -7,20 +7,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from service.confidence.features import FEATURES
+from service.confidence.reasons import reasons_of
 from service.errors import BundleError, NoDepthError, RequestError
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import heading_of_camera, transform_from
-from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
-from service.localization.prior import Prior
-from service.localization.query import Query
-from service.localization.reasons import reasons_of
-from service.localization.search import distinct_places, search_views
-from service.localization.street_vote import StreetVote
-from service.maps.calibration import FEATURES
 from service.maps.content import BundleContent
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
+from service.retrieval.encoder import Encoder
+from service.retrieval.knn import StreetVote, distinct_places, search_views
+from service.retrieval.prior import Prior
+from service.retrieval.query import Query
 
 Pictures = tuple[NDArray[np.uint8], NDArray[np.float32], PinholeCamera]
 
@@ -89,7 +88,7 @@ def test_without_registration_the_heaviest_cluster_says_the_street_whatever_the_
 ) -> None:
     """Places on both sides of a street's border vote across it; a cluster lies on one side."""
     outvoted = StreetVote(street=1, share=0.6, shares=((1, 0.6), (2, 0.4)))
-    monkeypatch.setattr("service.localization.retrieval.vote", lambda *_: outvoted)
+    monkeypatch.setattr("service.retrieval.retrieve.vote", lambda *_: outvoted)
     answer = localizer.localize(replace(query, refine=False))
     assert answer.vote is outvoted
     assert answer.street == answer.hypotheses[0].street == 2
@@ -205,6 +204,7 @@ def test_the_evidence_has_a_number_for_every_feature(localizer: Localizer, query
     assert answer.evidence is not None
     assert answer.evidence.shape == (len(FEATURES),)
     assert np.isfinite(answer.evidence).all()
+    assert answer.candidates is not None
     assert answer.evidence[FEATURES.index("inliers")] == answer.candidates[0].registered.inliers
 
 
@@ -299,6 +299,7 @@ def test_a_prior_that_is_wrong_does_not_move_a_pose_that_the_pictures_are_sure_o
         answer = localizer.localize(replace(query, prior=wrong))
         np.testing.assert_allclose(answer.T_map_camera_guess, alone.T_map_camera_guess, atol=1e-9)
         assert answer.covariance is not None
+        assert alone.covariance is not None
         np.testing.assert_allclose(answer.covariance, alone.covariance, atol=1e-9)
 
 

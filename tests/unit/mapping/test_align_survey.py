@@ -1,4 +1,5 @@
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,6 +78,8 @@ def test_scans_between_those_that_take_part_move_as_the_one_before(shifted):
 class Empty(Shifted):
     """Whose third scan saw nothing, and the others of its kind."""
 
+    blind: set[int]
+
     def scan(self, number):
         return super().scan(number)[:0] if number in self.blind else super().scan(number)
 
@@ -112,9 +115,8 @@ def test_a_map_is_built_of_scans_in_agreement_unless_told_otherwise(shifted, enc
     """Its places stand where the scans agree they do, and the manifest says so."""
     poses = {}
     for name, align in (("aligned", True), ("given", False)):
-        settings = BuildSettings(
-            name="small", headings=2, spacing_m=5.0, calibration=None, **({} if align else {"align_survey": False})
-        )
+        changed: dict[str, Any] = {} if align else {"align_survey": False}
+        settings = BuildSettings(name="small", headings=2, spacing_m=5.0, calibration=None, **changed)
         build_map(shifted, encoder_file, tmp_path / name, settings, threads=1)
         poses[name] = MapBundle.open(tmp_path / name).T_map_place
         assert parameters_of(tmp_path / name).get("survey_aligned") == (1.0 if align else None)

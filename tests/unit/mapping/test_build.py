@@ -8,10 +8,10 @@ from model_training.datasets.dataset import Dataset
 from model_training.mapping import site_check
 from model_training.mapping.build import BuildSettings, build_map, describe, fan, thinned, view_ranges
 from service.errors import BundleError, DatasetError, EncoderError
-from service.localization.encoder import Encoder
 from service.localization.localizer import Localizer
-from service.localization.query import Query
 from service.maps.reader import MapBundle
+from service.retrieval.encoder import Encoder
+from service.retrieval.query import Query
 
 SETTINGS = BuildSettings(
     name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False, traffic_vote=False
@@ -235,7 +235,9 @@ def test_some_scans_are_held_out_to_check_it_and_are_in_the_map_all_the_same(
         small_dataset, encoder_file, tmp_path / "m", settings, threads=1, report=lambda *event: told.append(event)
     )
     checked = MapBundle.open(tmp_path / "m")
+    assert checked.calibration is not None
     site, places = checked.calibration.site, bundle.manifest.counts.places
+    assert site is not None
     assert site.queries == places // 4 >= 2
     assert [event for event in told if event[0] == "site check"] == [
         ("site check", k + 1, site.queries) for k in range(site.queries)
@@ -244,6 +246,7 @@ def test_some_scans_are_held_out_to_check_it_and_are_in_the_map_all_the_same(
     assert site.offset <= 0
     assert checked.manifest.counts == bundle.manifest.counts
     np.testing.assert_array_equal(checked.T_map_place, bundle.T_map_place)
+    assert checked.cloud is not None
     np.testing.assert_allclose(
         np.sort(checked.cloud.surfels["xyz"][:, 0]), np.sort(bundle.cloud.surfels["xyz"][:, 0]), atol=1e-3
     )

@@ -3,7 +3,7 @@ import pytest
 from model_training.mapping.calibration_file import calibration_for
 from model_training.stock import CALIBRATION, ENCODER
 from service.errors import BundleError, DatasetError
-from service.localization.encoder import Encoder
+from service.retrieval.encoder import Encoder
 
 OWN, OTHER = "1" * 64, "2" * 64
 

@@ -50,6 +50,7 @@ def test_info_tells_what_the_bundle_holds(small_map):
     assert (found["name"], found["version"]) == ("small", bundle.manifest.version)
     assert found["counts"] == bundle.manifest.counts.model_dump()
     assert found["size_bytes"] == sum(path.stat().st_size for path in small_map.rglob("*") if path.is_file())
+    assert bundle.streets is not None
     assert found["streets"] == sorted({street.street for street in bundle.streets.features})
     assert found["keeps_sums"] is True
     assert found["calibrated"] is False
@@ -185,6 +186,7 @@ def test_differences_by_hand(changed):
 def test_the_picture_shows_green_and_red(run, changed, tmp_path):
     before, after = changed
     picture = cv2.imdecode(np.frombuffer(difference_png(before, after, longest_px=400), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
     assert max(picture.shape) <= 402
     blue, green, red = (picture[..., k].astype(int) for k in range(3))
     assert ((green > red + 50) & (green > blue + 50)).sum() > 5

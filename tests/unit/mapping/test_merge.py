@@ -14,16 +14,16 @@ from model_training.mapping.verify import damage_of
 from service.errors import BundleError, DatasetError
 from service.geometry.rigid import rotation_z, transform_from
 from service.localization.localizer import Localizer
-from service.localization.query import Query
 from service.maps import content as parts
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
+from service.retrieval.query import Query
 
 
 @pytest.fixture(scope="module")
 def merged(half_maps, tmp_path_factory):
     out = tmp_path_factory.mktemp("merged") / "m"
-    merge_maps(*half_maps, out)
+    merge_maps(half_maps[0], half_maps[1], out)
     return MapBundle.open(out)
 
 
@@ -36,6 +36,11 @@ def positions(bundle):
     return bundle.cloud.surfels["xyz"] + bundle.cloud.origin_m
 
 
+def nearest_of(points, asked):
+    """Return distance and index of the nearest of ``points`` to each point asked for."""
+    return cKDTree(points).query(asked)
+
+
 def test_a_merged_map_has_the_places_of_one_built_at_once(merged, whole):
     assert merged.manifest.counts.places == whole.manifest.counts.places
     np.testing.assert_allclose(merged.T_map_place[:, :2, 3], whole.T_map_place[:, :2, 3], atol=1e-9)
@@ -46,13 +51,13 @@ def test_a_merged_map_has_the_places_of_one_built_at_once(merged, whole):
 
 
 def test_the_ground_under_each_place_stays_where_it_was(merged, whole):
-    ground = [b.T_map_place[:, 2, 3] - b.manifest.lidar_height_m for b in (merged, whole)]
-    np.testing.assert_allclose(*ground, atol=1e-9)
+    one, other = (b.T_map_place[:, 2, 3] - b.manifest.lidar_height_m for b in (merged, whole))
+    np.testing.assert_allclose(one, other, atol=1e-9)
 
 
 def test_its_cloud_is_that_of_both_drives(merged, whole):
     assert len(merged.cloud.surfels) == len(whole.cloud.surfels)
-    distance, nearest = cKDTree(positions(whole)).query(positions(merged))
+    distance, nearest = nearest_of(positions(whole), positions(merged))
     assert distance.max() < 1e-4
     a, b = merged.cloud.surfels, whole.cloud.surfels[nearest]
     np.testing.assert_array_equal(a["points"], b["points"])
@@ -90,7 +95,7 @@ def test_a_map_merged_with_itself_gains_no_place_and_no_voxel(half_maps, tmp_pat
 
 
 def test_merging_twice_gives_the_same_version(half_maps, merged, tmp_path):
-    assert merge_maps(*half_maps, tmp_path / "again").version == merged.manifest.version
+    assert merge_maps(half_maps[0], half_maps[1], tmp_path / "again").version == merged.manifest.version
 
 
 def test_bundles_without_sums_merge_by_their_surfels(half_maps, whole, tmp_path):
@@ -102,9 +107,10 @@ def test_bundles_without_sums_merge_by_their_surfels(half_maps, whole, tmp_path)
         write_bundle(tmp_path / f"old{number}", content)
         assert parts.STATISTICS_FILE not in MapBundle.open(tmp_path / f"old{number}").manifest.files
         old.append(tmp_path / f"old{number}")
-    merge_maps(*old, tmp_path / "m")
+    merge_maps(old[0], old[1], tmp_path / "m")
     found = MapBundle.open(tmp_path / "m")
-    distance, nearest = cKDTree(positions(whole)).query(positions(found))
+    assert found.cloud is not None
+    distance, nearest = nearest_of(positions(whole), positions(found))
     assert np.percentile(distance, 95) < 0.01
     cosine = np.abs((found.cloud.surfels["normal"] * whole.cloud.surfels["normal"][nearest]).sum(axis=1))
     assert np.median(cosine) > 0.98
@@ -152,7 +158,7 @@ def test_what_is_no_bundle_is_refused(half_maps, tmp_path):
 def test_a_name_that_is_taken_is_refused_before_any_work(half_maps, tmp_path):
     told = []
     with pytest.raises(BundleError, match="already"):
-        merge_maps(*half_maps, tmp_path, report=lambda *event: told.append(event))
+        merge_maps(half_maps[0], half_maps[1], tmp_path, report=lambda *event: told.append(event))
     assert told == []
 
 
@@ -196,6 +202,7 @@ def collection(**names):
 
 def test_streets_of_both_are_there_once():
     found = joined_streets(collection(a="A", b="B"), collection(b="B", c="C"))
+    assert found is not None
     assert [f["properties"]["id"] for f in found["features"]] == ["a", "b", "c"]
     assert joined_streets(None, collection(a="A")) == collection(a="A")
     assert joined_streets(collection(a="A"), None) == collection(a="A")
@@ -249,7 +256,7 @@ def test_the_manifest_is_of_the_same_format(merged):
 
 def test_brightness_of_a_merged_map_is_that_of_both_surveys(merged, whole):
     """The mean over the returns of both, whichever survey they are of."""
-    distance, nearest = cKDTree(positions(whole)).query(positions(merged))
+    distance, nearest = nearest_of(positions(whole), positions(merged))
     same = distance < 1e-4
     assert same.mean() > 0.95
     one, other = merged.cloud.brightness[same], whole.cloud.brightness[nearest[same]]

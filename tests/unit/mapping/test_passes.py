@@ -1,6 +1,7 @@
 """What moved between passes: a street worked by hand, and a simulated one."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ def voted(tmp_path, *, cars, earlier=None):
     """The street driven once for each flag of ``cars``; the cloud before and after the vote."""
     poses = drive(len(cars))
     each = len(poses) // len(cars)
-    dataset = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=cars[number // each]))
+    dataset: Any = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=cars[number // each]))
     cloud = VoxelMap(0.3, np.zeros(3))
     for number, T in enumerate(poses):
         points = dataset.scan(number)[:, :3].astype(np.float64)
@@ -111,7 +112,7 @@ def test_traffic_of_a_single_pass_vanishes_and_all_that_stands_stays(tmp_path):
     """A van drives on 10 m ahead, in the lane to the right; the parked car is there in every scan."""
     poses = along(np.arange(0.0, 41.0, 2.0))
     vans = [(np.array([x + 10.0, -4.0, 0.3]), np.array([x + 14.0, -2.0, 2.3])) for x in poses[:, 0, 3]]
-    dataset = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=True, van=vans[number]))
+    dataset: Any = SimpleNamespace(scan=lambda number: scan_of(poses[number], car=True, van=vans[number]))
     cloud = VoxelMap(0.3, np.zeros(3))
     for number, T in enumerate(poses):
         points = dataset.scan(number)[:, :3].astype(np.float64)
@@ -139,7 +140,7 @@ def test_two_new_passes_overrule_what_the_map_had(tmp_path_factory):
     sides[:, 1] = BOX[0][1]  # the side that looks at the street
     for new_passes, share in ((2, 0.8), (1, 0.0)):
         poses = drive(new_passes)
-        dataset = SimpleNamespace(scan=lambda number, poses=poses: scan_of(poses[number], car=False))
+        dataset: Any = SimpleNamespace(scan=lambda number, poses=poses: scan_of(poses[number], car=False))
         cloud = VoxelMap(0.3, np.zeros(3))
         cloud.add(sides)
         earlier = cloud.sums()[0].copy()

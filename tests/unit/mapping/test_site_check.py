@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 from model_training.mapping import site_check
 from model_training.mapping.site_check import FEWEST, MOST, HeldScan, held_out, site_of
+from service.confidence.features import FEATURES
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
 from service.imaging.view_grid import ViewGrid
-from service.maps.calibration import FEATURES, probability
+from service.maps.calibration import probability
 from service.registration.kernel import SURFEL
 from service.registration.surfel_map import SurfelMap
 
@@ -74,6 +75,7 @@ def test_without_some_places_their_views_are_gone_and_the_others_are_renumbered(
     np.testing.assert_array_equal(left.view_heading_rad, content.view_heading_rad[views])
     np.testing.assert_array_equal(left.view_place, np.repeat(np.arange(10), 4))
     assert left.calibration["calibrated"] is False
+    assert left.cloud is not None
     assert left.cloud.surfels is content.cloud.surfels
     assert len(content.T_map_place) == 12
 
@@ -100,7 +102,9 @@ def test_the_maps_brightness_is_not_asked(content):
     """The pictures are drawn of the same sensor's intensities: they would agree as no camera's do."""
     cloud = SurfelMap.prepare(np.zeros(3), np.zeros(4, SURFEL), np.zeros((0, 4)), np.ones(4, np.float32))
     lit = replace(content, cloud=cloud)
-    assert site_check._without(lit, {1}).cloud.brightness is None
+    left = site_check._without(lit, {1}).cloud
+    assert left is not None
+    assert left.brightness is None
     assert lit.cloud.brightness is not None
 
 

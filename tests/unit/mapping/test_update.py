@@ -1,5 +1,6 @@
 import json
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,14 +9,15 @@ from scipy.spatial import cKDTree
 from model_training.datasets.dataset import Dataset
 from model_training.mapping import places, update
 from model_training.mapping.area import CELL_M, covered_by, polygon_of
+from model_training.mapping.passes import moved
 from model_training.mapping.stored_map import voxels_of
 from model_training.mapping.update import update_map
 from model_training.mapping.verify import damage_of
 from model_training.mapping.work import work_folder
 from service.errors import BundleError, DatasetError
 from service.localization.localizer import Localizer
-from service.localization.query import Query
 from service.maps.reader import MapBundle
+from service.retrieval.query import Query
 
 
 def positions(bundle):
@@ -39,7 +41,8 @@ def test_a_map_extended_by_the_second_half_is_the_map_of_the_whole(extended, who
     np.testing.assert_allclose(extended.T_map_place[:, :2, 3], whole.T_map_place[:, :2, 3], atol=1e-9)
     views = np.arange(len(whole.views))
     np.testing.assert_allclose(extended.view_index.vectors(views), whole.view_index.vectors(views), atol=1e-6)
-    distance, _ = cKDTree(positions(whole)).query(positions(extended))
+    tree: Any = cKDTree(positions(whole))
+    distance, _ = tree.query(positions(extended))
     assert len(positions(extended)) == len(positions(whole))
     assert distance.max() < 1e-4
 
@@ -60,8 +63,8 @@ def test_the_same_drive_again_adds_no_place(small_map, small_dataset, tmp_path):
     update_map(small_map, small_dataset, tmp_path / "m", threads=1)
     again, once = MapBundle.open(tmp_path / "m"), MapBundle.open(small_map)
     np.testing.assert_allclose(again.T_map_place, once.T_map_place, atol=1e-12)
-    cells = [voxels_of(bundle).statistics()["cell"] for bundle in (again, once)]
-    np.testing.assert_array_equal(*cells)
+    one, other = (voxels_of(bundle).statistics()["cell"] for bundle in (again, once))
+    np.testing.assert_array_equal(one, other)
 
 
 @pytest.fixture(scope="module")
@@ -264,21 +267,18 @@ def test_votes_are_recorded_only_where_both_drives_had_them(half_maps, halves, m
     )
 
 
-def test_a_drive_too_far_from_the_map_is_refused(half_maps, halves, tmp_path):
-    class Far(type(halves[1])):
-        def survey_poses(self):
-            poses = super().survey_poses()
-            poses[:, 1, 3] += 300_000.0
-            return poses
-
+def test_a_drive_too_far_from_the_map_is_refused(half_maps, halves, tmp_path, monkeypatch):
+    poses = halves[1].survey_poses()
+    poses[:, 1, 3] += 300_000.0
+    monkeypatch.setattr(halves[1], "survey_poses", lambda: poses)
     with pytest.raises(DatasetError, match=r"scan \d+ lies 300 km from the middle of the map"):
-        update_map(half_maps[0], Far(halves[1].folder, halves[1].numbers), tmp_path / "m", threads=1)
+        update_map(half_maps[0], halves[1], tmp_path / "m", threads=1)
 
 
 def test_a_drive_is_cleared_of_traffic_if_the_maps_was(halves, map_of, tmp_path, monkeypatch):
     """And where the map was built without, the update is, too; what is said of the map holds of all of its drives."""
     asked = []
-    real = update.moved
+    real = moved
 
     def listening(*args, each_scan=False, **more):
         asked.append(each_scan)

@@ -1,11 +1,14 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from model_training.mapping.voxel_map import TILE_M, VOXEL, VOXEL_WITHOUT_BRIGHTNESS, VoxelMap, lattice_origin
+from model_training.mapping.voxel_map import VOXEL, VOXEL_WITHOUT_BRIGHTNESS, VoxelMap, lattice_origin
 from service.errors import DatasetError
+from service.registration.surfel_map import TILE_M
 
 
 def map_of(*clouds, voxel_m=0.5, origin=(100.0, -50.0, 2.0)):
@@ -98,7 +101,8 @@ def test_tiles_hold_every_surfel_once_and_within_their_edges():
     own, rows, _ = voxels.tiles(surfels)
     assert rows[:, 3].sum() == len(own) == len(surfels.positions)
     np.testing.assert_array_equal(rows[:, 2], np.r_[0, np.cumsum(rows[:, 3])[:-1]])
-    distance, nearest = cKDTree(own["xyz"] + voxels.origin).query(surfels.positions)
+    tree: Any = cKDTree(own["xyz"] + voxels.origin)
+    distance, nearest = tree.query(surfels.positions)
     assert distance.max() < 1e-4
     assert len(set(nearest.tolist())) == len(own)
     inside = own["xyz"][:, :2] - np.repeat(rows[:, :2], rows[:, 3].astype(int), axis=0)
@@ -184,7 +188,7 @@ def test_statistics_of_an_older_map_say_nothing_of_brightness(cloud):
     near = lattice_origin(0.5, np.array([98.0, -50.0, 1.0]))
     whole = lit(cloud, np.ones(len(cloud)), origin=near).statistics()
     older = np.zeros(len(whole), VOXEL_WITHOUT_BRIGHTNESS)
-    for name in older.dtype.names:
+    for name in older.dtype.names or ():
         older[name] = whole[name]
     read = VoxelMap(0.5, near)
     read.add_statistics(older)

@@ -164,6 +164,7 @@ def holder(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", _HOLDER, str(tmp_path / "m")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
+    assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
     yield process
     process.kill()
@@ -219,7 +220,7 @@ def test_a_killed_build_with_votes_and_a_site_check_ends_with_the_same_bytes(
     small_dataset, encoder_file, small_chunks, calibration_file_of, tmp_path, monkeypatch
 ):
     from model_training.mapping import site_check
-    from service.localization.encoder import Encoder
+    from service.retrieval.encoder import Encoder
 
     monkeypatch.setattr(site_check, "_EACH", 4)
     monkeypatch.setattr(site_check, "FEWEST", 2)
@@ -237,5 +238,7 @@ def test_a_killed_build_with_votes_and_a_site_check_ends_with_the_same_bytes(
     build_map(small_dataset, encoder_file, tmp_path / "b", settings, threads=1)
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
     bundle = MapBundle.open(tmp_path / "b")
+    assert bundle.calibration is not None
+    assert bundle.calibration.site is not None
     assert bundle.calibration.site.queries >= 2
     assert bundle.manifest.parameters["passes_vote"] == 1.0

@@ -22,6 +22,8 @@ def test_what_is_written_is_what_is_opened(content: BundleContent, bundle_path: 
     np.testing.assert_array_equal(bundle.place_street, content.place_street)
     np.testing.assert_array_equal(bundle.view_place, content.view_place)
     np.testing.assert_array_equal(bundle.view_heading_rad, content.view_heading_rad)
+    assert content.cloud is not None
+    assert bundle.cloud is not None
     written = content.cloud.arrays()
     assert bundle.cloud.arrays().keys() == written.keys()
     for name, array in bundle.cloud.arrays().items():
@@ -37,9 +39,11 @@ def test_what_is_written_is_what_is_opened(content: BundleContent, bundle_path: 
 
 def test_arrays_are_mapped_and_read_only(bundle_path: Path) -> None:
     bundle = MapBundle.open(bundle_path)
+    cloud = bundle.cloud
     assert isinstance(bundle.places, np.memmap)
+    assert cloud is not None
     with pytest.raises(ValueError, match="read-only"):
-        bundle.cloud.surfels["xyz"][0] = 1
+        cloud.surfels["xyz"][0] = 1
 
 
 def test_a_map_may_have_no_streets(content_of: Callable[..., BundleContent], tmp_path: Path) -> None:

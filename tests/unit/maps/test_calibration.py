@@ -5,18 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.confidence.features import FEATURES, RIVALRY, UNWEIGHED
 from service.errors import BundleError
-from service.maps.calibration import (
-    FEATURES,
-    RIVALRY,
-    UNWEIGHED,
-    Calibration,
-    Logistic,
-    expanded,
-    probability,
-    read_calibration,
-    terms,
-)
+from service.maps.calibration import Calibration, Logistic, expanded, probability, read_calibration, terms
 from service.maps.content import UNCALIBRATED
 
 COUNT, NOISE = len(FEATURES), FEATURES.index("log_noise")
@@ -84,9 +75,9 @@ def test_a_document_that_is_neither_is_refused_with_the_file_the_reason_and_what
     assert error.value.field == "calibration.json"
 
 
-@pytest.mark.parametrize("features", [FEATURES[::-1], FEATURES[:-1], (*FEATURES, "more"), ()])
-def test_a_calibration_of_other_features_is_refused(document, features):
-    refused(document | {"features": list(features)}, "features are not this program's: margin, inliers")
+@pytest.mark.parametrize("features", [FEATURES[:-1], (*FEATURES, "more"), ()])
+def test_a_calibration_of_another_number_of_features_is_refused(document, features):
+    refused(document | {"features": list(features)}, f"right: mean and spread need {len(features)} numbers")
 
 
 def test_thresholds_that_do_not_rise_are_refused(document):
@@ -101,7 +92,7 @@ def test_a_calibration_without_thresholds_is_refused(document):
 @pytest.mark.parametrize("part", ["right", "known"])
 def test_a_regression_of_another_length_is_refused(document, part, name, length):
     document[part][name] = [1.0] * length
-    refused(document, f"{part}: .*mean and spread need {COUNT} numbers, weights {TERMS}")
+    refused(document, f"{part}: mean and spread need {COUNT} numbers, weights {TERMS}")
 
 
 @pytest.mark.parametrize("spread", [0.0, -1.0])
@@ -238,6 +229,7 @@ def test_every_feature_has_a_name_of_its_own_and_those_of_rivalry_and_the_unweig
 
 
 def test_a_calibration_cannot_be_changed(calibration_of):
-    calibration: Calibration = calibration_of()
+    calibration = calibration_of()
+    assert isinstance(calibration, Calibration)
     with pytest.raises(ValueError, match="frozen"):
-        calibration.site = None
+        calibration.site = None  # type: ignore[misc]  # that is the point

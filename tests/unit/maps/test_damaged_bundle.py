@@ -13,6 +13,7 @@ from service.errors import BundleError
 from service.maps import reader
 from service.maps.manifest import Manifest
 from service.maps.reader import MapBundle
+from service.maps.writer import sha256_of
 
 NEEDED = ["encoder.onnx", "views.faiss", "places.npy", "views.npy", "calibration.json"]
 FILES = [*NEEDED, "streets.geojson", "cloud/surfels.npy"]
@@ -66,7 +67,7 @@ def test_a_file_that_vanishes_while_the_bundle_is_opened_is_refused(
 ) -> None:
     """As when an operator removes it: all files were there when they were looked at."""
 
-    def looked_at(*arguments: object, **changed: object) -> None:
+    def looked_at(*arguments: Any, **changed: Any) -> None:
         original(*arguments, **changed)
         (bundle_copy / name).unlink()
 
@@ -85,7 +86,7 @@ def test_a_file_that_vanishes_while_it_is_compared_is_refused(
             path.unlink()
         return original(path)
 
-    original = reader.sha256_of
+    original = sha256_of
     monkeypatch.setattr(reader, "sha256_of", compare)
     with pytest.raises(BundleError, match=f"{name}: it cannot be read"):
         MapBundle.open(bundle_copy)

@@ -39,18 +39,38 @@ def test_a_list_longer_than_the_map_is_all_of_it(tmp_path: Path) -> None:
     assert ViewIndex.open(tmp_path / "i").shortlist(unit_vectors(1, 8)[0], 50).tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("descriptors", [np.zeros((3, 8), np.float32), np.zeros((0, 8), np.float32)])
-def test_descriptors_of_nothing_do_no_harm(tmp_path: Path, descriptors) -> None:
-    write_index(tmp_path / "i", descriptors)
-    assert len(ViewIndex.open(tmp_path / "i").shortlist(np.zeros(8, np.float32), 2)) == min(2, len(descriptors))
+@pytest.mark.parametrize("count", [0, 3, 1500])
+def test_descriptors_of_nothing_do_no_harm(tmp_path: Path, count: int) -> None:
+    write_index(tmp_path / "i", np.zeros((count, 8), np.float32))
+    assert len(ViewIndex.open(tmp_path / "i").shortlist(np.zeros(8, np.float32), 2)) == min(2, count)
 
 
 def test_the_coarse_copy_is_made_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    descriptors = unit_vectors(200, 32)
+    descriptors = unit_vectors(1200, 32)
     write_index(tmp_path / "i", descriptors)
     whole = ViewIndex.open(tmp_path / "i").shortlist(descriptors[3], 20)
     monkeypatch.setattr("service.maps.index._CHUNK", 64)
     np.testing.assert_array_equal(ViewIndex.open(tmp_path / "i").shortlist(descriptors[3], 20), whole)
+
+
+def test_a_few_views_are_compared_exactly(tmp_path: Path) -> None:
+    descriptors = unit_vectors(999, 32)
+    write_index(tmp_path / "i", descriptors)
+    listed = ViewIndex.open(tmp_path / "i").shortlist(descriptors[3], 20)
+    np.testing.assert_array_equal(listed, np.argsort(-(descriptors @ descriptors[3]))[:20])
+
+
+def test_a_part_of_the_views_determines_the_axes_of_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Descriptors of trained encoders have a common part, and most of the rest lies along a few axes."""
+    rng = np.random.default_rng(3)
+    descriptors = rng.normal(size=(3000, 256)) * np.geomspace(1, 1e-6, 256) + rng.normal(size=256)
+    descriptors = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
+    write_index(tmp_path / "i", descriptors)
+    monkeypatch.setattr("service.maps.index._SAMPLE", 500)
+    index = ViewIndex.open(tmp_path / "i")
+    for query in descriptors[:5]:
+        best = np.argsort(-(descriptors @ query))[:20]
+        assert set(best.tolist()) <= set(index.shortlist(query, 120).tolist())
 
 
 def test_opening_limits_faiss_to_one_thread(tmp_path: Path) -> None:
@@ -86,18 +106,3 @@ def test_descriptors_that_are_no_numbers_are_refused(tmp_path: Path, value: floa
     write_index(tmp_path / "i", descriptors)
     with pytest.raises(BundleError, match="not finite"):
         ViewIndex.open(tmp_path / "i")
-
-
-def test_the_coarse_copy_has_no_more_numbers_than_the_descriptors_need(tmp_path: Path) -> None:
-    few = (
-        np.random.default_rng(3).normal(size=(300, 5))
-        @ np.linalg.qr(np.random.default_rng(4).normal(size=(64, 5)))[0].T
-    )
-    descriptors = (few / np.linalg.norm(few, axis=1, keepdims=True)).astype(np.float32)
-    write_index(tmp_path / "few", descriptors)
-    write_index(tmp_path / "all", unit_vectors(300, 64))
-    index = ViewIndex.open(tmp_path / "few")
-    assert index.coarse_numbers == 16
-    assert ViewIndex.open(tmp_path / "all").coarse_numbers == 64
-    best = np.argsort(-(descriptors @ descriptors[7]))[:10]
-    assert set(best) <= set(index.shortlist(descriptors[7], 20).tolist())

@@ -1,5 +1,7 @@
 """Odometry on a hall whose every pose is known; loops by descriptors that are turned; a pose graph on a square."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -87,8 +89,12 @@ def test_a_place_that_was_turned_is_known_with_its_turn(turn):
     assert likeness[0] < 0.5
 
 
+#: Of a keyframe whose scan is never read.
+NO_LEVEL: Any = None
+
+
 def keyframe(index, T, descriptors=None):
-    return Keyframe(index, 0.1 * index, T, float(index), None, 0.0, descriptors)
+    return Keyframe(index, 0.1 * index, T, float(index), NO_LEVEL, 0.0, descriptors)
 
 
 def square(*, turn_rad_m=0.0, stretch=1.0):
@@ -158,7 +164,7 @@ def test_a_place_that_is_only_alike_is_not_registered(tmp_path):
     """Two places far apart by odometry, whose views are the same: too far for drift, so no loop is looked for."""
     views = np.ones((24, 8), np.float32) / np.sqrt(8).astype(np.float32)
     near, far = (transform_from(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 100.0))
-    keyframes = (keyframe(0, near, views), Keyframe(4, 1.0, far, 100.0, None, 0.0, views))
+    keyframes = (keyframe(0, near, views), Keyframe(4, 1.0, far, 100.0, NO_LEVEL, 0.0, views))
     drive = Drive(np.array([0.0, 1.0]), np.stack([near, far]), keyframes, tmp_path)
     told = []
     assert find_loops(drive, LoopSettings(every=1), report=lambda *each: told.append(each)) == []

@@ -1,5 +1,6 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,9 @@ from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_x, rotation_y, rotation_z
 from service.registration.kernel import STATE, QueryPoints, SolverOptions, align, nearest_grid
+
+#: A fixture of two values: grid and surfels, or rotation and position.
+Pair = tuple[Any, Any]
 
 
 def turned(R, *, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
@@ -47,6 +51,27 @@ def test_from_a_metre_and_five_degrees_away_the_true_pose_comes_back(
     assert found["inliers"] > 0.98
 
 
+@pytest.mark.parametrize(("away_m", "most", "converged"), [(0.3, 1, False), (0.0, 20, True)])
+def test_a_state_tells_how_the_solver_ended(street_map, seen, pose, start_at, away_m, most, converged):
+    """One step of a decimetre has not converged; at the true pose the solver stops long before its last iteration."""
+    states = start_at(pose[0], pose[1] + [away_m, 0.0, 0.0])
+    options = SolverOptions(iterations=most, reach=1.2, robust_first=0.06, robust_last=0.06)
+    align(street_map.grid, street_map.surfels, seen, states, options)
+    assert bool(states["converged"][0]) == converged
+    assert (4 < states["iterations"][0] < most) if converged else states["iterations"][0] == 1
+
+
+def test_the_error_is_half_the_weighted_squared_distance(street_map, points_at, start_at):
+    """One point 0.1 m in front of a facade, square to it, with 0.05 m of noise and a kernel so wide that it has no effect."""
+    points = points_at([[0.0, 5.9, 0.0]], sigma=0.05)
+    states = start_at(np.eye(3), np.array([0.0, 0.0, 1.5]))
+    options = SolverOptions(iterations=1, reach=1.2, robust_first=1e6, robust_last=1e6, surface=0.0, prior_weight=1e9)
+    align(street_map.grid, street_map.surfels, points, states, options)
+    thickness_m, ratio = 0.01, 6.0 / 5.9  # the variance is taken where the ray meets the facade
+    expected = 0.5 * 0.1**2 / (0.05**2 * ratio**3 + thickness_m**2)
+    assert states["error"][0] == pytest.approx(expected, rel=1e-3)
+
+
 def test_a_turned_frame_stays_a_rotation(street_map, seen, pose, start_at, settle):
     found = settle(street_map, seen, start_at(turned(pose[0], yaw_deg=5), pose[1] + 0.4))[0]["R"]
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
@@ -80,7 +105,7 @@ def test_what_is_not_free_stays(street_map, seen, pose, start_at, settle):
 def test_without_iterations_nothing_moves_and_the_score_alone_is_written(street_map, seen, pose, start_at):
     start = start_at(turned(pose[0], yaw_deg=3), pose[1] + 0.2, log_scale=0.01, offset=0.1)
     found = scored(street_map, seen, start)
-    for name in set(STATE.names) - {"inliers", "weight"}:
+    for name in set(STATE.names or ()) - {"inliers", "weight"}:
         np.testing.assert_array_equal(found[name], start[name])
     assert 0 < found["inliers"][0] < 1
 
@@ -107,7 +132,7 @@ STILL = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0
 ON_GROUND = [[1.0, 1, -1.5], [2, -2, -1.5], [-3, 1, -1.5], [0, 2, -1.5]]
 
 
-def share(plain, points, states, **options):
+def share(plain: Pair, points, states, **options):
     align(*plain, points, states, STILL, **options)
     return float(states["inliers"][0])
 
@@ -184,14 +209,14 @@ def test_a_car_that_has_moved_by_half_a_metre_hardly_moves_the_pose(street_map, 
     np.testing.assert_allclose(found["t"], pose[1], atol=0.03)
 
 
-def test_seen_is_the_weight_of_the_points_that_met_the_map(plain, points_at, start_at):
+def test_seen_is_the_weight_of_the_points_that_met_the_map(plain: Pair, points_at, start_at):
     points = points_at([*ON_GROUND, [1, 1, 4], [500, 0, 0]], weight=[1, 2, 3, 4, 50, 60])
     start = start_at(np.eye(3), [0, 0, 1.5])
     align(*plain, points, start, SolverOptions(iterations=1, reach=1.2, robust_first=1.0, robust_last=1.0))
     assert start["seen"][0] == 10
 
 
-def test_a_point_further_than_reach_from_its_surfel_is_left_out(plain, points_at, start_at):
+def test_a_point_further_than_reach_from_its_surfel_is_left_out(plain: Pair, points_at, start_at):
     """The grid reaches 1.2 m; the solver is told to look 0.5 m far."""
     points = points_at(ON_GROUND)
     near, far = start_at(np.eye(3), [0, 0, 1.9]), start_at(np.eye(3), [0, 0, 2.1])
@@ -220,7 +245,7 @@ def test_threads_do_not_disturb_each_other(street_map, seen, pose, start_at, set
     assert found == expected
 
 
-def test_no_points_move_nothing_and_score_zero(plain, points_at, start_at):
+def test_no_points_move_nothing_and_score_zero(plain: Pair, points_at, start_at):
     start = start_at(rotation_y(0.1), [1, 2, 3], anchor=[0, 0, 0])
     found = start.copy()
     align(*plain, points_at(np.zeros((0, 3))), found, SolverOptions(iterations=5, **PRIORS))
@@ -230,10 +255,10 @@ def test_no_points_move_nothing_and_score_zero(plain, points_at, start_at):
 
 
 LOST = [[300.0, 0, 0]] * 10  # meets no surfel: the priors alone move the start
-PRIORS = {"reach": 1.0, "robust_first": 1.0, "robust_last": 1.0, "free_offset": True}
+PRIORS: dict[str, Any] = {"reach": 1.0, "robust_first": 1.0, "robust_last": 1.0, "free_offset": True}
 
 
-def test_the_priors_alone_lead_to_the_anchor_without_scale_or_offset(plain, points_at, start_at):
+def test_the_priors_alone_lead_to_the_anchor_without_scale_or_offset(plain: Pair, points_at, start_at):
     start = start_at(rotation_z(0.4), [3, -4, 2], log_scale=0.01, offset=0.2, anchor=[1, 2, 1.5])
     align(*plain, points_at(LOST), start, SolverOptions(iterations=1, **PRIORS))
     np.testing.assert_allclose(start["t"][0], [1, 2, 1.5], atol=1e-9)
@@ -243,7 +268,9 @@ def test_the_priors_alone_lead_to_the_anchor_without_scale_or_offset(plain, poin
 
 @pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.1, -0.05, 0.99]])
 @pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(4, 0), (0, 4), (-3, 2)])
-def test_the_priors_alone_stand_the_query_upright_on_the_ground(plain, points_at, start_at, roll_deg, pitch_deg, up):
+def test_the_priors_alone_stand_the_query_upright_on_the_ground(
+    plain: Pair, points_at, start_at, roll_deg, pitch_deg, up
+):
     up = np.array(up) / np.linalg.norm(up)
     leaning = turned(rotation_z(0.7), roll_deg=roll_deg, pitch_deg=pitch_deg)
     start = start_at(leaning, [0, 0, 1.5], up=up)
@@ -252,13 +279,13 @@ def test_the_priors_alone_stand_the_query_upright_on_the_ground(plain, points_at
     assert np.arctan2(start["R"][0][1, 0], start["R"][0][0, 0]) == pytest.approx(0.7, abs=0.01)
 
 
-def test_a_step_turns_by_a_tenth_of_a_radian_at_most(plain, points_at, start_at):
+def test_a_step_turns_by_a_tenth_of_a_radian_at_most(plain: Pair, points_at, start_at):
     start = start_at(rotation_y(0.5), [0, 0, 1.5])
     align(*plain, points_at(LOST), start, SolverOptions(iterations=1, **PRIORS))
     np.testing.assert_allclose(start["R"][0], rotation_y(0.4), atol=1e-9)
 
 
-def test_the_height_prior_gives_way_to_what_the_points_say(plain, points_at, start_at):
+def test_the_height_prior_gives_way_to_what_the_points_say(plain: Pair, points_at, start_at):
     """The anchor says 1.7 m; all points say 1.5 m, each as surely as 3 cm against a twentieth of 15 cm."""
     rng = np.random.default_rng(7)
     points = points_at(np.c_[rng.uniform(-4, 4, (200, 2)), np.full(200, -1.5)], sigma=0.0)

@@ -1,6 +1,7 @@
 """The kernel looks points up 32 at a time: nothing it finds may depend on where one batch ends and the next begins."""
 
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ AROUND_A_BATCH = [0, 1, 2, 31, 32, 33, 63, 64, 65, 96, 97]
 SOLVE = SolverOptions(iterations=8, reach=1.2, robust_first=0.8, robust_last=0.1, free_offset=True)
 ONE_STEP = SolverOptions(iterations=1, reach=1.2, robust_first=0.5, robust_last=0.5, free_offset=True)
 STILL = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
-SUM = {"rtol": 1e-9, "atol": 1e-6}  # sums of up to 1e6 in another order
+SUM: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-6}  # sums of up to 1e6 in another order
 
 
 def joined(*parts):

@@ -1,6 +1,7 @@
 """A triangulating camera errs evenly in 1 / range: what it sees too near must not count for better measured than what it sees too far."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,11 @@ from hypothesis import strategies as st
 from service.geometry.rigid import rotation_z
 from service.registration.kernel import SURFEL, SolverOptions, align, nearest_grid
 
+#: A fixture of two values: grid and surfels, or rotation and position.
+Pair = tuple[Any, Any]
+
 #: No robust kernel, no surface's roughness: the points' own noise is all there is.
-FREE = {"reach": 1.2, "robust_first": 1e6, "robust_last": 1e6, "surface": 0.0, "prior_weight": 0.0}
+FREE: dict[str, Any] = {"reach": 1.2, "robust_first": 1e6, "robust_last": 1e6, "surface": 0.0, "prior_weight": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +26,7 @@ def one_surfel():
     return nearest_grid(surfels, cell_m=0.3, reach_m=1.2), surfels
 
 
-def known(one_surfel, points, start, **options):
+def known(one_surfel: Pair, points, start, **options):
     """How much one iteration learns of x."""
     align(*one_surfel, points, start, SolverOptions(**(FREE | options), iterations=1))
     return start["information"][0, 0, 0]
@@ -118,7 +122,7 @@ def test_noise_that_is_even_in_inverse_range_draws_no_wall_nearer(
 
 
 @pytest.mark.parametrize("distance_m", [2.5, 4.0, 5.0])
-def test_a_narrow_robust_kernel_damps_both_halves_of_the_noise_alike(wall, points_at, start_at, distance_m):
+def test_a_narrow_robust_kernel_damps_both_halves_of_the_noise_alike(wall: Pair, points_at, start_at, distance_m):
     """Errors of 0.8 standard deviations: of larger ones a kernel that lets go chooses a half, which no symmetry forbids."""
     start = start_at(np.eye(3), [0.01 - distance_m, 0, 0])
     kernel = {"robust_first": 1e-3, "robust_last": 1e-3, "prior_weight": 1e-6}

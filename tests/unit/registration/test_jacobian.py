@@ -1,5 +1,7 @@
 """The kernel's derivatives against numerical ones, on surfels so lonely that every point keeps its own."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from service.registration.kernel import SURFEL, QueryPoints, SolverOptions, align, nearest_grid, pulls
 
 UNKNOWNS = ["x", "y", "z", "roll", "pitch", "yaw", "log scale", "disparity offset"]
-FREE = {"reach": 1.0, "robust_first": 1e6, "robust_last": 1e6, "prior_weight": 0.0, "free_offset": True}
+FREE: dict[str, Any] = {"reach": 1.0, "robust_first": 1e6, "robust_last": 1e6, "prior_weight": 0.0, "free_offset": True}
 
 
 class Problem:

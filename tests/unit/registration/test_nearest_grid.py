@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -34,7 +36,8 @@ def test_every_cell_within_reach_holds_its_nearest_surfel_and_every_other_none(s
     surfels = surfels_at(rng.uniform(-500, 500, 3) + rng.uniform(0, extent_m, (count, 3)))
     centres, found = cells_of(nearest_grid(surfels, cell_m=cell_m, reach_m=reach_m))
     xyz = surfels["xyz"].astype(np.float64)
-    distance, _ = cKDTree(xyz).query(centres)
+    tree: Any = cKDTree(xyz)
+    distance, _ = tree.query(centres)
     held = found >= 0
     assert held[distance < reach_m - 1e-4].all()
     assert not held[distance > reach_m + 1e-4].any()

@@ -1,6 +1,7 @@
 """What each patch of a picture pulls a pose by; against numerical derivatives in ``test_jacobian``."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,9 @@ from hypothesis import strategies as st
 
 from service.geometry.rigid import rotation_z
 from service.registration.kernel import SURFEL, SolverOptions, align, nearest_grid, pulls
+
+#: A fixture of two values: grid and surfels, or rotation and position.
+Pair = tuple[Any, Any]
 
 OPTIONS = SolverOptions(iterations=1, reach=1.0, robust_first=1e6, robust_last=1e6, surface=0.1)
 
@@ -32,7 +36,7 @@ def numbers(*patch):
     return np.array(patch, np.int32)
 
 
-def test_the_pull_of_a_point_by_hand(wall, points_at, start_at):
+def test_the_pull_of_a_point_by_hand(wall: Pair, points_at, start_at):
     """0.1 m behind the wall, known to 0.1 m: a weight of 100, so 10 for each unit of the gradient.
 
     The gradient: the normal; (5.1, 0.3, -0.2) x (1, 0, 0) = (0, -0.2, -0.3); 5.1 of scale; and of the offset less 5.1 x 5.1 / 80.
@@ -43,7 +47,7 @@ def test_the_pull_of_a_point_by_hand(wall, points_at, start_at):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_pulls_of_opposite_residuals_meet_in_one_patch_and_show_in_two(wall, points_at, start_at):
+def test_pulls_of_opposite_residuals_meet_in_one_patch_and_show_in_two(wall: Pair, points_at, start_at):
     """0.1 m behind the wall and 0.1 m before it; a patch's own points may cancel, the patches of a picture do not."""
     points = points_at([[5.1, 0.3, 0], [4.9, 0.3, 0]], sigma=0.0, weight=[1, 3])
     start = start_at(np.eye(3), [-5.0, 0, 0])
@@ -57,14 +61,14 @@ def test_pulls_of_opposite_residuals_meet_in_one_patch_and_show_in_two(wall, poi
 @pytest.mark.parametrize(
     ("robust_m", "weight"), [(1e6, 100.0), (0.3, 100 * (0.13 / 0.14) ** 2), (1e-6, 100 * (0.04 / 0.05) ** 2)]
 )
-def test_the_robust_width_is_that_of_the_last_iteration(wall, points_at, start_at, robust_m, weight):
+def test_the_robust_width_is_that_of_the_last_iteration(wall: Pair, points_at, start_at, robust_m, weight):
     """However wide the first was; 0.1 m off, as in ``test_jacobian``."""
     options = replace(OPTIONS, robust_first=5.0, robust_last=robust_m, iterations=8)
     found = pulls(*wall, points_at([[5.1, 0, 0]], sigma=0.0), start_at(np.eye(3), [-5.0, 0, 0]), options, numbers(0))
     assert found[0, 0] == pytest.approx(0.1 * weight, rel=1e-4)
 
 
-def test_points_on_their_surface_pull_nowhere(ground, points_at, start_at):
+def test_points_on_their_surface_pull_nowhere(ground: Pair, points_at, start_at):
     """Exactly on it, in whatever numbers, and they do inform."""
     xy = np.random.default_rng(1).uniform(-5, 5, (100, 2))
     points, start = points_at(np.c_[xy, np.full(100, -1.5)]), start_at(rotation_z(0.3), [0, 0, 1.5])
@@ -74,7 +78,7 @@ def test_points_on_their_surface_pull_nowhere(ground, points_at, start_at):
     assert start["information"][0, 2, 2] > 100
 
 
-def test_points_that_meet_no_surface_within_reach_pull_nowhere(ground, points_at, start_at):
+def test_points_that_meet_no_surface_within_reach_pull_nowhere(ground: Pair, points_at, start_at):
     """The last three: 0.6 m above the ground where 0.5 m are looked at, beyond the grid, and of no weight."""
     near, start = [[1.0, 1, -1.4], [2, -2, -1.6]], start_at(np.eye(3), [0, 0, 1.5])
     options = replace(OPTIONS, reach=0.5)
@@ -86,7 +90,7 @@ def test_points_that_meet_no_surface_within_reach_pull_nowhere(ground, points_at
     assert pulls(*ground, points, start, replace(OPTIONS, reach=1.0), numbers(0, 1, 2, 2, 2))[2, 2] > 0
 
 
-def test_no_points_are_no_patches(ground, points_at, start_at):
+def test_no_points_are_no_patches(ground: Pair, points_at, start_at):
     none = points_at(np.zeros((0, 3)))
     assert pulls(*ground, none, start_at(np.eye(3), [0, 0, 1.5]), OPTIONS, numbers()).shape == (0, 8)
 

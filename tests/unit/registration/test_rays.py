@@ -62,6 +62,9 @@ def test_a_faultless_picture_is_put_where_it_was_taken(city, street, pose, away,
     assert np.linalg.norm(got.camera_m - ORIGIN - pose[1]) < 0.02
     assert Rotation.from_matrix(got.R_map_level @ pose[0].T).magnitude() < np.deg2rad(0.15)
     assert (got.hypothesis, got.inliers) == (3, 0.9)
+    assert 3 <= got.iterations <= 18
+    assert got.iterations % 3 == 0
+    assert got.converged
 
 
 def test_what_a_scorer_has_looked_up_already_is_not_looked_up_again(city, street, pose, monkeypatch):
@@ -217,7 +220,7 @@ def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
     met = [SurfelRaycaster(city, s).meet(state.camera_of(picture), CAMERA)] * len(pictures)
     got = rays._pull(city, pictures, met, state, s, scattered=True)
     J, r, w, patches = plain(city, picture, met[0], R, t, scale=scale, offset=offset, s=s)
-    H, b = J.T @ (J * w[:, None]), J.T @ (w * r)
+    H, b, error = J.T @ (J * w[:, None]), J.T @ (w * r), 0.5 * (w @ r**2)
     shift = np.where(movable, moved * picture.inverse.astype(float) ** 2, 0)[(met[0] >= 0) & (picture.inverse > 0)]
     for own in np.unique(patches[w > 0]):
         of = (patches == own) & (w > 0)
@@ -225,10 +228,11 @@ def test_the_normal_equations_are_those_with_one_more_unknown_for_every_patch(
         if common > 0:
             h, own_w, own_r = J[of].T @ w[of], w[of].sum(), w[of] @ r[of]
             share = 1 / (own_w + 1 / common)
-            H, b = H - share * np.outer(h, h), b - share * h * own_r
+            H, b, error = H - share * np.outer(h, h), b - share * h * own_r, error - 0.5 * share * own_r**2
     np.testing.assert_allclose(got.H, len(pictures) * H, rtol=1e-4, atol=1e-5 * np.abs(H).max())
     np.testing.assert_allclose(got.b, len(pictures) * b, rtol=1e-4, atol=1e-5 * np.abs(J.T * w * r).sum(axis=1).max())
     assert got.pixels == len(pictures) * (w > 0).sum()
+    assert got.error == pytest.approx(len(pictures) * error, rel=1e-4)
     assert np.linalg.eigvalsh(got.scatter).min() > -1e-6 * np.abs(got.scatter).max()
 
 

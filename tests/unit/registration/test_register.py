@@ -1,15 +1,19 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from service.geometry.rigid import rotation_y, rotation_z
+from service.geometry.rigid import rotation_y, rotation_z, transform_from
 from service.registration.kernel import QueryPoints, SolverOptions, align
-from service.registration.register import RegistrationSettings, Start, register
+from service.registration.register import Registered, RegistrationSettings, Start, register
+
+#: A fixture of two values: grid and surfels, or rotation and position.
+Pair = tuple[Any, Any]
 
 HEIGHT_M = 1.5
 STILL = SolverOptions(iterations=0, reach=1.2, robust_first=1.0, robust_last=1.0)
-NOTHING_MOVES = {"coarse": STILL, "middle": STILL, "fine": STILL, "turns_rad": ()}
+NOTHING_MOVES: dict[str, Any] = {"coarse": STILL, "middle": STILL, "fine": STILL, "turns_rad": ()}
 
 
 def start(R, camera_m, hypothesis, *, turned_deg=0.0, moved_m=(0.0, 0.0, 0.0)):
@@ -27,7 +31,7 @@ def measured(points, *, seed=2):
     return replace(points, xyz=points.xyz + noise[:, None] * points.ray)
 
 
-def test_a_query_is_registered_within_centimetres_on_a_surveyed_street(surveyed, seen, pose):
+def test_a_query_is_registered_within_centimetres_on_a_surveyed_street(surveyed, seen, pose: Pair):
     starts = [start(*pose, 0, turned_deg=4, moved_m=(1.0, -0.6, 0.1))]
     best = register(surveyed, measured(seen), starts, HEIGHT_M, RegistrationSettings())[0]
     np.testing.assert_allclose(best.camera_m, pose[1], atol=0.03)
@@ -36,13 +40,13 @@ def test_a_query_is_registered_within_centimetres_on_a_surveyed_street(surveyed,
     assert best.scale == pytest.approx(1, abs=2e-3)
 
 
-def test_the_depths_scale_is_estimated(surveyed, seen, pose):
+def test_the_depths_scale_is_estimated(surveyed, seen, pose: Pair):
     short = replace(seen, xyz=seen.xyz / np.float32(1.01))
     best = register(surveyed, short, [start(*pose, 0)], HEIGHT_M, RegistrationSettings())[0]
     assert best.scale == pytest.approx(1.01, abs=2e-3)
 
 
-def test_positions_are_the_maps_wherever_the_surfels_origin_lies(street, surveyed, seen, pose):
+def test_positions_are_the_maps_wherever_the_surfels_origin_lies(street, surveyed, seen, pose: Pair):
     moved = street.survey(origin=(3.0, -2.1, 0.6))
     one, other = (
         register(cloud, seen, [start(*pose, 0, turned_deg=2)], HEIGHT_M, RegistrationSettings())[0]
@@ -52,7 +56,7 @@ def test_positions_are_the_maps_wherever_the_surfels_origin_lies(street, surveye
     np.testing.assert_allclose(other.camera_m, pose[1], atol=0.03)
 
 
-def test_the_best_supported_start_comes_first_and_says_whose_it_was(surveyed, seen, pose):
+def test_the_best_supported_start_comes_first_and_says_whose_it_was(surveyed, seen, pose: Pair):
     starts = [
         start(*pose, 5, turned_deg=180),
         start(*pose, 2, moved_m=(9.0, 2.0, 0.0)),
@@ -72,7 +76,7 @@ def two_streets(scene_of, streets_at):
     return scene_of(*streets_at(-6.0, 0.0), *streets_at(-6.0, 40.0)).survey()
 
 
-def test_every_candidate_keeps_the_number_of_its_hypothesis(two_streets, seen, pose):
+def test_every_candidate_keeps_the_number_of_its_hypothesis(two_streets, seen, pose: Pair):
     here, there = start(*pose, 6, moved_m=(0.5, 0.3, 0.0)), start(*pose, 3, moved_m=(0.4, 40.3, 0.0))
     for starts in ([here, there], [there, here]):
         found = register(two_streets, seen, starts, HEIGHT_M, RegistrationSettings())
@@ -81,7 +85,7 @@ def test_every_candidate_keeps_the_number_of_its_hypothesis(two_streets, seen, p
             assert abs(each.camera_m[1] - (40.0 if each.hypothesis == 3 else 0.0)) < 5
 
 
-def test_the_starts_that_are_refined_stand_apart_and_are_few(surveyed, seen, pose):
+def test_the_starts_that_are_refined_stand_apart_and_are_few(surveyed, seen, pose: Pair):
     """Without further iterations the candidates lie where they were picked, and a single coarse one leaves them spread."""
     few = SolverOptions(iterations=1, reach=1.2, robust_first=0.8, robust_last=0.3, surface=0.1)
     starts = [start(*pose, k, moved_m=(0.9 * k, 0.2 * k, 0.0)) for k in range(6)]
@@ -127,7 +131,9 @@ def test_starts_are_turned_too_where_they_do_not_become_too_many(surveyed, seen,
     [({"kept": 4, "kept_of_each": (1, 5)}, 2), ({"kept": 5, "kept_of_each": (1, 5)}, 2), ({"kept": 6, "kept_of_each": (1, 5)}, 3),
      ({"kept": 2, "kept_of_each": (2, 5)}, 2), ({"kept": 40, "kept_of_each": (1, 4)}, 4)],
 )  # fmt: skip
-def test_so_many_starts_of_each_hypothesis_go_on_however_badly_another_fares(two_streets, seen, pose, options, kept):
+def test_so_many_starts_of_each_hypothesis_go_on_however_badly_another_fares(
+    two_streets, seen, pose: Pair, options, kept
+):
     """Nothing moves. Hypothesis 4 stands in the street, 9 in a field, where nothing is on the map."""
     starts = [start(*pose, 4), start(*pose, 9, moved_m=(500.0, 0.0, 0.0))]
     settings = RegistrationSettings(**NOTHING_MOVES, **options, refined=20)
@@ -138,7 +144,7 @@ def test_so_many_starts_of_each_hypothesis_go_on_however_badly_another_fares(two
     assert {each.inliers for each in found if each.hypothesis == 9} == {0.0}
 
 
-def test_the_starts_of_one_hypothesis_that_go_on_stand_apart(surveyed, seen, pose):
+def test_the_starts_of_one_hypothesis_that_go_on_stand_apart(surveyed, seen, pose: Pair):
     offsets = ((0.0, 0.0), (0.3, 0.0), (0.0, 0.3), (2.0, 0.0))
     settings = RegistrationSettings(**NOTHING_MOVES, offsets_m=offsets, kept_of_each=(3, 3), apart_m=0.5)
     found = register(surveyed, seen, [start(*pose, 0)], HEIGHT_M, settings)
@@ -146,7 +152,7 @@ def test_the_starts_of_one_hypothesis_that_go_on_stand_apart(surveyed, seen, pos
     assert away == [0, 2]
 
 
-def test_hypotheses_that_meet_are_refined_once(surveyed, seen, pose):
+def test_hypotheses_that_meet_are_refined_once(surveyed, seen, pose: Pair):
     """Two starts a metre apart both come to the true pose; one of them is carried to the end."""
     starts = [start(*pose, 0, moved_m=(0.5, 0.0, 0.0)), start(*pose, 1, moved_m=(-0.5, 0.0, 0.0))]
     settings = RegistrationSettings(offsets_m=((0.0, 0.0),), refined=4)
@@ -158,7 +164,7 @@ def test_hypotheses_that_meet_are_refined_once(surveyed, seen, pose):
 @pytest.mark.parametrize(("true", "beside"), [(0, 1), (1, 0), (7, 3)])
 @pytest.mark.parametrize(("weight", "true_goes_on"), [(0.0, True), (0.5, True), (2.0, False)])
 def test_the_similarity_that_a_start_had_helps_to_choose_which_go_to_the_end(
-    two_streets, seen, pose, weight, true_goes_on, true, beside
+    two_streets, seen, pose: Pair, weight, true_goes_on, true, beside
 ):
     """Nothing moves. One stands where the query was taken; the other, 2.5 m beside, fits worse and is 0.5 more similar."""
     starts = [
@@ -170,7 +176,7 @@ def test_the_similarity_that_a_start_had_helps_to_choose_which_go_to_the_end(
     assert [each.hypothesis for each in found] == [true if true_goes_on else beside]
 
 
-def test_the_middle_stage_moves_the_starts_by_its_own_options_and_points(surveyed, seen, pose, start_at):
+def test_the_middle_stage_moves_the_starts_by_its_own_options_and_points(surveyed, seen, pose: Pair, start_at):
     """With nothing else moving, the candidate lies where the solver leaves the start on every so manyth point."""
     options = SolverOptions(iterations=4, reach=1.2, robust_first=0.6, robust_last=0.1)
     settings = RegistrationSettings(
@@ -187,7 +193,7 @@ def test_the_middle_stage_moves_the_starts_by_its_own_options_and_points(surveye
 
 
 def test_the_fine_stage_lets_no_point_weigh_too_little_but_the_score_is_by_their_own_weights(
-    surveyed, seen, pose, start_at
+    surveyed, seen, pose: Pair, start_at
 ):
     """Nothing else moves. Every third point is trusted with a tenth only, until the end, when it weighs 0.7."""
     options = SolverOptions(iterations=5, reach=1.2, robust_first=0.6, robust_last=0.1)
@@ -215,14 +221,14 @@ def test_the_fine_stage_lets_no_point_weigh_too_little_but_the_score_is_by_their
     np.testing.assert_array_equal(points.weight, trusted)
 
 
-def test_points_of_the_ground_support_no_candidate(surveyed, seen, pose):
+def test_points_of_the_ground_support_no_candidate(surveyed, seen, pose: Pair):
     ground = seen.subset(np.flatnonzero(seen.xyz[:, 2] < 0.25 - HEIGHT_M))
     assert len(ground) > 100
     found = register(surveyed, ground, [start(*pose, 0)], HEIGHT_M, RegistrationSettings())
     assert [each.inliers for each in found] == [0.0] * len(found)
 
 
-def test_few_points_are_all_used_in_the_coarse_stage(surveyed, seen, pose):
+def test_few_points_are_all_used_in_the_coarse_stage(surveyed, seen, pose: Pair):
     few = seen.subset(np.arange(0, len(seen), 20))
     assert len(few) < RegistrationSettings().coarse_points
     best = register(surveyed, few, [start(*pose, 0, moved_m=(0.4, 0.4, 0.0))], HEIGHT_M, RegistrationSettings())[0]
@@ -237,7 +243,7 @@ def test_a_subset_holds_the_rows_asked_for(seen):
         np.testing.assert_array_equal(getattr(found, name), getattr(seen, name)[rows])
 
 
-def test_the_starts_given_are_not_changed(surveyed, seen, pose):
+def test_the_starts_given_are_not_changed(surveyed, seen, pose: Pair):
     given = start(*pose, 0, turned_deg=3, moved_m=(0.5, 0.5, 0.0))
     R, camera_m = given.R_map_level.copy(), given.camera_m.copy()
     register(surveyed, seen, [given], HEIGHT_M, RegistrationSettings())
@@ -249,3 +255,15 @@ def test_a_leaning_start_is_set_upright_on_its_walls(surveyed, seen, pose):
     leaning = Start(pose[0] @ rotation_y(np.deg2rad(2)), pose[1], 0)
     best = register(surveyed, seen, [leaning], HEIGHT_M, RegistrationSettings())[0]
     assert np.rad2deg(np.arccos(best.R_map_level[2, 2])) < 0.2
+
+
+def test_a_pose_of_another_frame_follows_from_that_of_the_reference():
+    """The other level frame stands 2 m ahead of the reference and is turned by 90 degrees."""
+    pose = Registered(
+        rotation_z(np.pi / 2), np.array([10.0, 5.0, 1.5]), 1.0, 0.0, 0.5, np.eye(8), 3, converged=True, iterations=8
+    )
+    other = pose.of_frame(transform_from(rotation_z(np.pi / 2), np.array([2.0, 0.0, 0.1])))
+    np.testing.assert_allclose(other.camera_m, [10.0, 7.0, 1.6], atol=1e-12)
+    np.testing.assert_allclose(other.R_map_level, rotation_z(np.pi), atol=1e-12)
+    np.testing.assert_array_equal(pose.T_map_level, transform_from(pose.R_map_level, pose.camera_m))
+    assert (other.hypothesis, other.inliers, other.converged, other.iterations) == (3, 0.5, True, 8)

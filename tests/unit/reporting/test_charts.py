@@ -1,29 +1,83 @@
 """Numbers as drawings."""
 
+import base64
 import re
+from xml.etree import ElementTree
 
+import matplotlib
 import numpy as np
 import pytest
 
-from model_training.reporting.charts import error_curve, recall_curves, reliability, series_of
+from model_training.reporting.charts import (
+    error_curve,
+    error_histogram,
+    recall_curves,
+    reliability,
+    series_of,
+    side_by_side,
+)
 from model_training.reporting.pictures import FARTHEST_M, depth_bgr
-from model_training.reporting.svg import Axis, Series, histogram, plot
 
-X = Axis("x", 0.0, 10.0, ((0.0, "0"), (10.0, "10")))
-
-
-def test_points_lie_where_their_axes_say():
-    drawn = plot("t", "w", X, X, [Series("a", np.array([[0.0, 0.0], [10.0, 10.0], [5.0, 20.0]]))])
-    assert re.search(r'points="52.0,254.0 466.0,10.0 259.0,10.0"', drawn)  # what is beyond stays on the frame
+SVG = "{http://www.w3.org/2000/svg}"
 
 
-def test_a_logarithmic_axis_spaces_by_factors():
-    axis = Axis("m", 0.01, 100.0, (), log=True)
-    np.testing.assert_allclose(axis.share(np.array([0.01, 0.1, 1.0, 100.0])), [0, 0.25, 0.5, 1])
+def svg_of(drawn: str) -> ElementTree.Element:
+    """The drawing inside an image of a page."""
+    content = re.fullmatch(r'<img class="plot" src="data:image/svg\+xml;base64,([^"]+)" alt="[^"]+">', drawn)
+    assert content is not None
+    return ElementTree.fromstring(base64.b64decode(content[1]))  # noqa: S314 - we wrote it
 
 
-def test_an_empty_histogram_is_drawn():
-    assert "<rect" not in histogram("t", "w", X, np.array([0.0, 5.0, 10.0]), np.array([0, 0]))
+def texts_of(svg: ElementTree.Element) -> list[str]:
+    return ["".join(each.itertext()).strip() for each in svg.iter(f"{SVG}text")]
+
+
+def test_a_chart_runs_and_loads_nothing_and_has_a_title(answers_of):
+    svg = svg_of(error_curve({"all": answers_of([[0, 0]], [[0.2, 0]])}))
+    assert {each.tag for each in svg.iter()} & {f"{SVG}script", f"{SVG}image", f"{SVG}foreignObject"} == set()
+    assert not [name for each in svg.iter() for name in each.attrib if name.startswith("on")]
+    links = [value for each in svg.iter() for name, value in each.attrib.items() if name.endswith("href")]
+    assert all(link.startswith("#") for link in links)
+    assert next(svg.iter(f"{SVG}title")).text == "Share of queries within a distance"
+
+
+def test_the_same_answers_give_the_same_bytes(answers_of):
+    runs = {"a": answers_of([[0, 0]] * 3, [[0.2, 0], [4, 0], [9, 0]]), "b": answers_of([[0, 0]], [[0.3, 0]])}
+    assert error_curve(runs) == error_curve(runs)
+    assert recall_curves(runs) == recall_curves(runs)
+
+
+def test_series_are_named_where_there_are_several(answers_of):
+    p = answers_of([[0, 0]], [[0.2, 0]])
+    assert "rain" not in texts_of(svg_of(error_curve({"rain": p})))
+    assert {"rain", "$a_b$ <1>"} <= set(texts_of(svg_of(error_curve({"rain": p, "$a_b$ <1>": p}))))
+
+
+def test_axes_are_in_metres_and_per_cent(answers_of):
+    told = texts_of(svg_of(error_curve({"all": answers_of([[0, 0]], [[0.2, 0]])})))
+    assert told[:7] == ["0.01", "0.1", "0.5", "1", "5", "20", "100"]
+    assert {"0", "100", "distance from the truth, m", "share of queries, %"} <= set(told)
+
+
+def test_settings_of_the_user_neither_change_nor_matter(answers_of, monkeypatch):
+    runs = {"all": answers_of([[0, 0]], [[0.2, 0]])}
+    drawn = error_curve(runs)
+    monkeypatch.setitem(matplotlib.rcParams, "lines.linewidth", 7.0)
+    before = dict(matplotlib.rcParams)
+    assert error_curve(runs) == drawn
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_a_histogram_without_answers_is_drawn(answers_of):
+    drawn = error_histogram(answers_of([[0, 0]], [[np.nan, np.nan]]))
+    assert "0 answers" in drawn
+    assert "queries" in texts_of(svg_of(drawn))
+
+
+def test_each_set_has_its_number_and_words_tell_its_share():
+    drawn = side_by_side({"rain & fog": (1.0, 0.9, 1.0 - 1e-12), "sun": (0.5, 0.4, 0.6)}, "within 1 m")
+    assert "rain &amp; fog 100.0% (90.0% to 100.0%); sun 50.0% (40.0% to 60.0%)" in drawn
+    assert texts_of(svg_of(drawn))[:2] == ["1", "2"]
 
 
 def test_words_tell_the_shares_within_distances(answers_of):

@@ -45,10 +45,11 @@ def opened(path: Path) -> Any:
     return SimpleNamespace(name="m", path=path, manifest=manifest_of(path))
 
 
-map_watcher._POLL_S = map_watcher._RETRY_S = workers.RESTART_S = 0.02  # type: ignore[misc]
-map_watcher.read_manifest = manifest_of
-map_watcher.MapBundle = SimpleNamespace(open=opened)  # type: ignore[misc,assignment]
-map_watcher.Localizer = SimpleNamespace(open=lambda bundle, **_: SimpleNamespace(bundle=bundle))  # type: ignore[misc,assignment]
+patched: Any = map_watcher
+patched._POLL_S = patched._RETRY_S = workers.RESTART_S = 0.02
+patched.read_manifest = manifest_of
+patched.MapBundle = SimpleNamespace(open=opened)
+patched.Localizer = SimpleNamespace(open=lambda bundle, **_: SimpleNamespace(bundle=bundle))
 
 
 def told(path: Path, text: str) -> None:

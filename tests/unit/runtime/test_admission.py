@@ -5,10 +5,11 @@ import weakref
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future
 
+import numpy as np
 import pytest
 
-from service.errors import BusyError
-from service.runtime.admission import Admission
+from service.errors import BusyError, RequestError, TooLargeError
+from service.runtime.admission import Admission, MemoryBudget
 
 
 @pytest.fixture
@@ -99,3 +100,79 @@ def test_a_closed_pool_refuses() -> None:
     admission.close()
     with pytest.raises(BusyError, match="shutting down"):
         admission.submit(lambda: None)
+
+
+def test_what_does_not_fit_beside_others_is_busy_and_what_never_fits_is_too_large() -> None:
+    budget = MemoryBudget(10)
+    with budget.hold() as one, budget.hold() as other:
+        one.grow(6)
+        with pytest.raises(BusyError):
+            other.grow(5)
+        other.grow(4)
+        with pytest.raises(TooLargeError):
+            one.grow(5)
+        assert (one.bytes, other.bytes, budget.held) == (6, 4, 10)
+        one.shrink_to(1)
+        other.grow(5)
+    assert budget.held == 0
+
+
+def test_work_that_goes_on_after_its_caller_keeps_its_memory() -> None:
+    budget, first, second = MemoryBudget(10), Future[None](), Future[None]()
+    with budget.hold() as hold:
+        hold.grow(6)
+        hold.until(first)
+        hold.until(second)
+    assert budget.held == 6
+    second.cancel()
+    assert budget.held == 6
+    first.set_result(None)
+    assert budget.held == 0
+
+
+def test_what_is_left_to_a_picture_goes_with_it() -> None:
+    budget, picture = MemoryBudget(10), np.zeros(3)
+    with budget.hold() as hold:
+        hold.grow(6)
+        hold.leave_with(picture)
+    assert budget.held == 6
+    view = picture
+    del picture
+    assert budget.held == 6
+    del view
+    assert budget.held == 0
+
+
+def test_watchers_are_told_of_every_change() -> None:
+    budget, told = MemoryBudget(10), list[float]()
+    budget.watch(told.append)
+    with budget.hold() as hold:
+        hold.grow(6)
+        hold.shrink_to(2)
+    assert told == [0, 6, 2, 0]
+
+
+def test_an_error_keeps_nothing_of_the_work_that_raised_it() -> None:
+    class Picture:
+        pass
+
+    gone = list[bool]()
+
+    def work() -> None:
+        picture = Picture()
+        weakref.finalize(picture, gone.append, True)
+        try:
+            raise ValueError("inner")
+        except ValueError as error:
+            raise RequestError("outer") from error
+
+    admission = Admission(threads=1, queue=1)
+    gc.disable()
+    try:
+        future = admission.submit(work)
+        with pytest.raises(RequestError):
+            future.result()
+        assert gone == [True]
+    finally:
+        gc.enable()
+        admission.close()

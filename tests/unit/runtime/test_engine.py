@@ -18,9 +18,9 @@ from service.errors import (
     UnknownMapError,
 )
 from service.geometry.camera import PinholeCamera
-from service.localization.prior import Prior
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
+from service.retrieval.prior import Prior
 from service.runtime.engine import EncodedQuery, Engine, prior_in
 from service.runtime.settings import Limits, Settings
 
@@ -110,6 +110,7 @@ def test_a_prior_in_degrees_keeps_what_else_is_known(twins: Engine, encoded: Enc
     bundle = twins.registry.get(None).bundle
     found = prior_in(replace(encoded, prior=prior, prior_wgs84=(52.53, 13.415)), bundle)
     assert found is not None
+    assert found.position_m is not None
     np.testing.assert_allclose(found.position_m, [678.6, 1112.7], atol=0.3)
     assert (found.position_std_m, found.heading_rad, found.heading_std_rad) == (7.0, 1.25, 0.5)
     assert prior_in(replace(encoded, prior=prior), bundle) is prior
@@ -129,9 +130,14 @@ def test_a_prior_in_degrees_is_refused_where_the_map_does_not_know_where_it_lies
     (0.01, None, "LOCALIZED"), (0.001, None, "AMBIGUOUS"), (0.001, 0.01, "LOCALIZED"), (0.01, 0.001, "AMBIGUOUS"),
 ])  # fmt: skip
 def test_the_services_rate_of_false_accepts_holds_where_a_query_names_none(
-    content_of: Callable[..., Any], calibration_json: Callable[..., Any], tmp_path: Path, encoded: EncodedQuery,
-    of_service: float, of_query: float | None, status: str,
-) -> None:  # fmt: skip
+    content_of: Callable[..., Any],
+    calibration_json: Callable[..., Any],
+    tmp_path: Path,
+    encoded: EncodedQuery,
+    of_service: float,
+    of_query: float | None,
+    status: str,
+) -> None:
     """Even odds whatever the evidence: enough for one in a hundred, not for one in a thousand."""
     write_bundle(tmp_path / "m", content_of(calibration=calibration_json()))
     engine = Engine.open(Settings(maps=(tmp_path / "m",), threads=1, false_accept_rate=of_service))

@@ -25,6 +25,8 @@ def test_the_newest_comes_first_and_the_oldest_go(engine: Engine, parts_of: Call
     located = engine.localize(encoded)
     (kept,) = engine.last_answers.newest(10)
     assert (kept.number, kept.status, kept.frames) == (1, located.answer.status, 1)
+    assert located.answer.T_map_camera_guess is not None
+    assert kept.position_m is not None
     assert kept.position_m.tolist() == located.answer.T_map_camera_guess[:3, 3].tolist()
     answers = LastAnswers()
     for _ in range(MOST + 5):

@@ -1,18 +1,15 @@
-"""The budget of memory: what it is, and how it is held and given back."""
+"""How large the budget of memory is."""
 
-import gc
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from service.errors import BusyError, RequestError, TooLargeError
+from service.errors import RequestError, TooLargeError
 from service.imaging.picture_headers import ImageLimits, require_pixels
 from service.runtime import memory
-from service.runtime.admission import Admission
-from service.runtime.memory import MIB, MemoryBudget, budget_of, memory_limit
+from service.runtime.admission import MIB
+from service.runtime.memory import budget_of, memory_limit
 from service.runtime.settings import Settings
 
 GIB = 2**30
@@ -100,56 +97,6 @@ def test_too_little_is_told_with_the_remedy(limited: Any, settings: dict[str, An
     assert "max_request_bytes" in refused.value.message
 
 
-def test_what_does_not_fit_beside_others_is_busy_and_what_never_fits_is_too_large() -> None:
-    budget = MemoryBudget(10)
-    with budget.hold() as one, budget.hold() as other:
-        one.grow(6)
-        with pytest.raises(BusyError):
-            other.grow(5)
-        other.grow(4)
-        with pytest.raises(TooLargeError):
-            one.grow(5)
-        assert (one.bytes, other.bytes, budget.held) == (6, 4, 10)
-        one.shrink_to(1)
-        other.grow(5)
-    assert budget.held == 0
-
-
-def test_work_that_goes_on_after_its_caller_keeps_its_memory() -> None:
-    budget, first, second = MemoryBudget(10), Future[None](), Future[None]()
-    with budget.hold() as hold:
-        hold.grow(6)
-        hold.until(first)
-        hold.until(second)
-    assert budget.held == 6
-    second.cancel()
-    assert budget.held == 6
-    first.set_result(None)
-    assert budget.held == 0
-
-
-def test_what_is_left_to_a_picture_goes_with_it() -> None:
-    budget, picture = MemoryBudget(10), np.zeros(3)
-    with budget.hold() as hold:
-        hold.grow(6)
-        hold.leave_with(picture)
-    assert budget.held == 6
-    view = picture
-    del picture
-    assert budget.held == 6
-    del view
-    assert budget.held == 0
-
-
-def test_watchers_are_told_of_every_change() -> None:
-    budget, told = MemoryBudget(10), list[float]()
-    budget.watch(told.append)
-    with budget.hold() as hold:
-        hold.grow(6)
-        hold.shrink_to(2)
-    assert told == [0, 6, 2, 0]
-
-
 def test_a_picture_is_reserved_when_its_header_is_read() -> None:
     told = list[tuple[str, int]]()
     limits = ImageLimits(max_pixels=100, reserve=lambda field, pixels: told.append((field, pixels)))
@@ -157,31 +104,3 @@ def test_a_picture_is_reserved_when_its_header_is_read() -> None:
     with pytest.raises(TooLargeError):
         require_pixels(10, 11, limits, field="depth")
     assert told == [("rgb", 100)]
-
-
-def test_an_error_keeps_nothing_of_the_work_that_raised_it() -> None:
-    class Picture:
-        pass
-
-    gone = list[bool]()
-
-    def work() -> None:
-        import weakref
-
-        picture = Picture()
-        weakref.finalize(picture, gone.append, True)
-        try:
-            raise ValueError("inner")
-        except ValueError as error:
-            raise RequestError("outer") from error
-
-    admission = Admission(threads=1, queue=1)
-    gc.disable()
-    try:
-        future = admission.submit(work)
-        with pytest.raises(RequestError):
-            future.result()
-        assert gone == [True]
-    finally:
-        gc.enable()
-        admission.close()

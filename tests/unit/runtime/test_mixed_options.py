@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from service.confidence.features import FEATURES
 from service.contract.convert import answer_from
 from service.errors import NotFiniteError
 from service.geometry.camera import PinholeCamera
@@ -20,11 +21,11 @@ from service.grpc.messages import answer_message
 from service.localization import localizer as localizer_module
 from service.localization.answer import Answer, require_finite
 from service.localization.localizer import Localizer
-from service.localization.prior import Prior
-from service.localization.query import Query
-from service.maps.calibration import FEATURES, terms
+from service.maps.calibration import terms
 from service.maps.reader import MapBundle
 from service.maps.writer import write_bundle
+from service.retrieval.prior import Prior
+from service.retrieval.query import Query
 from service.runtime.engine import EncodedQuery, Engine, Located
 from service.runtime.settings import Settings
 from service.runtime.stream import Stream

@@ -45,7 +45,7 @@ def folder(content_of: Content, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def write(folder: Path, content_of: Content) -> Callable[[int], None]:
+def write(folder: Path, content_of: Content) -> Callable[[int], object]:
     return lambda seed: write_bundle(folder / f"v{seed}", content_of(seed=seed))
 
 

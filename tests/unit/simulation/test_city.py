@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import shapely
@@ -196,5 +198,6 @@ def test_cars_of_a_car_park_stand_in_rows_beyond_the_pavement(car_parks):
 
 def test_no_two_cars_of_a_car_park_stand_in_each_other(car_parks):
     spots = np.array([(x, y) for x, y, *_ in car_parks._parking if car_parks.clearance(np.array([[x, y]])) > 4.0])
-    distance, _ = cKDTree(spots).query(spots, k=2)
+    tree: Any = cKDTree(spots)
+    distance, _ = tree.query(spots, k=2)
     assert distance[:, 1].min() > 2.0

@@ -2,6 +2,7 @@ import hashlib
 import itertools
 import json
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from model_training.datasets.dataset import Dataset
 from model_training.simulation import simulate as module
+from model_training.simulation.drives import quota_of
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.sensor_parameters import DepthParameters, LidarParameters
 from model_training.simulation.simulate import simulate
@@ -22,6 +24,11 @@ from service.geometry.rigid import transform_points
 def hashes_of(folder):
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def pose_of(frame):
+    assert frame.T_map_camera is not None
+    return frame.T_map_camera
 
 
 def interrupt(folder, *patterns):
@@ -122,9 +129,9 @@ def test_depth_presets_share_pictures_and_poses(tiny_dataset):
 @pytest.mark.parametrize("file", ["survey/poses.txt", "queries/drive1_precise/poses.txt"])
 def test_poses_are_tum_lines(tiny_dataset, file):
     lines = [[float(x) for x in line.split(" ")] for line in (tiny_dataset / file).read_text().splitlines()]
-    transforms = Dataset(tiny_dataset).survey_poses()
+    transforms = list(Dataset(tiny_dataset).survey_poses())
     if file.startswith("queries"):
-        transforms = [frame.T_map_camera for frame in Dataset(tiny_dataset).queries("drive1_precise")]
+        transforms = [pose_of(frame) for frame in Dataset(tiny_dataset).queries("drive1_precise")]
     assert {len(line) for line in lines} == {8}
     assert all(later[0] > earlier[0] for earlier, later in itertools.pairwise(lines))
     np.testing.assert_allclose([line[1:4] for line in lines], np.array(transforms)[:, :3, 3], atol=1e-8)
@@ -144,7 +151,7 @@ def test_pictures_show_what_the_scans_measured(plan_of, tmp_path):
         depth_m = frame.depth_m()
         near = (depth_m > 0) & (depth_m < 12)
         points = (frame.camera.pinhole().rays_of_pixels() * depth_m[..., None])[near]
-        distance, _ = tree.query(transform_points(frame.T_map_camera, points))
+        distance, _ = tree.query(transform_points(pose_of(frame), points))
         assert np.median(distance) < 0.15
 
 
@@ -236,13 +243,14 @@ def test_a_plan_that_names_what_is_not_there_is_refused(plan_of, tmp_path, chang
 def test_table_i_is_met_class_by_class(monkeypatch):
     """626 queries on candidates strewn over the paper's streets, of which every third one is blocked."""
     streets = paper_streets(np.random.default_rng(0))
-    city = type("Streets", (), {"streets_geojson": lambda _: streets_geojson(streets)})()
+    city: Any = type("Streets", (), {"streets_geojson": lambda _: streets_geojson(streets)})()
     rng = np.random.default_rng(1)
     candidates = np.tile(np.eye(4), (9000, 1, 1))
     candidates[:, 0, 3], candidates[:, 1, 3] = rng.uniform(-130, 130, 9000), rng.uniform(-180, 180, 9000)
-    quota = module.quota_of(city, QueryPlan(name="a", traversal=1, per_class=True), candidates)
+    quota = quota_of(city, QueryPlan(name="a", traversal=1, per_class=True), candidates)
     monkeypatch.setattr(module, "_is_free", lambda k: k % 3 > 0)
-    chosen = module._free_candidates(None, quota)
+    job: Any = None
+    chosen = module._free_candidates(job, quota)
     counts = np.bincount(quota.class_of[chosen], minlength=16)
     assert counts.tolist() == [count for _, _, count in TABLE_I]
     assert len(set(chosen.tolist())) == 626
@@ -305,6 +313,6 @@ def test_sequences_are_written_frame_by_frame_and_as_many_as_asked_for(plan_of, 
     steps = np.linalg.norm(np.diff(truth[:, :2, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps[[0, 1, 3, 4]], 0.5, atol=1e-6)
     for frame, single in zip(frames[2::3], last, strict=True):
-        np.testing.assert_allclose(frame.T_map_camera, single.T_map_camera, atol=1e-9)
+        np.testing.assert_allclose(pose_of(frame), pose_of(single), atol=1e-9)
     pictures = [frame.depth_m() for frame in frames]
     assert all(np.abs(one - other).max() > 0.1 for one, other in itertools.pairwise(pictures))

@@ -96,6 +96,8 @@ def test_a_simulated_pair_measures_the_street_and_the_dataset_knows_its_baseline
     simulate(pair_plan(queries=(ideal,)), tmp_path / "ideal", workers=1)
     for seen, true in zip(dataset.queries("a_sgbm"), Dataset(tmp_path / "ideal").queries("a_ideal"), strict=True):
         matched, truth = seen.depth_m(), true.depth_m()
+        assert seen.T_map_camera is not None
+        assert true.T_map_camera is not None
         np.testing.assert_allclose(seen.T_map_camera, true.T_map_camera)
         both = (matched > 0) & (truth > 0)
         assert both.mean() > 0.2

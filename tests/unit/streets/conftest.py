@@ -14,9 +14,19 @@ LANES = '<left><lane id="1" type="driving"><width sOffset="0" a="4" b="0" c="0" 
 
 
 def road_of(
-    identity: int, geometry: str = "<line/>", *, length: float = 100.0, name: str = "", x: float = 0.0, y: float = 0.0,
-    hdg: float = 0.0, junction: int = -1, link: str = "", offset: str = "", lanes: str = LANES,
-) -> str:  # fmt: skip
+    identity: int,
+    geometry: str = "<line/>",
+    *,
+    length: float = 100.0,
+    name: str = "",
+    x: float = 0.0,
+    y: float = 0.0,
+    hdg: float = 0.0,
+    junction: int = -1,
+    link: str = "",
+    offset: str = "",
+    lanes: str = LANES,
+) -> str:
     """A <road> of one geometry and one lane section; by default 100 m towards east, one lane of 4 m to the left."""
     drawn = f'<geometry s="0" x="{x}" y="{y}" hdg="{hdg}" length="{length}">{geometry}</geometry>'
     return (

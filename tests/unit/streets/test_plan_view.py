@@ -36,8 +36,8 @@ def test_a_spiral_is_scipys_clothoid(radius, length, side):
 
 def test_a_spiral_that_opens_backwards_ends_where_it_began():
     there = Bend(0.0, 0.001)
-    (end,), (heading,) = there.at(np.array([60.0]))
-    back = Geometry(0, *end, heading + np.pi, 60, Bend(-0.06, 0.001))
+    ((x, y),), (heading,) = there.at(np.array([60.0]))
+    back = Geometry(0, x, y, heading + np.pi, 60, Bend(-0.06, 0.001))
     points, _ = reference_line((back,), np.array([60.0]))
     np.testing.assert_allclose(points, [[0, 0]], atol=1e-9)
 

@@ -14,7 +14,9 @@ def file(tmp_path):
 
 def test_elements_attributes_and_text_are_read(file):
     tree = read_xml(file('<a><b c="1">text</b></a>'), root="a")
-    assert (tree.find("b").get("c"), tree.findtext("b")) == ("1", "text")
+    found = tree.find("b")
+    assert found is not None
+    assert (found.get("c"), tree.findtext("b")) == ("1", "text")
 
 
 @pytest.mark.parametrize(

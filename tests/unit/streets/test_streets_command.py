@@ -53,6 +53,7 @@ def test_openstreetmap_lands_in_the_georeferenced_map(run, osm, dataset, streets
 def test_a_picture_is_drawn(run, geojson, dataset, tmp_path):
     run("geojson", geojson(LINE), "--dataset", dataset((50, 0)), "--picture", tmp_path / "map.png")
     picture = cv2.imread(str(tmp_path / "map.png"))
+    assert picture is not None
     assert picture.shape[1] == 1600
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 3
 

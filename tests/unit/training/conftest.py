@@ -38,7 +38,7 @@ def write_pack(folder: Path, *, places: int = 60, seed: int = 0) -> Path:
     queries[:, 2] += turn
     queries[:, :2] += rng.uniform(-0.5, 0.5, (places, 2))
     queries[:, 3] = 1.5
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         "panoramas": panoramas.astype(np.float16), "intensities": (panoramas * 8).astype(np.uint8), "places": poses,
         "rows_seen": np.ones(GRID.rows, np.bool_),
         "ranges": np.stack([p[:, c] for p, c in zip(panoramas, columns, strict=True)]).astype(np.float16),

@@ -8,7 +8,7 @@ from torch import nn  # noqa: E402  # after the skip
 from model_training.training.encoder_net import LAYERS, VIEWS_AT_ONCE, EncoderNet, EncoderShape  # noqa: E402
 from model_training.training.export import export  # noqa: E402
 from service.errors import EncoderError  # noqa: E402
-from service.localization.encoder import Encoder  # noqa: E402
+from service.retrieval.encoder import Encoder  # noqa: E402
 
 # torch's tracing exporter is deprecated in favour of one that needs a newer runtime than the service has
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")

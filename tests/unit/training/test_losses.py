@@ -14,7 +14,7 @@ def pairs(count=7, seed=0, spread_m=100.0):
     return descriptors[0], descriptors[1], positions, positions + rng.uniform(-1, 1, (count, 2))
 
 
-def slow_loss(queries, surveys, positions_q, positions_s, scale, more=(), same_place_m=6.0):
+def slow_loss(queries, surveys, positions_q, positions_s, *, scale, more=(), same_place_m=6.0):
     """Pair by pair: minus the log of the own one's share, both ways, those too near left out."""
     losses = []
     for k in range(len(queries)):
@@ -38,7 +38,7 @@ def side(descriptors, positions):
     return Side(torch.tensor(descriptors, dtype=torch.float64), torch.tensor(positions, dtype=torch.float64))
 
 
-def loss_of(queries, surveys, positions_q, positions_s, scale=10.0, more=()):
+def loss_of(queries, surveys, positions_q, positions_s, *, scale=10.0, more=()):
     given = dict(zip(("more_queries", "more_surveys"), (side(*m) for m in more), strict=False))
     losses, first = paired_info_nce(
         side(queries, positions_q), side(surveys, positions_s), scale=torch.tensor(scale, dtype=torch.float64), **given
@@ -49,14 +49,14 @@ def loss_of(queries, surveys, positions_q, positions_s, scale=10.0, more=()):
 @pytest.mark.parametrize("spread_m", [10.0, 30.0, 300.0])
 def test_the_loss_is_that_of_a_slow_loop(spread_m):
     given = pairs(spread_m=spread_m)
-    np.testing.assert_allclose(loss_of(*given)[0], slow_loss(*given, 10.0), rtol=1e-9)
+    np.testing.assert_allclose(loss_of(*given)[0], slow_loss(*given, scale=10.0), rtol=1e-9)
 
 
 def test_earlier_descriptors_are_negatives_unless_they_are_near():
     given, others = pairs(spread_m=20.0), pairs(count=11, seed=1, spread_m=20.0)
     more = ((others[0], others[2]), (others[1], others[3]))
     found = loss_of(*given, more=more)[0]
-    np.testing.assert_allclose(found, slow_loss(*given, 10.0, more), rtol=1e-9)
+    np.testing.assert_allclose(found, slow_loss(*given, scale=10.0, more=more), rtol=1e-9)
     assert (found > loss_of(*given)[0]).all()
 
 

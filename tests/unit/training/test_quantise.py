@@ -14,7 +14,7 @@ from model_training.training.export import export  # noqa: E402
 from model_training.training.loop import TrainingConfig  # noqa: E402
 from model_training.training.quantise import Views, quantise  # noqa: E402
 from service.errors import EncoderError  # noqa: E402
-from service.localization.encoder import Encoder  # noqa: E402
+from service.retrieval.encoder import Encoder  # noqa: E402
 
 # torch's tracing exporter is deprecated in favour of one that needs a newer runtime than the service has
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")

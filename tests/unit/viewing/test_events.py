@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +19,14 @@ SEEN = {"most_scans": 4, "most_points": 500}
 
 
 def test_a_dataset_shows_scans_in_the_map_frame_then_queries(small_dataset):
-    events = list(events_of(small_dataset.folder, **SEEN))
-    scans = [event for event in events if isinstance(event, Cloud)]
+    events: list[Any] = list(events_of(small_dataset.folder, **SEEN))
+    scans: list[Any] = [event for event in events if isinstance(event, Cloud)]
     assert len(scans) == 4
     assert max(len(scan.points_m) for scan in scans) <= 500
     T = small_dataset.survey_poses()[0]
     first = small_dataset.scan(0)[0, :3]
     np.testing.assert_allclose(scans[0].origin_m + scans[0].points_m[0], (T @ [*first, 1])[:3], atol=1e-4)
-    views = [event for event in events if isinstance(event, View)]
+    views: list[Any] = [event for event in events if isinstance(event, View)]
     assert len(views) == 5
     assert all(view.colour_jpeg[:2] == view.fused_jpeg[:2] == b"\xff\xd8" for view in views)
     assert min(view.stamp_s for view in views) > max(scan.stamp_s for scan in scans)
@@ -46,7 +47,7 @@ def test_a_map_shows_cloud_places_and_streets_all_the_time(bundle_path):
 
 def test_answers_show_each_querys_truth_hypotheses_registration_and_answer(saved_run):
     p = SavedRun.open(saved_run).predictions["drive1_precise"]
-    events = list(events_of(saved_run, **SEEN))
+    events: list[Any] = list(events_of(saved_run, **SEEN))
     for row in range(len(p.T_true)):
         now = {event.topic: event for event in events if event.stamp_s == float(row)}
         np.testing.assert_allclose(now["query/truth"].T_map_camera[0], p.T_true[row])

@@ -58,6 +58,12 @@ export interface Reason {
   remedy: string;
 }
 
+/** Height of the camera above the ground: of the request, found in the depth image, or the usual one because no ground is seen. */
+export interface CameraHeight {
+  height_m: number;
+  origin: 'given' | 'estimated' | 'assumed';
+}
+
 /** Street and pose are null unless the answer is LOCALIZED, the spread is null and the reasons are empty if it is. */
 export interface Answer {
   status: Status;
@@ -68,6 +74,7 @@ export interface Answer {
   spread: Spread | null;
   reasons: Reason[];
   neighbours: Neighbour[];
+  camera_height: CameraHeight | null;
   map: MapVersion;
   timings_ms: { decode: number; fuse: number; encode: number; search: number; register: number; total: number };
 }

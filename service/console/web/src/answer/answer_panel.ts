@@ -108,6 +108,7 @@ export class AnswerPanel {
       rows.push(['σ heading', degrees(answer.spread.heading_std_deg)]);
       rows.push(['in one of the hypotheses', percent(answer.spread.hypotheses_weight)]);
     }
+    rows.push(...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Where it may be'), facts(rows));
   }
@@ -123,6 +124,7 @@ export class AnswerPanel {
       rows.push(['σ on the ground', `${metres(ellipse.major)} × ${metres(ellipse.minor)}`]);
       rows.push(['σ heading', degrees((180 / Math.PI) * Math.sqrt(covariance[35] ?? 0))]);
     }
+    rows.push(...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Pose'), facts(rows));
   }
@@ -181,6 +183,10 @@ export class AnswerPanel {
       element('p', { class: 'hint' }, `${milliseconds(times.total)} in the service, ${milliseconds(elapsedMs)} from the click to the answer`),
     );
   }
+}
+
+function heightRow({ camera_height }: Answer): [string, string][] {
+  return camera_height === null ? [] : [['camera above ground', `${metres(camera_height.height_m)}, ${camera_height.origin}`]];
 }
 
 function figure(value: string, name: string, wrong = false): HTMLElement {

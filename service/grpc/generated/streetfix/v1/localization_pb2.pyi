@@ -25,6 +25,13 @@ class DepthEncoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     DEPTH_ENCODING_CARLA: _ClassVar[DepthEncoding]
     DEPTH_ENCODING_COMPRESSED_DEPTH: _ClassVar[DepthEncoding]
 
+class CameraHeightOrigin(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CAMERA_HEIGHT_ORIGIN_UNSPECIFIED: _ClassVar[CameraHeightOrigin]
+    CAMERA_HEIGHT_ORIGIN_GIVEN: _ClassVar[CameraHeightOrigin]
+    CAMERA_HEIGHT_ORIGIN_ESTIMATED: _ClassVar[CameraHeightOrigin]
+    CAMERA_HEIGHT_ORIGIN_ASSUMED: _ClassVar[CameraHeightOrigin]
+
 class LocalizationStatus(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     LOCALIZATION_STATUS_UNSPECIFIED: _ClassVar[LocalizationStatus]
@@ -46,6 +53,10 @@ DEPTH_KIND_DISPARITY: DepthKind
 DEPTH_ENCODING_UNSPECIFIED: DepthEncoding
 DEPTH_ENCODING_CARLA: DepthEncoding
 DEPTH_ENCODING_COMPRESSED_DEPTH: DepthEncoding
+CAMERA_HEIGHT_ORIGIN_UNSPECIFIED: CameraHeightOrigin
+CAMERA_HEIGHT_ORIGIN_GIVEN: CameraHeightOrigin
+CAMERA_HEIGHT_ORIGIN_ESTIMATED: CameraHeightOrigin
+CAMERA_HEIGHT_ORIGIN_ASSUMED: CameraHeightOrigin
 LOCALIZATION_STATUS_UNSPECIFIED: LocalizationStatus
 LOCALIZATION_STATUS_LOCALIZED: LocalizationStatus
 LOCALIZATION_STATUS_AMBIGUOUS: LocalizationStatus
@@ -55,7 +66,7 @@ STREET_SECTION_BEGINNING: StreetSection
 STREET_SECTION_END: StreetSection
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("map", "rgb", "depth", "camera", "depth_format", "gravity", "vehicle_from_camera", "options", "prior")
+    __slots__ = ("map", "rgb", "depth", "camera", "depth_format", "gravity", "vehicle_from_camera", "options", "prior", "vehicle_base_on_ground")
     MAP_FIELD_NUMBER: _ClassVar[int]
     RGB_FIELD_NUMBER: _ClassVar[int]
     DEPTH_FIELD_NUMBER: _ClassVar[int]
@@ -65,6 +76,7 @@ class LocalizeRequest(_message.Message):
     VEHICLE_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     PRIOR_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_BASE_ON_GROUND_FIELD_NUMBER: _ClassVar[int]
     map: str
     rgb: bytes
     depth: bytes
@@ -74,7 +86,8 @@ class LocalizeRequest(_message.Message):
     vehicle_from_camera: RigidTransform
     options: Options
     prior: Prior
-    def __init__(self, map: _Optional[str] = ..., rgb: _Optional[bytes] = ..., depth: _Optional[bytes] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., depth_format: _Optional[_Union[DepthFormat, _Mapping]] = ..., gravity: _Optional[_Union[Vector3, _Mapping]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ...) -> None: ...
+    vehicle_base_on_ground: bool
+    def __init__(self, map: _Optional[str] = ..., rgb: _Optional[bytes] = ..., depth: _Optional[bytes] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., depth_format: _Optional[_Union[DepthFormat, _Mapping]] = ..., gravity: _Optional[_Union[Vector3, _Mapping]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., vehicle_base_on_ground: _Optional[bool] = ...) -> None: ...
 
 class LocalizeBatchRequest(_message.Message):
     __slots__ = ("requests",)
@@ -109,18 +122,20 @@ class Problem(_message.Message):
     def __init__(self, code: _Optional[str] = ..., title: _Optional[str] = ..., detail: _Optional[str] = ..., field: _Optional[str] = ...) -> None: ...
 
 class LocalizeSequenceRequest(_message.Message):
-    __slots__ = ("map", "frames", "vehicle_from_camera", "prior", "options")
+    __slots__ = ("map", "frames", "vehicle_from_camera", "prior", "options", "vehicle_base_on_ground")
     MAP_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
     VEHICLE_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     PRIOR_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    VEHICLE_BASE_ON_GROUND_FIELD_NUMBER: _ClassVar[int]
     map: str
     frames: _containers.RepeatedCompositeFieldContainer[SequenceFrame]
     vehicle_from_camera: RigidTransform
     prior: Prior
     options: Options
-    def __init__(self, map: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ...) -> None: ...
+    vehicle_base_on_ground: bool
+    def __init__(self, map: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., vehicle_from_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., prior: _Optional[_Union[Prior, _Mapping]] = ..., options: _Optional[_Union[Options, _Mapping]] = ..., vehicle_base_on_ground: _Optional[bool] = ...) -> None: ...
 
 class SequenceFrame(_message.Message):
     __slots__ = ("rgb", "depth", "camera", "depth_format", "gravity", "reference_from_camera")
@@ -253,7 +268,7 @@ class PriorWgs84(_message.Message):
     def __init__(self, latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., std_m: _Optional[float] = ...) -> None: ...
 
 class Camera(_message.Message):
-    __slots__ = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+    __slots__ = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion", "height_m", "height_std_m")
     MODEL_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
@@ -262,6 +277,8 @@ class Camera(_message.Message):
     CX_FIELD_NUMBER: _ClassVar[int]
     CY_FIELD_NUMBER: _ClassVar[int]
     DISTORTION_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_M_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_STD_M_FIELD_NUMBER: _ClassVar[int]
     model: CameraModel
     width: int
     height: int
@@ -270,7 +287,9 @@ class Camera(_message.Message):
     cx: float
     cy: float
     distortion: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, model: _Optional[_Union[CameraModel, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx: _Optional[float] = ..., cy: _Optional[float] = ..., distortion: _Optional[_Iterable[float]] = ...) -> None: ...
+    height_m: float
+    height_std_m: float
+    def __init__(self, model: _Optional[_Union[CameraModel, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., fx: _Optional[float] = ..., fy: _Optional[float] = ..., cx: _Optional[float] = ..., cy: _Optional[float] = ..., distortion: _Optional[_Iterable[float]] = ..., height_m: _Optional[float] = ..., height_std_m: _Optional[float] = ...) -> None: ...
 
 class DepthFormat(_message.Message):
     __slots__ = ("scale_m", "kind", "encoding", "max_range_m", "baseline_m")
@@ -297,7 +316,7 @@ class Options(_message.Message):
     def __init__(self, neighbours: _Optional[int] = ..., refine: _Optional[bool] = ..., false_accept_rate: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons")
+    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height")
     STATUS_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     STREET_FIELD_NUMBER: _ClassVar[int]
@@ -310,6 +329,7 @@ class LocalizeResponse(_message.Message):
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
     SPREAD_FIELD_NUMBER: _ClassVar[int]
     REASONS_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_HEIGHT_FIELD_NUMBER: _ClassVar[int]
     status: LocalizationStatus
     confidence: float
     street: Street
@@ -322,7 +342,16 @@ class LocalizeResponse(_message.Message):
     hypotheses: _containers.RepeatedCompositeFieldContainer[Hypothesis]
     spread: Spread
     reasons: _containers.RepeatedCompositeFieldContainer[Reason]
-    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ...) -> None: ...
+    camera_height: CameraHeight
+    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ...) -> None: ...
+
+class CameraHeight(_message.Message):
+    __slots__ = ("height_m", "origin")
+    HEIGHT_M_FIELD_NUMBER: _ClassVar[int]
+    ORIGIN_FIELD_NUMBER: _ClassVar[int]
+    height_m: float
+    origin: CameraHeightOrigin
+    def __init__(self, height_m: _Optional[float] = ..., origin: _Optional[_Union[CameraHeightOrigin, str]] = ...) -> None: ...
 
 class Reason(_message.Message):
     __slots__ = ("check", "evidence", "remedy")

@@ -1,0 +1,150 @@
+"""Decision: the status and the calibrated confidence of an answer; reasons and spread if it is not LOCALIZED."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.confidence.features import FEATURES
+from service.confidence.reasons import Reason, reasons_of
+from service.confidence.spread import Extent, Spread, spread_of
+from service.errors import RequestError
+from service.geometry.rigid import heading_of_camera
+from service.maps.calibration import Calibration, probability
+from service.retrieval.query import Query
+from service.scoring.candidates import Candidate, Refined, distinct_candidates, shares_of
+
+Status = Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
+
+#: An answer that is not accepted is AMBIGUOUS if the probability that the query is from the map is at least this; else OUT_OF_MAP.
+KNOWN = 0.5
+#: The best candidate of an accepted answer must hold more than half of the support of all distinct candidates. The threshold on
+#: confidence rejects out-of-map queries. It does not reject perceptual aliases, such as six blocks that look the same (decision 0086).
+_SHARE, _HALF = FEATURES.index("log_share"), float(np.log(0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Status and confidence of an answer.
+
+    Attributes:
+        status: LOCALIZED, AMBIGUOUS or OUT_OF_MAP.
+        confidence: probability that the position is within 1 m, 0 to 1.
+    """
+
+    status: Status
+    confidence: float
+
+
+def decide(
+    calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None, false_accept_rate: float, *,
+    prior_nats: float = 0.0,
+) -> Decision:  # fmt: skip
+    """Compute status and confidence from the confidence features.
+
+    In the calibration data every second query comes from outside the map. A caller who sends a prior claims that the robot is in
+    the map. So the odds of being in the map change by Bayes' rule (decision 0135). The probability that the chosen place is the
+    right place of the map does not change: confidence is P(known) P(right | known).
+
+    Args:
+        calibration: calibration of the map.
+        evidence: confidence features of the answer; None if the images have too few points to register.
+        false_accept_rate: largest tolerated share of out-of-map queries that become LOCALIZED, 0 to 1. It holds without a prior.
+        prior_nats: increase of the log odds of being in the map by a prior that agrees with the answer (``Prior.known_nats``).
+
+    Returns:
+        The decision; OUT_OF_MAP with confidence 0 without ``evidence``.
+    """
+    if evidence is None:
+        return Decision("OUT_OF_MAP", 0.0)
+    confidence = float(calibration.confidence(evidence))
+    known_odds = calibration.known.log_odds(evidence)
+    unprompted, known = (float(odds) for odds in probability(np.array([known_odds, known_odds + prior_nats])))
+    if prior_nats > 0:
+        confidence = confidence / max(unprompted, confidence) * known
+    if confidence >= calibration.threshold(false_accept_rate) and evidence[_SHARE] > _HALF:
+        return Decision("LOCALIZED", confidence)
+    return Decision("AMBIGUOUS" if known >= KNOWN else "OUT_OF_MAP", confidence)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """How far an answer can be trusted.
+
+    Attributes:
+        status: LOCALIZED, AMBIGUOUS or OUT_OF_MAP. Always LOCALIZED if the query asked for no registration or the map has no
+            calibration.
+        confidence: calibrated probability that the position is within 1 m; None in these two cases.
+        reasons: what to check; empty for a LOCALIZED answer.
+        candidates: registered poses, the best supported first; None if nothing was registered. If the answer is not LOCALIZED,
+            candidates that exclude each other have covariances.
+        spread: mean and covariance over all places where the camera may be; None for a LOCALIZED answer.
+    """
+
+    status: Status
+    confidence: float | None
+    reasons: tuple[Reason, ...]
+    candidates: tuple[Candidate, ...] | None
+    spread: Spread | None
+
+
+def outcome_of(
+    calibration: Calibration | None, query: Query, refined: Refined | None, evidence: Float64[NDArray[np.float64], " F"] | None, *,
+    frames: int, extent: Extent,
+) -> Outcome:  # fmt: skip
+    """Compute status, confidence, reasons and spread of an answer.
+
+    Args:
+        calibration: calibration of the map; None if the map has none, or if the query asked for no registration.
+        query: the reference; its prior and its false-accept rate count.
+        refined: registered candidates; None if nothing was registered, or if the images have too few points.
+        evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without ``refined``.
+        frames: number of image pairs.
+        extent: extent of the map.
+    """
+    candidates = None if refined is None else refined.candidates
+    if calibration is None:
+        return Outcome("LOCALIZED", None, (), candidates, None)
+    prior_nats = 0.0
+    if query.prior is not None and refined is not None:
+        T = refined.best.T_map_camera
+        prior_nats = query.prior.known_nats(T[:2, 3], heading_of_camera(T))
+    decision = decide(calibration, evidence, query.false_accept_rate, prior_nats=prior_nats)
+    if decision.status == "LOCALIZED":
+        return Outcome(decision.status, decision.confidence, (), candidates, None)
+    candidates = None if refined is None else refined.with_covariances()
+    spread = _spread_over(candidates or (), frames, decision.confidence, extent)
+    reasons = reasons_of(calibration, evidence, query.depth_m)
+    return Outcome(decision.status, decision.confidence, reasons, candidates, spread)
+
+
+def require_promise(calibration: Calibration | None, query: Query) -> None:
+    """Refuse a false-accept rate that the calibration data cannot support.
+
+    Args:
+        calibration: calibration of the map; None supports every rate.
+        query: query with its false-accept rate.
+
+    Raises:
+        RequestError: the rate is lower than the calibration supports.
+    """
+    if calibration is not None and query.false_accept_rate < calibration.least_false_accept_rate:
+        raise RequestError(
+            f"false_accept_rate: {query.false_accept_rate:g} is less than this map's calibration can promise; "
+            f"ask for {calibration.least_false_accept_rate:g} or more",
+            field="options.false_accept_rate",
+        )
+
+
+def _spread_over(candidates: tuple[Candidate, ...], frames: int, confidence: float, extent: Extent) -> Spread:
+    distinct = distinct_candidates(candidates)
+    covariances = [each.covariance for each in distinct if each.covariance is not None]
+    return spread_of(
+        [each.T_map_camera for each in distinct],
+        covariances,
+        shares_of(distinct, frames),
+        confidence=confidence,
+        extent=extent,
+    )

@@ -1,0 +1,212 @@
+"""Confidence features of an answer: the inputs of the calibrated confidence, one number each.
+
+``TABLE`` defines each feature: its name, unit, meaning, sign, and how it is computed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.confidence.shape import Shape, shape_of
+from service.errors import BundleError
+from service.imaging.view_grid import ViewGrid
+from service.maps.calibration import Calibration
+from service.retrieval.frame import Frame
+from service.retrieval.hypotheses import Hypothesis
+from service.retrieval.knn import Neighbour
+from service.scoring.candidates import Candidate, Refined, behind, distinct_candidates, log_shares
+
+#: A neighbour further than OTHER_PLACE_M from the answer is another place (feature ``similarity_margin``).
+#: Of the first VOTERS neighbours, those within VOTE_M of the answer vote for it (feature ``votes``).
+OTHER_PLACE_M, VOTE_M, VOTERS = 10.0, 5.0, 20
+_NEAREST = 5  # number of the most similar neighbours in ``pose_spread``
+_MOST_MARGIN = 12.0  # nats; largest margin, also used if there is no rival
+_MOST_PLACE_M = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The results of the stages that the features are computed from.
+
+    Attributes:
+        frames: image pairs, the reference first.
+        refined: registered candidates, the best supported first.
+        neighbours: distinct places retrieved for the reference, the most similar first.
+        hypotheses: clusters of the most similar views of the reference.
+        places_m: x and y of all places, map frame, metres.
+        grid: view grid of the map.
+    """
+
+    frames: tuple[Frame, ...]
+    refined: Refined
+    neighbours: tuple[Neighbour, ...]
+    hypotheses: tuple[Hypothesis, ...]
+    places_m: Float64[NDArray[np.float64], "P 2"]
+    grid: ViewGrid
+
+    @property
+    def best(self) -> Candidate:
+        """The best supported candidate."""
+        return self.refined.best
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Statistics of the reference's view along its optical axis."""
+        views = self.frames[0].views
+        return shape_of(views.planes[int(np.argmin(np.abs(views.turns_rad))), 0], self.grid)
+
+    @cached_property
+    def support_gaps(self) -> Float64[NDArray[np.float64], " C"]:
+        """Support gap of each candidate that excludes the others to the best one, nats."""
+        return behind(distinct_candidates(self.refined.candidates), len(self.frames))
+
+    @cached_property
+    def away_m(self) -> Float64[NDArray[np.float64], " N"]:
+        """Horizontal distance of each neighbour from the answer, metres."""
+        xy = self.best.T_map_camera[:2, 3]
+        return np.array([np.hypot(*(place.position_m[:2] - xy)) for place in self.neighbours])
+
+    @property
+    def similarity_margin(self) -> float:
+        """Similarity of the best candidate minus that of the most similar neighbour elsewhere, times the root of the frames."""
+        elsewhere = np.array([place.similarity for place in self.neighbours])[self.away_m > OTHER_PLACE_M]
+        other = float(elsewhere.max()) if len(elsewhere) else 0.5
+        return float(np.sqrt(len(self.frames))) * (self.best.similarity - other)
+
+    @property
+    def votes(self) -> float:
+        """Neighbours near the answer, as a share of the places that exist there.
+
+        Without this normalisation a sparse survey would get fewer votes (decision 0033).
+        """
+        xy = self.best.T_map_camera[:2, 3]
+        there = float(np.clip((np.hypot(*(self.places_m - xy).T) < VOTE_M).sum(), 1, VOTERS))
+        return float((self.away_m[:VOTERS] < VOTE_M).sum()) / there
+
+    @property
+    def entropy(self) -> float:
+        """Entropy of the clusters' weights, nats."""
+        weights = np.array([hypothesis.weight for hypothesis in self.hypotheses])
+        return float(-(weights * np.log(np.maximum(weights, 1e-12))).sum())
+
+    @property
+    def pose_spread(self) -> float:
+        """Log of the sum of 0.1 m and the RMS distance (m) of the first neighbours from their mean."""
+        xy = np.array([place.position_m[:2] for place in self.neighbours[:_NEAREST]])
+        return float(np.log(np.sqrt(xy.var(axis=0).sum()) + 0.1))
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """One confidence feature.
+
+    Attributes:
+        name: name in the calibration file and in answers.
+        unit: unit of the value; "1" for a ratio or a share.
+        meaning: what it measures.
+        sign: effect of a larger value on the probability of a right answer: 1 more, -1 less, 0 not known in advance.
+        of: computes the value.
+        rivalry: whether it compares competing candidates. The probability that a query is in the map does not use these.
+        weighted: whether the confidence uses it.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    sign: Literal[-1, 0, 1]
+    of: Callable[[Evidence], float]
+    rivalry: bool = False
+    weighted: bool = True
+
+
+#: All confidence features, in the order of the calibration file.
+#:
+#: ``log_share`` has no weight, because it is a separate rule beside the confidence (``service.confidence.decision``, decision
+#: 0086). ``similarity`` has none, because it depends more on the kind of street than on the place. Real streets lie four
+#: standard deviations below simulated streets (decision 0137).
+TABLE: tuple[Feature, ...] = (
+    Feature("margin", "nat", "support gap to the best rival", 1,
+            lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True),
+    Feature("inliers", "1", "share of the points that lie on the map", 1, lambda e: e.best.registered.inliers),
+    Feature("similarity", "1", "descriptor similarity to the places around the pose", 1,
+            lambda e: e.best.similarity, weighted=False),
+    Feature("similarity_margin", "1", "similarity at the pose minus the best similarity elsewhere", 1,
+            lambda e: e.similarity_margin, rivalry=True),
+    Feature("likelihood", "nat", "mean log likelihood of the rendered depth", 1, lambda e: e.best.agreement.likelihood),
+    Feature("through", "1", "share of the points behind the mapped surfaces", -1, lambda e: e.best.agreement.through),
+    Feature("front", "1", "share of the points in front of the mapped surfaces", -1, lambda e: e.best.agreement.front),
+    Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.agreement.unmapped),
+    Feature("log_sigma", "log m", "larger horizontal standard deviation of the pose", -1,
+            lambda e: float(np.log(float(np.sqrt(np.linalg.eigvalsh(e.refined.covariance[:2, :2])[-1]))))),
+    Feature("scale", "1 %", "estimated scale error of the depth, unsigned", -1,
+            lambda e: abs(float(np.log(e.best.registered.scale))) / 0.01),
+    Feature("votes", "1", "neighbours within 5 m of the pose, as a share of the places there", 1,
+            lambda e: e.votes, rivalry=True),
+    Feature("entropy", "nat", "entropy of the clusters' weights", -1, lambda e: e.entropy, rivalry=True),
+    Feature("log_noise", "log 1/m", "standard deviation of the inverse depth of one pixel", -1,
+            lambda e: float(np.log(np.median([frame.noise for frame in e.frames])))),
+    Feature("points", "3000", "points of a frame", 1, lambda e: e.refined.points / 3000.0 / len(e.frames)),
+    Feature("measured", "1", "share of the view grid with a measurement", 1, lambda e: e.frames[0].views.measured_share),
+    Feature("place_m", "m", "distance of the places around the pose, at most 10 m", -1,
+            lambda e: min(e.best.place_m, _MOST_PLACE_M)),
+    Feature("facings", "log 1", "variety of the directions that walls face", 1, lambda e: e.shape.facings),
+    Feature("far", "log m", "median range above the horizon", 0, lambda e: e.shape.far),
+    Feature("edges", "1", "share of neighbouring cells on different surfaces", 0, lambda e: e.shape.edges),
+    Feature("residual", "log 1", "disagreement of the image's patches about the pose, relative to their noise", -1,
+            lambda e: float(np.log(e.refined.disagreement))),
+    Feature("pose_spread", "log m", "distance of the first five neighbours from their mean", -1,
+            lambda e: e.pose_spread, rivalry=True),
+    Feature("log_share", "log 1", "share of the best candidate in the support of all candidates that exclude each other", 1,
+            lambda e: float(log_shares(e.support_gaps)[0]), weighted=False),
+)  # fmt: skip
+
+#: Names of the features, in their order.
+FEATURES = tuple(feature.name for feature in TABLE)
+#: Names of the features that compare competing candidates.
+RIVALRY = tuple(feature.name for feature in TABLE if feature.rivalry)
+#: Names of the features that the confidence does not use.
+UNWEIGHED = tuple(feature.name for feature in TABLE if not feature.weighted)
+
+
+def evidence_of(
+    frames: tuple[Frame, ...],
+    refined: Refined,
+    neighbours: tuple[Neighbour, ...],
+    hypotheses: tuple[Hypothesis, ...],
+    places_m: Float64[NDArray[np.float64], "P 2"],
+    grid: ViewGrid,
+) -> Float64[NDArray[np.float64], " F"]:
+    """Compute the confidence features, in the order of ``FEATURES``.
+
+    Args:
+        frames: image pairs, the reference first.
+        refined: registered candidates, the best supported first.
+        neighbours: distinct places retrieved for the reference, the most similar first.
+        hypotheses: clusters of the most similar views of the reference.
+        places_m: x and y of all places, map frame, metres.
+        grid: view grid of the map.
+    """
+    evidence = Evidence(frames, refined, neighbours, hypotheses, places_m, grid)
+    return np.array([feature.of(evidence) for feature in TABLE])
+
+
+def require_features(calibration: Calibration | None, path: str) -> None:
+    """Refuse a calibration of other features than this program computes.
+
+    Args:
+        calibration: calibration of a map; None is accepted.
+        path: path of the file or the bundle, for the error message.
+
+    Raises:
+        BundleError: the names or their order differ.
+    """
+    if calibration is not None and calibration.features != FEATURES:
+        raise BundleError(
+            f"{path}: its features are not this program's: {', '.join(FEATURES)}; build the map again with this release",
+            field="calibration.json",
+        )

@@ -1,0 +1,106 @@
+"""Reasons why an answer is not LOCALIZED: confidence features outside the range of the calibration data, and what to check."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from numpy.typing import NDArray
+
+from service.confidence.features import FEATURES
+from service.imaging.depth_unit_hint import unit_hint
+from service.maps.calibration import Calibration
+from service.scoring.scorer import SupportWeights
+
+#: A confidence feature is out of range if it is more than this many standard deviations from the mean of the calibration data.
+FAR = 3.0
+#: Factors of the focal length to try. A common error is to send the intrinsics of an image of half or twice the size.
+FOCAL_FACTORS = (0.5, 2.0)
+#: Smallest gain of the best pose's support, in nats, for which a changed query is named as the remedy: ``GAIN`` for the median of
+#: several queries (decision 0108), ``GAIN_OF_ONE`` for a single query (decision 0132). The limit is higher for a single query,
+#: because an out-of-map query may fit the map slightly better with any focal length.
+GAIN, GAIN_OF_ONE = 3.0, 6.0
+_WEIGHTS = SupportWeights()
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """One possible cause and what to check.
+
+    Attributes:
+        check: what may be wrong, for example ``baseline``.
+        evidence: confidence features out of range, each with its signed distance from the mean of the calibration data, in
+            standard deviations.
+        remedy: what to do.
+    """
+
+    check: str
+    evidence: tuple[tuple[str, float], ...]
+    remedy: str
+
+
+#: Possible causes, the likeliest first: name, confidence features that indicate it, remedy. Features without a weight in the
+#: confidence (``UNWEIGHED``) are left out.
+GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("intrinsics", ("facings",), "compare fx, fy, cx, cy and the picture's size with the camera's own calibration"),
+    ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
+    (
+        "field of view or depth range", ("measured", "far"),
+        "the pictures measure another share of the view grid than those that confidence was fitted on; check the range of the depth",
+    ),
+    ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m), and how noisy the depth is"),
+    (
+        "traffic in the map", ("through", "front", "inliers", "unmapped", "likelihood"),
+        "build the map with the traffic vote, and look for what has been built or has moved since the survey",
+    ),
+    (
+        "calibration", ("margin", "similarity_margin", "votes", "entropy", "pose_spread", "residual", "edges", "place_m"),
+        "the map's confidence was calibrated on queries unlike these: calibrate on queries like them (streetfix calibrate)",
+    ),
+)  # fmt: skip
+_TOO_LITTLE = Reason(
+    "depth", (), "too few pixels have a depth to be registered; check depth.scale_m and that depth belongs to the colour picture"
+)  # fmt: skip
+
+
+def reasons_of(
+    calibration: Calibration,
+    evidence: Float64[NDArray[np.float64], " F"] | None,
+    depth_m: Float32[NDArray[np.float32], "h w"] | None = None,
+) -> tuple[Reason, ...]:
+    """List what to check, the likeliest cause first; empty if all confidence features are in range and the depth is plausible.
+
+    Args:
+        calibration: calibration of the map.
+        evidence: confidence features of the answer; None if the images have too few points to register.
+        depth_m: depth image, metres, 0 where nothing was measured. If its unit looks wrong, this is the first reason. None does
+            not check the unit.
+    """
+    hint = None if depth_m is None else unit_hint(depth_m)
+    unit = () if hint is None else (Reason("depth unit", (), hint),)
+    named = {each.check for each in unit}
+    return (*unit, *(each for each in _by_evidence(calibration, evidence) if each.check not in named))
+
+
+def _by_evidence(calibration: Calibration, evidence: Float64[NDArray[np.float64], " F"] | None) -> tuple[Reason, ...]:
+    if evidence is None:
+        return (_TOO_LITTLE,)
+    away = (evidence - np.array(calibration.right.mean)) / np.array(calibration.right.spread)
+    found = []
+    for check, names, remedy in GROUPS:
+        deviations = ((name, float(away[FEATURES.index(name)])) for name in names)
+        far = tuple((name, size) for name, size in deviations if abs(size) > FAR)
+        if far:
+            found.append(Reason(check, far, remedy))
+    return tuple(found)
+
+
+def support_of(inliers: float, similarity: float) -> float:
+    """Compute the part of a pose's support that does not depend on other candidates, nats.
+
+    It serves to compare the answers to a query and to a changed copy of this query.
+
+    Args:
+        inliers: share of inliers, 0 to 1.
+        similarity: descriptor similarity at the pose.
+    """
+    return _WEIGHTS.inliers * inliers + _WEIGHTS.similarity * similarity

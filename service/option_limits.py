@@ -1,0 +1,14 @@
+"""Defaults and limits of a query's options. The contract and the core read them here, so a client needs no core."""
+
+#: Default and upper limit of the option ``neighbours``.
+NEIGHBOURS, MOST_NEIGHBOURS = 5, 50
+#: Default share of the out-of-map queries in calibration that may be accepted. All kinds have equal weight (decisions 0039, 0084).
+FALSE_ACCEPT_RATE = 0.02
+#: Lower limit of the option ``false_accept_rate``. No calibration could measure a lower rate.
+LEAST_FALSE_ACCEPT_RATE = 1e-6
+#: Limits of a camera's height above the ground, metres.
+LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.05, 30.0
+#: Limits of the standard deviation of a given height, and its default, metres.
+LEAST_HEIGHT_STD_M, MOST_HEIGHT_STD_M, HEIGHT_STD_M = 0.005, 2.0, 0.05
+#: Standard deviation of a height that follows from the camera's pose on the vehicle, metres: tyres, suspension and load.
+VEHICLE_HEIGHT_STD_M = 0.1

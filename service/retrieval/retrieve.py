@@ -1,0 +1,133 @@
+"""Retrieval: views and descriptors of an image pair, the most similar places, their clusters and the street vote."""
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from service.errors import BundleError
+from service.imaging.query_view import query_views
+from service.imaging.view_grid import ViewGrid
+from service.maps.reader import MapBundle
+from service.registration.points import inverse_depth_noise
+from service.retrieval.encoder import Encoder
+from service.retrieval.frame import Frame
+from service.retrieval.hypotheses import ClusterSettings, Hypothesis, cluster, rerank_with_prior
+from service.retrieval.knn import Neighbour, StreetVote, distinct_places, search_views, vote
+from service.retrieval.query import Query
+
+#: A query is searched at three turns, 5 degrees apart. The views of a place are 15 degrees apart, so one of the turns is within
+#: 2.5 degrees of a map view.
+TURN_RAD = float(np.deg2rad(5.0))
+
+#: Smallest number of distinct places to find. Registration starts from several of them.
+RANKED = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Retrieved:
+    """Result of retrieval.
+
+    Attributes:
+        neighbours: distinct places, the most similar first.
+        hypotheses: clusters of the most similar views, the heaviest first; a prior, if given, counts in this order.
+        vote: street vote of the k nearest places; None if the map has no streets.
+    """
+
+    neighbours: tuple[Neighbour, ...]
+    hypotheses: tuple[Hypothesis, ...]
+    vote: StreetVote | None
+
+
+def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: ClusterSettings) -> Frame:
+    """Encode one image pair and search the map for similar views.
+
+    Args:
+        bundle: the map.
+        encoder: encoder of the map.
+        query: image pair, camera and options.
+        clusters: settings of the clustering; they give the smallest number of views to find.
+
+    Returns:
+        The image pair as a reference frame: its ``T_reference_camera`` is the identity.
+
+    Raises:
+        NoDepthError: the depth image holds no measurement within the view grid.
+    """
+    started = perf_counter()
+    views = query_views(
+        query.rgb, query.depth_m, query.camera, turns=turns_on(bundle.grid),
+        grid=bundle.grid, rows_seen=bundle.rows_seen, down_camera=query.down_camera, given_height=query.camera_height,
+    )  # fmt: skip
+    fused = perf_counter()
+    descriptors = encoder.encode(views.planes, side="query")
+    encoded = perf_counter()
+    matches = search_views(
+        bundle, descriptors, turns_rad=views.turns_rad, places=places_of(query), fewest=clusters.views
+    )
+    # A query without registration does not need the noise. But a later query of a stream may register this frame (decision 0111).
+    noise = inverse_depth_noise(query.depth_m, focal_baseline_px_m=query.focal_baseline_px_m)
+    return Frame(
+        query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent,
+        fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,
+    )  # fmt: skip
+
+
+def retrieve(bundle: MapBundle, frame: Frame, clusters: ClusterSettings) -> Retrieved:
+    """Rank the places, cluster the views and vote over the streets, as the paper does.
+
+    Args:
+        bundle: the map.
+        frame: the reference, as ``look_up`` returned it.
+        clusters: settings of the clustering.
+    """
+    query = frame.query
+    neighbours = distinct_places(frame.matches, places_of(query))
+    hypotheses = rerank_with_prior(cluster(frame.matches, clusters), query.prior)
+    streets = None if bundle.streets is None else vote(neighbours[: query.neighbours], clusters.temperature)
+    return Retrieved(neighbours, hypotheses, streets)
+
+
+def turns_on(grid: ViewGrid) -> tuple[int, ...]:
+    """Return the turns at which a query is searched, in whole columns of the view grid, counter-clockwise.
+
+    Args:
+        grid: view grid of the map.
+    """
+    columns = max(1, round(TURN_RAD / grid.column_rad))
+    return (-columns, 0, columns)
+
+
+def places_of(query: Query) -> int:
+    """Return how many distinct places to search for.
+
+    Args:
+        query: query with its options.
+    """
+    return max(query.neighbours, query.ranked, RANKED)
+
+
+def require_encoder_of(bundle: MapBundle, encoder: Encoder) -> None:
+    """Refuse an encoder that did not compute the descriptors of a map.
+
+    Args:
+        bundle: the map.
+        encoder: encoder for the queries.
+
+    Raises:
+        BundleError: the encoder did not compute the map's descriptors, or reads another view grid.
+    """
+    expected, size = bundle.manifest.encoder_sha256, bundle.manifest.counts.descriptor_size
+    if encoder.sha256 != expected or encoder.dimension != size:
+        raise BundleError(
+            f"{bundle.path}: the descriptors ({size} numbers) are of encoder {expected[:12]}, not of "
+            f"{encoder.sha256[:12]} ({encoder.dimension} numbers): use the bundle's own, or build the map again",
+            field="encoder.onnx",
+        )
+    grid = (bundle.grid.rows, bundle.grid.columns)
+    if (encoder.rows, encoder.columns) != grid:
+        raise BundleError(
+            f"{bundle.path}: the encoder reads views of {encoder.rows} x {encoder.columns} cells, the map's have "
+            f"{grid[0]} x {grid[1]}: build the map again with a view grid that its encoder reads",
+            field="encoder.onnx",
+        )

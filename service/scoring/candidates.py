@@ -1,0 +1,145 @@
+"""Candidates: registered poses with their scores; which of them exclude each other, and each one's share of the support."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+
+from service.geometry.rigid import Transform
+from service.registration.register import Registered
+from service.scoring.rendered_depth import Agreement
+
+#: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
+RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A registered pose and its scores.
+
+    Attributes:
+        T_map_camera: pose of the reference camera.
+        registered: result of the solver. For the best candidate the ray adjustment then moves the pose by centimetres. Its
+            scores below come from before this adjustment.
+        similarity: descriptor similarity to the places around the pose, mean over the frames.
+        place_m: distance of these places from the pose in metres, mean over the frames.
+        agreement: agreement with the depth rendered from the map at the pose, mean over the frames.
+        brightness: agreement with the map's brightness, mean over the frames, 0 to 1; None if it was not computed.
+        support: weighted sum of the scores, in nats; only differences between candidates have a meaning.
+        covariance: of ``T_map_camera``, if the candidate is right: translation (m), then rotation (rad), in map axes, about the
+            camera. None if not computed.
+    """
+
+    T_map_camera: Transform
+    registered: Registered
+    similarity: float
+    place_m: float
+    agreement: Agreement
+    support: float
+    brightness: float | None = None
+    covariance: Float64[NDArray[np.float64], "6 6"] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refined:
+    """Result of registration.
+
+    Attributes:
+        candidates: registered poses, the best supported first.
+        covariance: of the best candidate: translation (m), then rotation (rad), in map axes, about the camera.
+        points: number of registered points, over all frames.
+        disagreement: variance inflation at the best pose: how much the image patches disagree about it, relative to their noise.
+        covariance_at: function that computes the covariance of a candidate without ray adjustment: of every one but the best.
+    """
+
+    candidates: tuple[Candidate, ...]
+    covariance: Float64[NDArray[np.float64], "6 6"]
+    points: int
+    disagreement: float
+    covariance_at: Callable[[Candidate], Float64[NDArray[np.float64], "6 6"]]
+
+    @property
+    def best(self) -> Candidate:
+        """The best supported candidate."""
+        return self.candidates[0]
+
+    def with_covariances(self) -> tuple[Candidate, ...]:
+        """Return all candidates, with a covariance for each of those that exclude each other.
+
+        A covariance takes about 0.5 ms. So only answers that are not LOCALIZED need this method.
+        """
+        distinct = {id(each) for each in distinct_candidates(self.candidates)}
+        return tuple(
+            replace(each, covariance=self.covariance_at(each))
+            if id(each) in distinct and each.covariance is None
+            else each
+            for each in self.candidates
+        )
+
+
+def is_rival(one: Candidate, other: Candidate) -> bool:
+    """Return whether two candidates exclude each other by position or rotation.
+
+    Args:
+        one: candidate.
+        other: another candidate.
+    """
+    apart = math.dist(one.T_map_camera[:3, 3], other.T_map_camera[:3, 3])
+    # The trace of the relative rotation is 1 + 2 cos(angle).
+    trace = (one.T_map_camera[:3, :3] * other.T_map_camera[:3, :3]).sum()
+    return bool(apart > RIVAL_M or trace < 1 + 2 * np.cos(RIVAL_RAD))
+
+
+def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
+    """Select candidates that exclude each other, the best supported one of each place.
+
+    Args:
+        candidates: registered poses, the best supported first.
+    """
+    kept: list[Candidate] = []
+    for candidate in candidates:
+        if all(is_rival(other, candidate) for other in kept):
+            kept.append(candidate)
+    return tuple(kept)
+
+
+def behind(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:
+    """Compute the support gap of each candidate to the best one, nats.
+
+    The gap grows with the square root of the number of frames, because the noise of their mean support falls with it.
+
+    Args:
+        distinct: candidates that exclude each other, the best supported first.
+        frames: number of image pairs in the query.
+    """
+    support = np.array([candidate.support for candidate in distinct])
+    less: Float64[NDArray[np.float64], " C"] = np.sqrt(frames) * (support[0] - support)
+    return less
+
+
+def log_shares(less: Float64[NDArray[np.float64], " C"]) -> Float64[NDArray[np.float64], " C"]:
+    """Compute the log of each candidate's share of the support: a log softmax.
+
+    Two candidates with equal support have a share of 1/2 each, six have 1/6 each.
+
+    Args:
+        less: support gaps, as returned by ``behind``, nats.
+    """
+    shares: Float64[NDArray[np.float64], " C"] = -less - np.log(np.exp(-less).sum())
+    return shares
+
+
+def shares_of(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:
+    """Compute each candidate's share of the support, 0 to 1; the shares sum to 1.
+
+    Args:
+        distinct: candidates that exclude each other, the best supported first; may be empty.
+        frames: number of image pairs in the query.
+    """
+    if not distinct:
+        return np.zeros(0)
+    shares: Float64[NDArray[np.float64], " C"] = np.exp(log_shares(behind(distinct, frames)))
+    return shares

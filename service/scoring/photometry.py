@@ -1,0 +1,162 @@
+"""Score poses by brightness: the patch-wise squared correlation of LiDAR intensity and image grey level.
+
+LiDAR intensity and grey level share neither scale nor sign. Leaves are bright in the infrared. A wall that looks darker than its
+neighbour may be brighter to the laser. But both mostly change at the same edges: panes, frames, kerbs, doors, posters. The squared
+correlation within a patch measures this and ignores the sign. The score does not use depth. So it distinguishes poses that depth
+cannot distinguish.
+
+Pandey et al., "Automatic Targetless Extrinsic Calibration", AAAI 2012, use mutual information of whole images. Patches were better
+here (decision 0100).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+from numpy.typing import NDArray
+
+from service.geometry.camera import PinholeCamera
+from service.registration.rays import met_by
+from service.registration.register import Registered
+from service.registration.visibility import SurfelRaycaster
+from service.scoring.measured import MeasuredFrame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotometrySettings:
+    """Settings of the brightness score, chosen on a validation city in November 2026 (decision 0100).
+
+    Attributes:
+        patch: edge of a patch, pixels of the small image.
+        known: least share of a patch's pixels that show a surfel with a brightness.
+        flat: standard deviation of the noise of a logarithmic brightness within a patch.
+        dark_grey: added to grey levels (0 to 255) before the logarithm, which levels off below this value.
+        dark_share: the same for the map's brightness, as a share of its mean over the pixels in view.
+    """
+
+    patch: int = 8
+    known: float = 0.5
+    flat: float = 0.05
+    dark_grey: float = 8.0
+    dark_share: float = 0.03
+
+
+def grey_of(
+    rgb: UInt8[NDArray[np.uint8], "h w 3"], camera: PinholeCamera, covered: tuple[float, float], settings: PhotometrySettings
+) -> Float32[NDArray[np.float32], "H W"]:  # fmt: skip
+    """Compute the logarithm of an image's grey levels at the resolution of a small camera (area means).
+
+    Args:
+        rgb: image of any size.
+        camera: intrinsics of the small image.
+        covered: shares of the image's width and height that the small image covers, from the left and from the top.
+        settings: of the score.
+    """
+    height, width = (max(1, round(side * share)) for side, share in zip(rgb.shape[:2], covered[::-1], strict=True))
+    grey = cv2.cvtColor(rgb[:height, :width], cv2.COLOR_RGB2GRAY)
+    small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    logarithm: Float32[NDArray[np.float32], "H W"] = np.log(small.astype(np.float32) + np.float32(settings.dark_grey))
+    return logarithm
+
+
+def agreement_of_brightness(
+    brightness: Float32[NDArray[np.float32], " n"], met: Int32[NDArray[np.int32], "H W"], grey: Float32[NDArray[np.float32], "H W"],
+    settings: PhotometrySettings,
+) -> float:  # fmt: skip
+    """Correlate the map's brightness with an image: mean squared correlation of all patches, from 0 to 1.
+
+    The score is 0 where no visible surfel has a brightness.
+
+    Args:
+        brightness: LiDAR intensity of each surfel, NaN where unknown.
+        met: index of the surfel in each pixel of the small image, -1 for none, as ``SurfelRaycaster.meet`` returns it.
+        grey: logarithmic grey levels, as ``grey_of`` returns them.
+        settings: of the score.
+    """
+    return squared_correlation(_drawn(brightness, met, settings), grey, settings)
+
+
+def _drawn(
+    brightness: Float32[NDArray[np.float32], " n"], met: Int32[NDArray[np.int32], "H W"], settings: PhotometrySettings
+) -> Float32[NDArray[np.float32], "H W"]:
+    """Logarithm of the brightness of each pixel's surfel, relative to the mean; NaN where unknown."""
+    values = np.where(met >= 0, brightness[np.maximum(met, 0)], np.float32(np.nan))
+    known = values[~np.isnan(values)]
+    mean = float(known.mean()) if known.size else 0.0
+    if not mean > 0:
+        return np.full(met.shape, np.nan, np.float32)
+    logarithm: Float32[NDArray[np.float32], "H W"] = np.log(values / np.float32(mean) + np.float32(settings.dark_share))
+    return logarithm
+
+
+def squared_correlation(
+    one: Float32[NDArray[np.float32], "H W"], other: Float32[NDArray[np.float32], "H W"], settings: PhotometrySettings
+) -> float:
+    """Average the squared correlation of two images over all patches; 0 if no patch has enough known pixels.
+
+    Args:
+        one: first image, NaN where unknown.
+        other: second image, known everywhere.
+        settings: of the score. Rows and columns that fill no whole patch are left out.
+    """
+    size = settings.patch
+    known = ~np.isnan(one)
+    m = _patches(known.astype(np.float32), size)
+    a, b = (_patches(np.where(known, picture, np.float32(0)), size) for picture in (one, other))
+    count = m.sum(axis=1)
+    enough = count >= settings.known * size * size
+    if not enough.any():
+        return 0.0
+    a, b, m, count = a[enough], b[enough], m[enough], count[enough]
+    a -= m * (a.sum(axis=1) / count)[:, None]
+    b -= m * (b.sum(axis=1) / count)[:, None]
+    noise = np.float32(settings.flat**2)
+    own, others, both = (np.einsum("pn,pn->p", x, y) / count for x, y in ((a, a), (b, b), (a, b)))
+    return float((both**2 / ((own + noise) * (others + noise))).mean())
+
+
+def _patches(picture: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Whole patches of an image, one per row: (patches, size x size)."""
+    down, across = picture.shape[0] // size, picture.shape[1] // size
+    whole = picture[: down * size, : across * size].reshape(down, size, across, size)
+    return np.ascontiguousarray(whole.transpose(0, 2, 1, 3)).reshape(down * across, size * size)
+
+
+class BrightnessScorer:
+    """Scorer of a query's images against the brightness of the map.
+
+    Args:
+        sights: ray casting into the map cloud.
+        measured: frames of the query, the reference first.
+        settings: of the score.
+    """
+
+    def __init__(
+        self, sights: SurfelRaycaster, measured: tuple[MeasuredFrame, ...], settings: PhotometrySettings
+    ) -> None:
+        self._sights, self._measured, self._settings = sights, measured, settings
+        self._greys: list[Float32[NDArray[np.float32], "H W"]] | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the map has brightness."""
+        return self._sights.cloud.brightness is not None
+
+    def score(self, pose: Registered) -> float:
+        """Return the mean squared correlation over all frames, 0 to 1; 0 if the map has no brightness.
+
+        Args:
+            pose: registered pose of the reference's level frame.
+        """
+        brightness = self._sights.cloud.brightness
+        if brightness is None:
+            return 0.0
+        if self._greys is None:  # many queries need no brightness, so the images are reduced at the first score
+            self._greys = [
+                grey_of(each.frame.query.rgb, each.blocks.camera, each.blocks.covered, self._settings)
+                for each in self._measured
+            ]
+        met = met_by(self._sights, [each.picture for each in self._measured], pose)
+        pairs = zip(met, self._greys, strict=True)
+        return float(np.mean([agreement_of_brightness(brightness, own, grey, self._settings) for own, grey in pairs]))

@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.confidence.decision import decide
+from service.confidence.features import FEATURES
+from service.maps.calibration import terms
+
+
+def odds(p):
+    return float(np.log(p / (1 - p)))
+
+
+@pytest.fixture(scope="module")
+def decided(calibration_json, calibration_of):
+    """What is made of a first feature whose size is the log odds of being right, and of whether the place is known."""
+
+    def made(right, known=0.5, rate=0.01, *, share=1.0, prior_nats=0.0, **changed):
+        first = np.eye(1, len(terms(len(FEATURES))))[0].tolist()
+        good = calibration_json()
+        calibration = calibration_of(
+            right=good["right"] | {"weights": first}, known=good["known"] | {"bias": odds(known)}, **changed
+        )
+        evidence = np.zeros(len(FEATURES))
+        evidence[0], evidence[FEATURES.index("log_share")] = odds(right), np.log(share)
+        return decide(calibration, evidence, rate, prior_nats=prior_nats)
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("right", "known", "rate", "status"),
+    [
+        (0.41, 0.9, 0.01, "LOCALIZED"),  # the threshold for one false accept in a hundred is 0.4
+        (0.39, 0.9, 0.01, "AMBIGUOUS"),
+        (0.39, 0.1, 0.01, "OUT_OF_MAP"),
+        (0.41, 0.1, 0.01, "LOCALIZED"),  # who is sure of the pose need not ask whether it is in the map
+        (0.89, 0.9, 0.001, "AMBIGUOUS"),  # and for one in a thousand 0.9
+        (0.91, 0.9, 0.001, "LOCALIZED"),
+        (0.39, 0.51, 0.01, "AMBIGUOUS"),
+        (0.39, 0.49, 0.01, "OUT_OF_MAP"),
+    ],
+)
+def test_the_status_follows_from_the_confidence_and_whether_the_place_is_in_the_map(
+    decided, right, known, rate, status
+):
+    found = decided(right, known, rate)
+    assert found.status == status
+    assert found.confidence == pytest.approx(right)
+    assert isinstance(found.confidence, float)
+
+
+def test_who_is_exactly_as_sure_as_asked_is_accepted_and_as_probably_known_as_not_is_ambiguous(decided):
+    accepted = decided(0.5, thresholds=[{"false_accept_rate": 0.01, "confidence": 0.5}])
+    refused = decided(0.5, 0.5, thresholds=[{"false_accept_rate": 0.01, "confidence": 0.51}])
+    assert (accepted.status, refused.status) == ("LOCALIZED", "AMBIGUOUS")
+
+
+@pytest.mark.parametrize("rate", [0.001, 0.5])
+def test_without_evidence_nothing_speaks_for_any_place(calibration_of, rate):
+    found = decide(calibration_of(), None, rate)
+    assert (found.status, found.confidence) == ("OUT_OF_MAP", 0.0)
+
+
+def test_the_maps_own_correction_counts_in_the_confidence_that_is_decided_on(decided):
+    """0.95 is above the threshold of 0.9; 0.05 less of log odds than leads from there to 0.9 is still, 0.05 more is not."""
+    enough = odds(0.95) - odds(0.9)
+    for less, status in ((0.0, "LOCALIZED"), (enough - 0.05, "LOCALIZED"), (enough + 0.05, "AMBIGUOUS")):
+        site = {"offset": -less, "queries": 10, "right": 5, "expected_calibration_error": 0.0}
+        assert decided(0.95, rate=0.001, site=site).status == status
+
+
+rate = st.floats(1e-6, 0.999)
+
+
+@given(st.floats(0.02, 0.98), st.floats(0.02, 0.98), rate, rate)
+def test_who_can_live_with_more_false_accepts_is_refused_no_answer_that_another_gets(decided, right, known, one, other):
+    strict, lax = decided(right, known, min(one, other)), decided(right, known, max(one, other))
+    assert strict.confidence == lax.confidence
+    assert lax.status == "LOCALIZED" or strict.status == lax.status
+
+
+@pytest.mark.parametrize(
+    ("share", "known", "status"),
+    [
+        (1.0, 0.9, "LOCALIZED"),
+        (0.51, 0.9, "LOCALIZED"),
+        (0.5, 0.9, "AMBIGUOUS"),  # two that are alike
+        (1 / 6, 0.9, "AMBIGUOUS"),
+        (1 / 6, 0.1, "OUT_OF_MAP"),
+    ],
+)
+def test_who_holds_no_more_than_half_of_the_support_of_all_places_is_not_accepted_however_sure(
+    decided, share, known, status
+):
+    found = decided(0.95, known, share=share)
+    assert found.status == status
+    assert found.confidence == pytest.approx(0.95)
+
+
+@pytest.mark.parametrize(
+    ("right", "known", "nats", "confidence"),
+    [
+        # Three to one against being in the map, times e^5: 148.4 / 3 to one. Right given known stays 0.1 / 0.25.
+        (0.1, 0.25, 5.0, 0.4 * 148.413 / 151.413),
+        (0.1, 0.25, np.log(3), 0.4 * 0.5),
+        # As surely right as known: the confidence is that of being known.
+        (0.25, 0.25, np.log(3), 0.5),
+        # More surely right than known is not more than sure.
+        (0.6, 0.25, np.log(3), 0.5),
+    ],
+)
+def test_a_prior_changes_the_odds_of_being_in_the_map_by_bayes_rule(decided, right, known, nats, confidence):
+    assert decided(right, known, prior_nats=nats).confidence == pytest.approx(confidence, rel=1e-4)
+
+
+def test_a_prior_makes_a_doubted_answer_an_accepted_one_and_a_stranger_an_ambiguous_one(decided):
+    assert decided(0.2, 0.25).status == "OUT_OF_MAP"
+    assert decided(0.2, 0.25, prior_nats=5.0).status == "LOCALIZED"
+    assert decided(0.02, 0.25, prior_nats=5.0).status == "AMBIGUOUS"
+
+
+@given(st.floats(0.01, 0.99), st.floats(0.01, 0.99), st.floats(0, 10))
+def test_no_prior_makes_a_confidence_beyond_one(decided, right, known, nats):
+    assert 0 <= decided(right, known, prior_nats=nats).confidence <= 1

@@ -1,0 +1,250 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.confidence.features import FEATURES, TABLE, evidence_of, require_features
+from service.confidence.shape import shape_of
+from service.errors import BundleError
+from service.geometry.rigid import rotation_z
+from service.imaging.view_grid import ViewGrid
+from service.maps.calibration import read_calibration
+from service.retrieval.hypotheses import Hypothesis
+from service.retrieval.knn import Neighbour
+from service.scoring.candidates import Refined
+from service.scoring.rendered_depth import Agreement
+
+
+def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
+    return Refined(
+        candidates, np.eye(6) if covariance is None else covariance, points, disagreement, lambda _: np.eye(6)
+    )
+
+
+def neighbour(x, similarity=0.5, *, y=0.0, z=0.0):
+    return Neighbour(0, similarity, 0.0, -1, np.array([x, y, z], np.float64), 0.0)
+
+
+def hypothesis(weight):
+    return Hypothesis(weight, np.zeros(3), 0.0, np.array([0.0, 0.0, 1.0]), 0, -1, 0.5, 1)
+
+
+@pytest.fixture(scope="module")
+def frame(frame_with, matches_at):
+    return frame_with(matches_at([(0, 0, 2)], [0], [0.9]))
+
+
+@pytest.fixture(scope="module")
+def weighed(candidate, frame):
+    """The evidence by name; whatever a test does not say is one candidate, one neighbour, one hypothesis, one frame."""
+
+    def weigh(*, candidates=None, neighbours=None, weights=(1.0,), frames=None, places=None, **options):
+        neighbours = neighbours or [neighbour(0)]
+        there = np.array(places or [each.position_m[:2] for each in neighbours], np.float64)
+        found = evidence_of(
+            frames or (frame,), refined(*(candidates or [candidate()]), **options), tuple(neighbours),
+            tuple(hypothesis(weight) for weight in weights), there, ViewGrid(),
+        )  # fmt: skip
+        assert found.shape == (len(FEATURES),)
+        return dict(zip(FEATURES, found.tolist(), strict=True))
+
+    return weigh
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("inliers", 0.7), ("similarity", 0.8), ("likelihood", -1.5), ("through", 0.02), ("front", 0.2), ("unmapped", 0.1),
+     ("measured", 0.75), ("place_m", 1.5)],
+)  # fmt: skip
+def test_what_is_known_of_the_best_candidate_is_told_as_it_is(candidate, weighed, name, expected):
+    other = replace(
+        candidate(-1.0, xyz=(50, 0, 1.5)), similarity=0.1, place_m=7.0, agreement=Agreement(-9.0, 0.9, 0.9, 0.9)
+    )
+    assert weighed(candidates=(candidate(), other))[name] == expected
+
+
+@pytest.mark.parametrize(("place_m", "expected"), [(0.0, 0.0), (9.9, 9.9), (10.1, 10.0), (1e4, 10.0)])
+def test_places_further_than_ten_metres_are_told_as_ten(candidate, weighed, place_m, expected):
+    """Calibration has seen no survey so sparse."""
+    assert weighed(candidates=(replace(candidate(), place_m=place_m),))["place_m"] == expected
+
+
+@pytest.mark.parametrize(
+    ("rivals", "margin"),
+    [
+        ([(4.0, (10, 0, 1.5), 0)], 6.0),
+        ([(4.0, (10, 0, 1.5), 0), (7.5, (0, 90, 1.5), 0)], 2.5),  # the best rival counts, wherever it comes
+        ([(9.9, (1, 0, 1.5), 0), (4.0, (10, 0, 1.5), 0)], 6.0),  # the next frame of the same street is none
+        ([(9.0, (0, 0, 1.5), 180)], 1.0),  # the other way round is one
+        ([(9.0, (3.1, 0, 1.5), 0)], 1.0),
+        ([(9.0, (2.9, 0, 1.5), 29)], 12.0),
+        ([(-50.0, (10, 0, 1.5), 0)], 12.0),  # more than 12 nats say no more
+        ([], 12.0),
+    ],
+)
+def test_the_margin_is_the_support_over_the_best_rival(candidate, weighed, rivals, margin):
+    others = [candidate(support, xyz=xyz, heading_deg=degrees) for support, xyz, degrees in rivals]
+    assert weighed(candidates=(candidate(10.0), *others))["margin"] == pytest.approx(margin)
+
+
+@pytest.mark.parametrize(
+    ("supports", "share"),
+    [
+        ([10.0], 1.0),
+        ([10.0, 10.0], 1 / 2),  # two alike
+        ([10.0] * 6, 1 / 6),  # six alike, whose margin is the same
+        ([10.0, 10.0 - np.log(3.0)], 3 / 4),
+        ([10.0, 9.0, 9.0], 1 / (1 + 2 / np.e)),
+        ([10.0, -990.0], 1.0),
+    ],
+)
+def test_the_share_is_the_best_ones_among_all_that_exclude_each_other(candidate, weighed, supports, share):
+    """And the next frame of the same street takes nothing from it."""
+    apart = [candidate(support, xyz=(20 * k, 0, 1.5)) for k, support in enumerate(supports)]
+    near = [candidate(support, xyz=(20 * k + 1, 0, 1.5)) for k, support in enumerate(supports)]
+    for candidates in (apart, [*apart, *near]):
+        assert weighed(candidates=tuple(candidates))["log_share"] == pytest.approx(np.log(share))
+
+
+def test_the_similarity_is_told_against_the_best_place_that_is_another(weighed):
+    """10.1 m along or across is another place, 9.9 m is not; height does not make one."""
+    places = [
+        neighbour(0, 0.95),
+        neighbour(9.9, 0.9),
+        neighbour(0, 0.85, z=50),
+        neighbour(0, 0.6, y=-10.1),
+        neighbour(90, 0.55),
+    ]
+    assert weighed(neighbours=places)["similarity_margin"] == pytest.approx(0.8 - 0.6)
+
+
+def test_where_no_other_place_was_found_half_is_taken_for_its_similarity(weighed):
+    assert weighed(neighbours=[neighbour(0, 0.95), neighbour(5, 0.9)])["similarity_margin"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "votes"),
+    [
+        ([0], 1.0),
+        ([0, 4.9, 5.1, -4.9], 1.0),  # all that are there
+        ([50] * 20, 0.0),
+        ([0] * 5 + [50] * 15 + [0] * 20, 0.25),
+        ([0] * 40, 1.0),
+    ],
+)
+def test_votes_are_the_first_twenty_places_that_lie_around_the_answer_of_those_that_do(weighed, x_m, votes):
+    assert weighed(neighbours=[neighbour(x) for x in x_m])["votes"] == votes
+
+
+def test_a_sparse_survey_has_fewer_places_to_vote_but_no_smaller_a_share(weighed):
+    voters = [neighbour(x) for x in (0, 50, 60, 70)]
+    dense, sparse = [(float(x), 0.0) for x in range(-4, 5)], [(0.0, 0.0), (10.0, 0.0)]
+    assert weighed(neighbours=voters, places=sparse)["votes"] == 1.0
+    assert weighed(neighbours=voters, places=dense)["votes"] == pytest.approx(1 / 9)
+
+
+@pytest.mark.parametrize(
+    ("weights", "entropy"), [([1.0], 0.0), ([0.25] * 4, np.log(4)), ([0.5, 0.5], np.log(2)), ([1.0, 0.0], 0.0)]
+)
+def test_entropy_tells_among_how_many_clusters_the_weight_is_spread(weighed, weights, entropy):
+    assert weighed(weights=weights)["entropy"] == pytest.approx(entropy, abs=1e-9)
+
+
+def test_sigma_is_that_of_the_worst_horizontal_direction(weighed):
+    """0.3 m along a street that runs at 30 degrees, 0.1 m across; 2 m of height do not count."""
+    R = rotation_z(np.deg2rad(30))
+    covariance = np.eye(6)
+    covariance[:3, :3] = R @ np.diag([0.09, 0.01, 4.0]) @ R.T
+    assert weighed(covariance=covariance)["log_sigma"] == pytest.approx(np.log(0.3))
+
+
+@pytest.mark.parametrize("scale", [1.02, 1 / 1.02])
+def test_scale_is_told_in_hundredths_whichever_way_it_is_off(candidate, weighed, scale):
+    assert weighed(candidates=(candidate(scale=scale),))["scale"] == pytest.approx(100 * np.log(1.02))
+
+
+def test_the_noise_is_the_median_of_the_frames_and_points_are_counted_a_frame(weighed, frame):
+    frames = tuple(replace(frame, noise=noise) for noise in (1e-3, 1e-4, 5e-4))
+    found = weighed(frames=frames, points=4500)
+    assert found["log_noise"] == pytest.approx(np.log(5e-4))
+    assert found["points"] == pytest.approx(0.5)
+    assert weighed(points=4500)["points"] == pytest.approx(1.5)
+
+
+def test_distances_are_from_the_best_candidate(candidate, weighed):
+    there = candidate(10.0, xyz=(100, 0, 1.5))
+    places = [neighbour(0, 0.9), neighbour(100, 0.7)]
+    map_places = [(0.0, 0.0), (98.0, 0.0), (100.0, 0.0)]
+    found = weighed(candidates=(there, candidate(1.0)), neighbours=places, places=map_places)
+    assert found["votes"] == 0.5
+    assert found["similarity_margin"] == pytest.approx(0.8 - 0.9)
+
+
+def test_margins_of_several_frames_count_by_the_root_of_their_number(candidate, weighed, frame):
+    asked = {
+        "candidates": (candidate(10.0), candidate(7.0, xyz=(20, 0, 1.5))),
+        "neighbours": [neighbour(0), neighbour(30)],
+    }
+    one, four = weighed(**asked), weighed(**asked, frames=(frame,) * 4)
+    assert one["margin"] == pytest.approx(3.0)
+    assert four["margin"] == pytest.approx(6.0)
+    assert one["log_share"] == pytest.approx(-np.log1p(np.exp(-3)))
+    assert four["log_share"] == pytest.approx(-np.log1p(np.exp(-6)))
+    assert four["similarity_margin"] == pytest.approx(2 * one["similarity_margin"])
+
+
+def test_the_shape_is_that_of_the_view_straight_ahead(frame, weighed):
+    """Of three turns the middle one: a wall 6 m ahead with a post, whatever the others show."""
+    planes = np.zeros((3, 6, ViewGrid().rows, ViewGrid().columns), np.float32)
+    planes[1, 0] = 6.0
+    planes[1, 0, :, 40:44] = 3.0
+    views = replace(frame.views, planes=planes, turns_rad=(-0.09, 0.0, 0.09))
+    found = weighed(frames=(replace(frame, views=views),))
+    assert found["far"] == pytest.approx(np.log(6.0))
+    assert found["edges"] == pytest.approx(2 / 127)
+    assert found["facings"] == pytest.approx(shape_of(planes[1, 0], ViewGrid()).facings)
+
+
+def test_the_residual_is_the_logarithm_of_the_patches_disagreement(weighed):
+    assert weighed(disagreement=np.e**2)["residual"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "expected"),
+    [
+        ((0, 0, 0, 0, 0), 0.1),
+        ((3,), 0.1),
+        ((-5, 5), 5.1),
+        ((0, 0, 0, 0, 10), 4.1),  # variance 16
+        ((0, 0, 0, 0, 0, 1000), 0.1),  # the sixth does not count
+    ],
+)
+def test_the_spread_is_that_of_the_five_most_similar_places(weighed, x_m, expected):
+    found = weighed(neighbours=[neighbour(x) for x in x_m])
+    assert found["pose_spread"] == pytest.approx(np.log(expected))
+
+
+@pytest.mark.parametrize("features", [FEATURES[::-1], (*FEATURES[:-1], "more")])
+def test_a_calibration_of_other_features_is_refused(calibration_json, features):
+    document = calibration_json(features=list(features))
+    calibration = read_calibration(json.dumps(document).encode(), path="x")
+    with pytest.raises(BundleError, match=r"^maps/town: its features are not this program's: margin, inliers") as error:
+        require_features(calibration, "maps/town")
+    assert error.value.field == "calibration.json"
+    require_features(read_calibration(json.dumps(calibration_json()).encode(), path="x"), "maps/town")
+    require_features(None, "maps/town")
+
+
+def test_the_table_is_complete_and_its_names_are_unique():
+    assert len(set(FEATURES)) == len(TABLE)
+    assert all(feature.unit and feature.meaning for feature in TABLE)
+    assert {feature.sign for feature in TABLE} == {-1, 0, 1}
+
+
+def test_the_documents_describe_every_feature_as_the_table_does():
+    text = (Path(__file__).parents[3] / "docs" / "how_it_works.md").read_text()
+    signs = {1: "+", -1: "-", 0: ""}
+    expected = [f"| `{each.name}` | {each.unit} | {each.meaning} | {signs[each.sign]} |" for each in TABLE]
+    assert [line for line in text.splitlines() if line in expected] == expected

@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+
+from service.confidence.features import FEATURES, UNWEIGHED
+from service.confidence.reasons import FAR, GROUPS, reasons_of, support_of
+from service.scoring.scorer import SupportWeights
+
+
+@pytest.fixture
+def calibration(calibration_of):
+    """Means of 2 and standard deviations of 0.5 for all evidence."""
+    flat = calibration_of().right.model_dump()
+    return calibration_of(right=flat | {"mean": [2.0] * len(FEATURES), "spread": [0.5] * len(FEATURES)})
+
+
+def evidence_of(**deviations):
+    """A row of evidence that lies so many standard deviations from the means."""
+    row = np.full(len(FEATURES), 2.0)
+    for name, size in deviations.items():
+        row[FEATURES.index(name)] += 0.5 * size
+    return row
+
+
+def told(reasons):
+    return [(each.check, each.evidence) for each in reasons]
+
+
+@pytest.mark.parametrize("size", [4.0, -4.0])
+def test_evidence_four_deviations_off_gives_its_reason_and_no_other(calibration, size):
+    (reason,) = reasons_of(calibration, evidence_of(log_noise=size))
+    assert (reason.check, reason.evidence) == ("baseline", (("log_noise", size),))
+    assert "depth.baseline_m" in reason.remedy
+
+
+@pytest.mark.parametrize("size", [0.0, 2.5, FAR, -FAR])
+def test_evidence_in_the_range_that_calibration_saw_gives_none(calibration, size):
+    assert reasons_of(calibration, evidence_of(**dict.fromkeys(FEATURES, size))) == ()
+
+
+def test_the_likeliest_reason_comes_first_and_one_remedy_is_told_once(calibration):
+    evidence = evidence_of(
+        margin=-5, front=4, through=8, points=-3.5, measured=-4, scale=6, facings=-10, similarity=-9, inliers=-2
+    )
+    assert told(reasons_of(calibration, evidence)) == [
+        ("intrinsics", (("facings", -10.0),)),
+        ("depth unit", (("scale", 6.0),)),
+        ("field of view or depth range", (("measured", -4.0),)),
+        ("baseline", (("points", -3.5),)),
+        ("traffic in the map", (("through", 8.0), ("front", 4.0))),
+        ("calibration", (("margin", -5.0),)),
+    ]
+
+
+def test_all_evidence_that_confidence_weighs_has_one_remedy():
+    names = [name for _, features, _ in GROUPS for name in features]
+    assert sorted(names) == sorted(set(FEATURES) - set(UNWEIGHED))
+
+
+def test_pictures_that_hold_too_little_to_register_speak_of_depth(calibration):
+    (reason,) = reasons_of(calibration, None)
+    assert (reason.check, reason.evidence) == ("depth", ())
+    assert "depth.scale_m" in reason.remedy
+
+
+def test_support_is_what_the_judge_gives_for_inliers_and_similarity():
+    weights = SupportWeights()
+    assert support_of(0.5, 0.75) == 0.5 * weights.inliers + 0.75 * weights.similarity == 61.0
+
+
+def test_a_depth_in_another_unit_is_the_first_reason_and_is_told_once(calibration):
+    evidence = evidence_of(facings=-10, scale=6)
+    depth_m = np.full((4, 4), 5000, np.float32)
+    unit, intrinsics = reasons_of(calibration, evidence, depth_m)
+    assert (unit.check, unit.evidence, intrinsics.check) == ("depth unit", (), "intrinsics")
+    assert "looks like millimetres: send scale_m 0.001" in unit.remedy
+    assert told(reasons_of(calibration, None, depth_m)) == [("depth unit", ()), ("depth", ())]
+    assert reasons_of(calibration, evidence, depth_m / np.float32(1000)) == reasons_of(calibration, evidence)

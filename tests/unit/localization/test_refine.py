@@ -1,0 +1,480 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.geometry.camera import PinholeCamera
+from service.geometry.rigid import R_BODY_OPTICAL, heading_of_camera, inverse, rotation_y, rotation_z, transform_from
+from service.localization import refine as refining
+from service.localization.refine import RefineSettings, refine, settings_for_rig
+from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, score_outer_product
+from service.registration.local_search import LocalPose
+from service.registration.points import PointSettings, inverse_depth_noise
+from service.registration.rays import RaySettings, adjust
+from service.registration.register import RegistrationSettings
+from service.registration.visibility import SurfelRaycaster
+from service.retrieval.prior import Prior
+from service.retrieval.starts import StartSettings
+from service.scoring import similarity as similar
+from service.scoring.measured import measure
+from service.scoring.photometry import BrightnessScorer
+from service.scoring.scorer import LocalScoreWeights, SupportWeights
+from service.scoring.similarity import similarity_of
+
+CAMERA = PinholeCamera(80, 60, 50.0, 50.0, 39.5, 29.5)
+R_LEVEL_CAMERA = rotation_y(np.deg2rad(4.0)) @ R_BODY_OPTICAL
+HEADING_DEG = 5.0
+TRUE = transform_from(rotation_z(np.deg2rad(HEADING_DEG)) @ R_LEVEL_CAMERA, np.array([0.8, 0.5, 1.5]))
+EVERY_VIEW = StartSettings(less_similar=3.0)  # no two cosines are so far apart
+BY_INLIERS = RegistrationSettings(similarity_weight=0.0)  # so that candidates of both streets come to the end
+
+
+@pytest.fixture(scope="module")
+def cloud(scene_of, streets_at):
+    """The street, and 40 m beside it its like without lorry and pillar."""
+    return scene_of(*streets_at(-6.0, 0.0), *streets_at(-6.0, 40.0)[:4]).survey()
+
+
+def taken(street, T_map_camera, *, seed=8):
+    """Depth with some noise."""
+    inverse_depth = 1 / np.maximum(street.depth(CAMERA, T_map_camera), 1e-3)
+    noise = np.random.default_rng(seed).normal(0, 1e-4, inverse_depth.shape)
+    return (1 / (inverse_depth + noise)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def depth(street):
+    """Taken in the street itself."""
+    return taken(street, TRUE)
+
+
+@pytest.fixture(scope="module")
+def bundle_like(bundle_at):
+    """Five places in the street beside, five in the true one; every view of a street is alike similar to (1, 0)."""
+
+    def bundle(beside, true):
+        xyz = [(x, y, 1.8) for y in (40.0, 0.0) for x in range(5)]
+        views = [(s, np.sqrt(1 - s * s)) for s in (beside, true) for _ in range(5)]
+        return bundle_at(xyz, [0.0], views)
+
+    return bundle
+
+
+@pytest.fixture(scope="module")
+def bundle(bundle_like):
+    return bundle_like(0.9, 0.4)
+
+
+@pytest.fixture
+def both(matches_at):
+    """The similar views lie in the street beside the true one, and in the true one."""
+    return matches_at([(0, 40, 1.8), (0, 0, 1.8)], [0, 0], [0.9, 0.4])
+
+
+@pytest.fixture
+def here(matches_at):
+    return matches_at([(0, 0, 1.8)], [0], [0.9])
+
+
+@pytest.fixture
+def seen_in(frame_with):
+    """A frame of a depth picture."""
+
+    def frame(depth_m, matches, *, R_level_camera=R_LEVEL_CAMERA, T_reference_camera=None):
+        noise = inverse_depth_noise(depth_m).total if depth_m.any() else 1e-4
+        return frame_with(
+            matches, depth_m=depth_m, camera=CAMERA, R_level_camera=R_level_camera, height_m=1.5, noise=noise,
+            T_reference_camera=T_reference_camera,
+        )  # fmt: skip
+
+    return frame
+
+
+def always_refined(bundle, cloud, frames, prior, settings):
+    """Refine candidates of which at least one has an answer."""
+    found = refine(bundle, cloud, frames, prior, settings)
+    assert found is not None
+    return found
+
+
+def refined(bundle, cloud, *frames, prior=None, **weights):
+    support = SupportWeights(**weights) if weights else SupportWeights()
+    return refine(
+        bundle, cloud, frames, prior, RefineSettings(starts=EVERY_VIEW, support=support, registration=BY_INLIERS)
+    )
+
+
+ONLY_INLIERS = {"inliers": 1.0, "similarity": 0.0, "likelihood": 0.0}
+
+
+def test_a_picture_is_found_where_it_was_taken(bundle, cloud, depth, here, seen_in):
+    found = refined(bundle, cloud, seen_in(depth, here))
+    assert found is not None
+    T = found.best.T_map_camera
+    np.testing.assert_allclose(T[:3, 3], TRUE[:3, 3], atol=0.05)
+    assert np.rad2deg(heading_of_camera(T)) == pytest.approx(HEADING_DEG, abs=0.2)
+    np.testing.assert_allclose(T[:3, :3], TRUE[:3, :3], atol=0.005)
+    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_every_candidates_pose_is_its_cameras_and_the_covariance_the_firsts(bundle, cloud, depth, both, seen_in):
+    found = refined(bundle, cloud, seen_in(depth, both))
+    assert found.best is found.candidates[0]
+    for each in found.candidates:
+        np.testing.assert_array_equal(each.T_map_camera[:3, 3], each.registered.camera_m)
+        R_map_level = each.T_map_camera[:3, :3] @ R_LEVEL_CAMERA.T
+        np.testing.assert_allclose(R_map_level, each.registered.R_map_level, atol=1e-12)
+    np.testing.assert_array_equal(found.covariance, found.covariance.T)
+    deviation, best = np.sqrt(np.diag(found.covariance)[:3]), found.best.registered
+    assert (np.abs(TRUE[1, 3] + 40 * (best.hypothesis == 0) - best.camera_m[1])) < 4 * deviation[1] + 0.02
+    assert deviation.max() < 0.3
+
+
+@pytest.mark.parametrize(("weight", "y_m"), [(0.0, 0.5), (1.0, 40.5)])
+def test_the_weight_of_the_similarity_decides_between_two_like_streets(
+    bundle, cloud, depth, both, seen_in, weight, y_m
+):
+    """The true street fits better; the views of the other one are more similar by 0.5."""
+    found = refined(bundle, cloud, seen_in(depth, both), inliers=1.0, similarity=weight, likelihood=0.0)
+    inliers = {each.registered.hypothesis: each.registered.inliers for each in reversed(found.candidates)}
+    assert inliers[0] < inliers[1] < inliers[0] + 0.5
+    assert found.best.T_map_camera[1, 3] == pytest.approx(y_m, abs=0.3)
+    assert found.best.registered.hypothesis == (0 if weight else 1)
+
+
+@pytest.mark.parametrize("weights", [{}, ONLY_INLIERS, {"inliers": 0.0, "similarity": 0.0, "likelihood": 1.0}])
+def test_like_similarity_leaves_it_to_the_points(bundle_like, cloud, depth, both, seen_in, weights):
+    found = refined(bundle_like(0.7, 0.7), cloud, seen_in(depth, both), **weights)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(0.5, abs=0.05)
+
+
+def test_similarity_is_of_the_places_around_the_pose_not_of_the_view_that_it_started_from(
+    bundle, cloud, depth, matches_at, seen_in
+):
+    """The start in the true street came by a match of 0.95, but what stands there is 0.4 similar."""
+    found = refined(bundle, cloud, seen_in(depth, matches_at([(0, 0, 1.8)], [0], [0.95])))
+    assert [each.similarity for each in found.candidates] == pytest.approx([0.4] * len(found.candidates), abs=1e-6)
+
+
+def test_candidates_come_in_the_order_of_their_support(bundle, cloud, depth, both, seen_in):
+    found = refined(bundle, cloud, seen_in(depth, both), inliers=2.0, similarity=3.0, likelihood=0.5)
+    sums = [2 * c.registered.inliers + 3 * c.similarity + 0.5 * c.agreement.likelihood for c in found.candidates]
+    support = [candidate.support for candidate in found.candidates]
+    assert len(support) > 1
+    assert support == pytest.approx(sums)
+    assert support == sorted(support, reverse=True)
+
+
+@pytest.mark.parametrize(("y_m", "heading_rad"), [(0.0, None), (40.0, None), (40.0, 0.0)])
+def test_a_prior_decides_where_nothing_else_does(bundle, cloud, depth, both, seen_in, y_m, heading_rad):
+    prior = Prior(position_m=np.array([0.0, y_m]), position_std_m=10.0, heading_rad=heading_rad)
+    nothing = {"inliers": 0.0, "similarity": 0.0, "likelihood": 0.0}
+    found = refined(bundle, cloud, seen_in(depth, both), prior=prior, **nothing)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(y_m + 0.5, abs=0.3)
+    xy = np.array([each.T_map_camera[:2, 3] for each in found.candidates])
+    headings = np.array([heading_of_camera(each.T_map_camera) for each in found.candidates])
+    np.testing.assert_allclose(
+        [each.support for each in found.candidates], prior.log_weight(xy, headings), atol=5e-3
+    )  # the camera's heading is the level frame's but for the lean
+
+
+def test_an_empty_picture_is_not_registered(bundle, cloud, depth, both, seen_in):
+    assert refined(bundle, cloud, seen_in(np.zeros_like(depth), both)) is None
+
+
+def test_a_picture_of_too_few_points_is_not_registered(bundle, cloud, depth, both, seen_in):
+    few = np.zeros_like(depth)
+    few[20, 10:39] = depth[20, 10:39]
+    assert refined(bundle, cloud, seen_in(few, both)) is None
+    few[20, 39:45] = depth[20, 39:45]
+    found = refined(bundle, cloud, seen_in(few, both))
+    assert found is not None
+    assert 30 <= found.points <= 35
+
+
+@pytest.fixture
+def judged(cloud, monkeypatch):
+    """The cloud with some brightness, and what brightness is then said to say of each pose that is asked about: its y."""
+    asked_y_m = []
+
+    def brightness(scorer, pose):
+        assert scorer.is_known
+        asked_y_m.append(pose.camera_m[1])
+        return float(pose.camera_m[1])
+
+    monkeypatch.setattr(BrightnessScorer, "score", brightness)
+    return replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32)), asked_y_m
+
+
+def test_brightness_decides_among_candidates_that_are_close(bundle_like, judged, depth, both, seen_in):
+    lit, asked_y_m = judged
+    weights = {"inliers": 1.0, "similarity": 0.0, "likelihood": 0.0, "behind": 5.0}
+    without = refined(bundle_like(0.7, 0.7), lit, seen_in(depth, both), brightness=0.0, **weights)
+    found = refined(bundle_like(0.7, 0.7), lit, seen_in(depth, both), brightness=0.1, **weights)
+    assert without.best.T_map_camera[1, 3] == pytest.approx(0.5, abs=0.1)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(40.5, abs=0.3)
+    assert len(asked_y_m) == 2 * len(found.candidates) > 2
+    support = [candidate.support for candidate in found.candidates]
+    assert support == sorted(support, reverse=True)
+    for each in found.candidates[1:]:  # the first was adjusted after it was judged
+        assert each.support == pytest.approx(each.registered.inliers + 0.1 * each.registered.camera_m[1])
+
+
+def test_who_is_far_behind_is_not_drawn_and_stays_behind(bundle_like, judged, depth, both, seen_in):
+    """By similarity the street beside is 9 nats behind; its brightness, which would make up for that, is not asked."""
+    lit, asked_y_m = judged
+    weights = {"inliers": 1.0, "similarity": 30.0, "likelihood": 0.0, "behind": 5.0}
+    unlit = refined(bundle_like(0.4, 0.7), replace(lit, brightness=None), seen_in(depth, both), **weights)
+    assert asked_y_m == []
+    found = refined(bundle_like(0.4, 0.7), lit, seen_in(depth, both), brightness=10.0, **weights)
+    assert found.best.T_map_camera[1, 3] == pytest.approx(0.5, abs=0.1)
+    assert max(asked_y_m, default=0.0) < 20.0
+    beside = [[c.support - r.best.support for c in r.candidates if c.T_map_camera[1, 3] > 20] for r in (unlit, found)]
+    assert max(beside[1]) <= max(beside[0]) + 1e-9 < -5
+
+
+def test_the_picture_tells_two_streets_apart_that_differ_in_paint_alone(bundle_like, cloud, depth, both, seen_in):
+    """The map's own brightness as the true pose shows it, as a picture of other size and sign."""
+    rng = np.random.default_rng(2)
+    lit = replace(cloud, brightness=rng.uniform(0.05, 1.0, len(cloud.surfels)).astype(np.float32))
+    frame = seen_in(depth, both)
+    camera = CAMERA.scaled_to(160, 120)
+    T = TRUE.copy()
+    T[:3, 3] -= lit.origin_m
+    met = SurfelRaycaster(lit, RaySettings()).meet(T, camera)
+    grey = np.where(met >= 0, 255 - 200 * lit.brightness[np.maximum(met, 0)], 128).astype(np.uint8)
+    frame = replace(frame, query=replace(frame.query, rgb=np.repeat(grey[..., None], 3, axis=2)))
+    weights = {"inliers": 1.0, "similarity": 2.0, "likelihood": 0.0}
+    blind, found = (refined(bundle_like(0.9, 0.4), each, frame, brightness=30.0, **weights) for each in (cloud, lit))
+    assert blind.best.T_map_camera[1, 3] == pytest.approx(40.5, abs=0.3)
+    np.testing.assert_allclose(found.best.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
+
+
+def test_a_noisy_pictures_best_pose_is_looked_around_and_moves_to_what_shows_the_paint(
+    bundle_like, cloud, depth, here, seen_in, monkeypatch
+):
+    """Points say nothing between poses along a bare street; brightness is said to be best 1.4 m ahead of where registration ends."""
+    lit = replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32))
+    ahead = TRUE[:3, 3] + 1.4 * np.array([np.cos(np.deg2rad(HEADING_DEG)), np.sin(np.deg2rad(HEADING_DEG)), 0])
+    monkeypatch.setattr(BrightnessScorer, "score", lambda _, pose: -float(np.linalg.norm(pose.camera_m - ahead)))
+    near = [LocalPose(each, 0.5) for each in _shifted(refined(bundle_like(0.4, 0.9), lit, seen_in(depth, here)))]
+    monkeypatch.setattr(refining, "search_locally", lambda *_: near)
+    still = RaySettings(fewest=10**6)  # nothing is adjusted
+    smooth = replace(
+        seen_in(depth, here), noise=5e-3
+    )  # errors that near pixels share make no hollows beside the right pose
+    noisy = replace(smooth, independent_noise=5e-3)
+    found = {}
+    for name, frame, settings in (
+        ("noisy", noisy, RefineSettings(rays=still)),
+        ("exact", seen_in(depth, here), RefineSettings(rays=still)),
+        ("smooth", smooth, RefineSettings(rays=still)),
+        ("sure", noisy, RefineSettings(rays=still, near=LocalScoreWeights(stay=1e6))),
+    ):
+        near[0] = LocalPose(_registered_by(bundle_like(0.4, 0.9), lit, frame), 0.5)
+        found[name] = always_refined(bundle_like(0.4, 0.9), lit, (frame,), None, settings)
+    moved, sure = found["noisy"], found["sure"]
+    np.testing.assert_allclose(moved.best.T_map_camera[:3, 3], ahead, atol=0.05)
+    for stayed in (found["exact"], found["smooth"], sure):
+        np.testing.assert_allclose(stayed.best.T_map_camera[:3, 3], TRUE[:3, 3], atol=0.05)
+    assert moved.best.support >= sure.best.support
+
+
+def _registered_by(bundle, lit, frame):
+    """What registration alone makes of a frame."""
+    return always_refined(
+        bundle, replace(lit, brightness=None), (frame,), None, RefineSettings(rays=RaySettings(fewest=10**6))
+    ).best.registered
+
+
+def _shifted(found):
+    best = found.best.registered
+    ahead = best.R_map_level @ [1.4, 0.0, 0.0]
+    return [best, replace(best, camera_m=best.camera_m + ahead), replace(best, camera_m=best.camera_m - ahead)]
+
+
+# A frame 2 m further on that is turned by 20 degrees, leans otherwise, and was levelled otherwise too.
+R_LEVEL_OTHER = rotation_y(np.deg2rad(-3.0)) @ R_BODY_OPTICAL
+OTHER = transform_from(rotation_z(np.deg2rad(25.0)) @ R_LEVEL_OTHER, np.array([2.8, 0.3, 1.6]))
+
+
+@pytest.fixture
+def two_frames(street, depth, here, seen_in):
+    other = seen_in(
+        taken(street, OTHER, seed=9), here, R_level_camera=R_LEVEL_OTHER, T_reference_camera=inverse(TRUE) @ OTHER
+    )
+    return seen_in(depth, here), other
+
+
+def test_two_frames_together_are_found_where_the_reference_was_taken(bundle, cloud, two_frames):
+    found = refined(bundle, cloud, *two_frames)
+    np.testing.assert_allclose(found.best.T_map_camera, TRUE, atol=0.03)
+    alone = [refined(bundle, cloud, replace(frame, T_reference_camera=np.eye(4))).points for frame in two_frames]
+    assert found.points == sum(alone)
+
+
+def test_what_another_frame_saw_finds_a_reference_that_saw_nothing(bundle, cloud, depth, here, two_frames, seen_in):
+    found = refined(bundle, cloud, seen_in(np.zeros_like(depth), here), two_frames[1])
+    np.testing.assert_allclose(found.best.T_map_camera, TRUE, atol=0.1)
+    assert found.best.agreement.through < 0.02
+
+
+def test_agreement_is_the_mean_of_what_each_frame_sees_from_where_it_stood(bundle, cloud, two_frames, matches_at):
+    found = refined(bundle, cloud, *two_frames).best
+    alone = []
+    for frame, T_true, heading_deg in zip(two_frames, (TRUE, OTHER), (5, 25), strict=True):
+        there = matches_at([(*T_true[:2, 3], 1.8)], [heading_deg], [0.9])
+        own = refined(bundle, cloud, replace(frame, T_reference_camera=np.eye(4), matches=there)).best
+        np.testing.assert_allclose(own.T_map_camera, T_true, atol=0.05)
+        alone.append(own.agreement)
+    assert found.agreement.likelihood == pytest.approx(np.mean([each.likelihood for each in alone]), abs=0.1)
+    assert found.agreement.through == pytest.approx(np.mean([each.through for each in alone]), abs=0.02)
+
+
+def test_it_does_not_matter_in_which_level_frame_a_frame_is_told(bundle, cloud, two_frames, matches_at):
+    """The second one's turned by a right angle, and the heading of what it resembles with it."""
+    other = two_frames[1]
+    views = replace(other.views, R_level_camera=rotation_z(np.pi / 2) @ other.R_level_camera)
+    turned = replace(other, views=views, matches=matches_at([(0, 0, 1.8)], [-90], [0.9]))
+    one, same = (refined(bundle, cloud, two_frames[0], each) for each in (other, turned))
+    np.testing.assert_allclose(same.best.T_map_camera, one.best.T_map_camera, atol=1e-4)
+    np.testing.assert_allclose(same.covariance, one.covariance, rtol=1e-2, atol=1e-9)
+    assert same.best.agreement.likelihood == pytest.approx(one.best.agreement.likelihood, abs=0.01)
+
+
+def test_similarity_is_the_mean_over_frames(bundle, cloud, two_frames):
+    """In the true street, whose views are (0.4, 0.917), a frame of (1, 0) is 0.4 similar and one of (0, 1) 0.917."""
+    across = replace(two_frames[1], descriptors=np.array([[0.0, 1.0]], np.float32))
+    found = refined(bundle, cloud, two_frames[0], across)
+    assert found.best.similarity == pytest.approx((0.4 + np.sqrt(0.84)) / 2, abs=1e-6)
+
+
+def test_how_far_the_places_are_is_the_mean_over_frames(bundle, cloud, two_frames, monkeypatch):
+    """Places lie at whole metres of the street's middle; each frame is as far from the nearest as it was registered."""
+    monkeypatch.setattr(similar, "WIDTH_M", 0.01)
+    found = refined(bundle, cloud, *two_frames).best
+    stood = [found.T_map_camera @ frame.T_reference_camera for frame in two_frames]
+    away = [np.hypot(T[0, 3] - round(T[0, 3]), T[1, 3]) for T in stood]
+    assert found.place_m == pytest.approx(np.mean(away), abs=0.01)  # the rays move it by less
+    assert away[0] > away[1] + 0.1
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What was given to each function of the end, in its order."""
+    calls = []
+
+    def noted(name):
+        kept = getattr(refining, name)
+
+        def call(*given, **named):
+            calls.append((name, given))
+            return kept(*given, **named)
+
+        monkeypatch.setattr(refining, name, call)
+
+    for name in ("adjust", "score_outer_product", "covariance_of"):
+        noted(name)
+    return calls
+
+
+def test_the_best_supported_candidate_is_adjusted_and_its_covariance_is_that_of_its_rays(
+    bundle, cloud, depth, both, seen_in, asked
+):
+    """Which is not the one that most points agree with, since the views of the other street are more similar."""
+    first = seen_in(depth, both)
+    frames = [replace(first, noise=noise) for noise in (3e-4, 1e-4, 2e-4)]
+    found = refined(bundle, cloud, *frames, inliers=1.0, similarity=1.0, likelihood=0.0)
+    best = found.best.registered
+    assert best.inliers < max(each.registered.inliers for each in found.candidates)
+    (adjusting, (sights, pictures, before, settings)), (covering, (information, scatter, noise, heading, model)) = asked
+    assert (adjusting, covering) == ("adjust", "covariance_of")
+    assert sights.cloud is cloud
+    assert settings == RefineSettings().rays
+    assert [picture.noise for picture in pictures] == [3e-4, 1e-4, 2e-4]
+    again = adjust(sights, pictures, before, settings)
+    assert again is not None
+    adjusted, its_scatter = again
+    np.testing.assert_array_equal(best.camera_m, adjusted.camera_m)
+    np.testing.assert_array_equal(found.best.T_map_camera[:3, 3], adjusted.camera_m)
+    np.testing.assert_allclose(found.best.T_map_camera[:3, :3], adjusted.R_map_level @ R_LEVEL_CAMERA, atol=1e-12)
+    np.testing.assert_array_equal(information, adjusted.information)
+    np.testing.assert_array_equal(scatter, its_scatter)
+    assert noise == 2e-4
+    assert model is OF_RAYS
+    assert heading == heading_of_camera(found.best.T_map_camera)
+    np.testing.assert_array_equal(found.covariance, covariance_of(information, scatter, noise, heading, OF_RAYS))
+
+
+def test_where_rays_meet_too_little_the_pose_and_its_covariance_are_those_of_the_points(
+    bundle, cloud, depth, here, seen_in, asked
+):
+    settings = RefineSettings(rays=RaySettings(fewest=10**6))
+    found = always_refined(bundle, cloud, (seen_in(depth, here),), None, settings)
+    best = found.best.registered
+    assert [name for name, _ in asked] == ["adjust", "score_outer_product", "covariance_of"]
+    of_cloud, points, registered, registration = asked[1][1]
+    assert (of_cloud is cloud, registered is best, registration is settings.registration) == (True, True, True)
+    assert len(points) == found.points
+    information, scatter, _, _, model = asked[2][1]
+    np.testing.assert_array_equal(information, best.information)
+    np.testing.assert_array_equal(scatter, score_outer_product(cloud, points, best, registration))
+    assert model is OF_POINTS
+
+
+def test_frames_of_a_drive_are_adjusted_together(bundle, cloud, two_frames, asked):
+    """Each where odometry says its camera stood against the reference's level frame."""
+    refined(bundle, cloud, *two_frames)
+    _, pictures, _, _ = asked[0][1]
+    for frame, picture in zip(two_frames, pictures, strict=True):
+        T_reference_camera = transform_from(two_frames[0].R_level_camera.T, np.zeros(3)) @ picture.T_level_camera
+        np.testing.assert_allclose(T_reference_camera, frame.T_reference_camera, atol=1e-9)
+        assert picture.focal_baseline_px_m is None
+
+
+def test_a_stereo_rigs_disparity_offset_is_estimated_where_its_baseline_is_known(bundle, cloud, street, here, seen_in):
+    """50 px times 1 m: 5 px of disparity at 10 m, of which 0.3 px are missing, so that all seems 6 % further away there."""
+    true = street.depth(CAMERA, TRUE)
+    measured = (1 / (1 / np.maximum(true, 1e-3) - 0.3 / 50.0)).astype(np.float32)
+    frame = seen_in(measured, here)
+    rig = replace(frame, query=replace(frame.query, baseline_m=1.0))
+    corrected, believed = (refined(bundle, cloud, each).best.T_map_camera[:2, 3] for each in (rig, frame))
+    np.testing.assert_allclose(corrected, TRUE[:2, 3], atol=0.08)
+    assert np.linalg.norm(believed - TRUE[:2, 3]) > 2 * np.linalg.norm(corrected - TRUE[:2, 3])
+
+
+def test_settings_for_a_rig_free_the_offset_once_the_pose_is_roughly_known():
+    settings = RefineSettings()
+    found = settings_for_rig(settings, 123.0)
+    assert found.focal_baseline_px_m == 123.0
+    free = {name: getattr(found.registration, name).free_offset for name in ("coarse", "middle", "fine")}
+    assert free == {"coarse": False, "middle": True, "fine": True}
+    assert not settings.registration.fine.free_offset
+
+
+@pytest.mark.parametrize(("width", "focal_px"), [(80, 50.0), (40, 25.0)])
+def test_the_unit_of_disparity_is_that_of_the_depth_picture(here, seen_in, width, focal_px):
+    query = seen_in(np.ones((60, 80), np.float32), here).query
+    assert query.focal_baseline_px_m is None
+    depth_m = np.ones((width * 3 // 4, width), np.float32)
+    assert replace(query, depth_m=depth_m, baseline_m=0.5).focal_baseline_px_m == 0.5 * focal_px
+
+
+def test_starts_of_several_frames_are_asked_where_each_frame_stood(bundle_at, frame_with, matches_at, monkeypatch):
+    """Place k, at x = 10 k, is 0.1 k similar; the second frame stood 10 m ahead: the mean of places k and k + 1."""
+    monkeypatch.setattr(similar, "PLACES", 1)
+    bundle = bundle_at(
+        [(10.0 * k, 0.0, 2.0) for k in range(8)], [0.0], [(0.1 * k, np.sqrt(1 - 0.01 * k * k)) for k in range(8)]
+    )
+    matches = matches_at([(0, 0, 2)], [0], [0.9])
+    ahead = transform_from(np.eye(3), np.array([0.0, 0.0, 10.0]))  # optical: z is forward
+    frames = (frame_with(matches), frame_with(matches, T_reference_camera=ahead))
+    measured = measure(frames, PointSettings(), focal_baseline_px_m=80.0, is_rig=False)
+
+    def likeness(T_map_level):
+        return similarity_of(bundle, measured, T_map_level)[0]
+
+    T_map_level = np.stack([transform_from(np.eye(3), np.array([x, 0.0, 1.4])) for x in (1.0, 29.0)])
+    np.testing.assert_allclose(likeness(T_map_level), [0.05, 0.35], atol=1e-6)
+    turned = transform_from(rotation_z(np.pi), np.array([30.0, 0.0, 1.4]))[None]  # ahead is now at x = 20
+    np.testing.assert_allclose(likeness(turned), [0.25], atol=1e-6)
