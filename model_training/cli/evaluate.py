@@ -166,15 +166,17 @@ def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[st
 
 
 def _say_why(bundle: MapBundle, data: Dataset, predictions: dict[str, Predictions]) -> None:
-    """Where nearly nothing was accepted, say what to check, the likeliest cause first."""
+    """Where nearly nothing was accepted, or the focal length is suspicious, say what to check, the likeliest cause first."""
     console = Console(soft_wrap=True, highlight=False)
     for name, answers in predictions.items():
-        if bundle.calibration is None or answers.localized.mean() >= FEW:
+        if bundle.calibration is None:
+            continue
+        found = causes(Localizer.open(bundle), list(data.queries(name)), answers)
+        if answers.localized.mean() >= FEW and not found:
             continue
         console.print(
             f"{name}: {answers.localized.mean():.0%} of the answers are accepted. What to check, the likeliest first:"
         )
-        found = causes(Localizer.open(bundle), list(data.queries(name)), answers)
         for number, cause in enumerate(found, 1):
             console.print(f"  {number}. {cause}")
         if not found:

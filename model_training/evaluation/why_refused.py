@@ -17,6 +17,8 @@ from service.confidence.features import FEATURES
 from service.confidence.reasons import FOCAL_FACTORS, GAIN, reasons_of, support_of
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
+from service.imaging.level import is_suspicious_height, level_query
+from service.imaging.view_grid import ViewGrid
 from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration
 from service.retrieval.query import Query
@@ -49,22 +51,45 @@ class Cause:
 
 
 def causes(localizer: Localizer, frames: Sequence[QueryFrame], answers: Predictions) -> list[Cause]:
-    """Return the possible causes, the likeliest first; none if enough answers are accepted.
+    """Return the possible causes, the likeliest first; none if enough answers are accepted and the camera's height is plausible.
 
     Args:
         localizer: the localizer of the map.
         frames: the queries of a set. Some of them are localized again.
         answers: the answers to all of them.
     """
-    if not len(frames) or answers.localized.mean() >= FEW:
+    is_few = bool(answers.localized.mean() < FEW) if len(frames) else False
+    if not is_few and not suspects_focal_length(frames):
         return []
-    chosen = [
-        frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(TRIED, len(frames))).round().astype(int))
-    ]
-    queries = [frame.query(localizer.bundle.grid) for frame in chosen]
+    queries = [frame.query(localizer.bundle.grid) for frame in _some_of(frames)]
     found = _tried(localizer, queries)
+    if not is_few:
+        return found
     calibration = localizer.bundle.calibration
     return found if calibration is None else [*found, *out_of_range(calibration, answers.evidence)]
+
+
+def suspects_focal_length(frames: Sequence[QueryFrame]) -> bool:
+    """Return whether most cameras seem to be at half or twice the usual height, as with a focal length off by a factor of two.
+
+    Args:
+        frames: the queries of a set. Some of them are looked at.
+    """
+    found = []
+    for frame in _some_of(frames):
+        query = frame.query(ViewGrid())
+        level, origin = level_query(
+            query.depth_m, query.camera, down_camera=query.down_camera, given=query.camera_height
+        )
+        found.append(is_suspicious_height(level.height_m, origin))
+    return bool(found) and float(np.mean(found)) > 0.5
+
+
+def _some_of(frames: Sequence[QueryFrame]) -> list[QueryFrame]:
+    if not frames:
+        return []
+    numbers = np.linspace(0, len(frames) - 1, min(TRIED, len(frames))).round().astype(int)
+    return [frames[k] for k in np.unique(numbers)]
 
 
 def out_of_range(calibration: Calibration, evidence: NDArray[np.float64]) -> list[Cause]:

@@ -20,6 +20,10 @@ def print_answer(answer: dict[str, Any], console: Console | None = None) -> None
         facts.add_row(name, value)
     out.print(facts)
     out.print()
+    factor = answer.get("focal_length_factor")
+    if answer["pose"] is not None and factor is not None:
+        out.print(f"warning: {_focal(factor)}", markup=False, style="yellow")
+        out.print()
     if answer["pose"] is None:
         for line in _why(answer):
             out.print(line, markup=False)
@@ -64,14 +68,18 @@ def _height(told: dict[str, Any]) -> str:
     return f"{told['height_m']:.2f} m above the ground ({told['origin']}{why})"
 
 
+def _focal(factor: float) -> str:
+    return (
+        f"the focal length is probably off by a factor of two: fx and fy times {factor:g} fit the map better; check the "
+        "intrinsics, and whether they are of pictures of this size"
+    )
+
+
 def _why(answer: dict[str, Any]) -> list[str]:
     """Lines that say what to check, the likeliest cause first."""
     found, factor = [], answer.get("focal_length_factor")
     if factor is not None:
-        found.append(
-            f"the focal length is probably off by a factor of two: fx and fy times {factor:g} fit the map better; check the intrinsics, "
-            "and whether they are of pictures of this size"
-        )  # fmt: skip
+        found.append(_focal(factor))
     for reason in answer.get("reasons", []):  # an older service sends no reasons
         told = ", ".join(f"{name} {size:+.1f}" for name, size in reason["evidence"].items())
         where = f" (standard deviations from what calibration saw: {told})" if told else ""

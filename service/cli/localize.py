@@ -56,8 +56,8 @@ def command(
         bool,
         typer.Option(
             "--try-focal/--no-try-focal",
-            help="If the answer is not LOCALIZED, ask twice more, with fx and fy halved and doubled. Report a factor "
-            "that fits.",
+            help="If the answer is not LOCALIZED, or the camera seems to be at half or twice the usual height, ask twice "
+            "more, with fx and fy halved and doubled. Report a factor that fits better.",
         ),
     ] = True,
     as_json: Annotated[
@@ -94,7 +94,7 @@ def command(
         )  # fmt: skip
 
     answer = ask(1.0)
-    if try_focal and answer["status"] != "LOCALIZED":
+    if try_focal and (answer["status"] != "LOCALIZED" or _has_suspicious_height(answer)):
         answer["focal_length_factor"] = _fitting_factor(answer, ask)
     if as_json:
         typer.echo(json.dumps(answer))
@@ -104,6 +104,13 @@ def command(
         print_answer(answer)
     if answer["status"] != "LOCALIZED":
         raise typer.Exit(NOT_LOCALIZED)
+
+
+def _has_suspicious_height(answer: dict[str, Any]) -> bool:
+    from service.imaging.level import is_suspicious_height
+
+    told = answer.get("camera_height")  # an older service sends none
+    return told is not None and is_suspicious_height(told["height_m"], told["origin"])
 
 
 def _fitting_factor(answer: dict[str, Any], ask: Callable[[float], dict[str, Any]]) -> float | None:

@@ -42,6 +42,9 @@ REPEATS = 3
 LEAST_ON, MOST_BELOW = 0.1, 0.02
 #: The usual height counts as fitting if its plane differs by less than this, metres. Beyond it the prior would bias the result.
 USUAL_WITHIN_M = 0.1
+#: A focal length that is off by a factor of two makes the estimated height wrong by the inverse factor. So an estimate whose ratio to the
+#: usual height lies in one of these ranges may have this cause.
+SUSPICIOUS_RATIOS = ((0.4, 0.6), (1.7, 2.4))
 #: Standard deviation of one ground point across the plane: constant part (m), and part per metre of horizontal distance.
 NOISE_M, NOISE_PER_M = 0.08, 0.01
 #: Number of neighbouring points with correlated errors. The fit counts so many points as one (decision 0081).
@@ -92,6 +95,17 @@ class GivenHeight:
 
     height_m: float
     std_m: float
+
+
+def is_suspicious_height(height_m: float, origin: str) -> bool:
+    """Return whether an estimated height may come from a focal length that is off by a factor of two.
+
+    Args:
+        height_m: height of the camera above the ground, metres.
+        origin: origin of this height, as ``level_query`` returns it.
+    """
+    ratio = height_m / USUAL_HEIGHT_M
+    return origin == "estimated" and any(least <= ratio <= most for least, most in SUSPICIOUS_RATIOS)
 
 
 def nominal_level(down_camera: Float64[NDArray[np.float64], "3"] | None) -> Rotation:

@@ -53,24 +53,19 @@ def ask(url: str, small_dataset: Dataset, tmp_path: Path, capsys: pytest.Capture
     return asked
 
 
-#: The fifth query is accepted at half the focal length, 8 m off (decision 0142).
-ACCEPTED = pytest.mark.xfail(reason="accepted at half the focal length, decision 0142", strict=True)
-
-
-@pytest.mark.parametrize(
-    ("focal", "factor", "query"),
-    [*((2.0, 0.5, query) for query in (0, 1, 3, 4)), *((0.5, 2.0, query) for query in (0, 1, 3)),
-     pytest.param(0.5, 2.0, 4, marks=ACCEPTED)],
-)  # fmt: skip
+@pytest.mark.parametrize("query", [0, 1, 3, 4])
+@pytest.mark.parametrize(("focal", "factor"), [(2.0, 0.5), (0.5, 2.0)])
 def test_a_focal_length_off_by_a_factor_of_two_is_named_first(
     ask: Any, focal: float, factor: float, query: int
 ) -> None:
+    """Also where the wrong answer is accepted: the ground then seems to be 3 m below the camera (decision 0145)."""
     lines = ask(focal=focal, query=query).splitlines()
-    assert lines[0].split()[1] in ("OUT_OF_MAP", "AMBIGUOUS")
-    why = next(k for k, line in enumerate(lines) if line.startswith("why it may not be LOCALIZED"))
-    assert lines[why + 1].startswith(
-        f"  1. the focal length is probably off by a factor of two: fx and fy times {factor:g} "
-    )
+    named = f"the focal length is probably off by a factor of two: fx and fy times {factor:g} "
+    if lines[0].split()[1] == "LOCALIZED":
+        assert any(line.startswith(f"warning: {named}") for line in lines)
+    else:
+        why = next(k for k, line in enumerate(lines) if line.startswith("why it may not be LOCALIZED"))
+        assert lines[why + 1].startswith(f"  1. {named}")
     assert json.loads(ask("--json", focal=focal, query=query))["focal_length_factor"] == factor
 
 
@@ -98,7 +93,7 @@ def test_evaluate_names_it_too(
         main(["evaluate", str(stock_map), str(folder), "--queries", "drive1_precise", "--list", "0"])
     assert end.value.code in (0, None)
     lines = capsys.readouterr().out.splitlines()
-    few = re.compile(r"drive1_precise: (0|20)% of the answers are accepted\. What to check, the likeliest first:")
+    few = re.compile(r"drive1_precise: \d+% of the answers are accepted\. What to check, the likeliest first:")
     start = next(number for number, line in enumerate(lines) if few.fullmatch(line))
     assert lines[start + 1].startswith(
         f"  1. the focal length is off by a factor of two: fx and fy times {factor:g} fit"

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z
 from service.imaging import level as module
-from service.imaging.level import GivenHeight, level_camera, level_query, nominal_level
+from service.imaging.level import GivenHeight, is_suspicious_height, level_camera, level_query, nominal_level
 
 CAMERA = PinholeCamera(160, 120, 80.0, 80.0, 79.5, 59.5)
 DOWN_AHEAD = np.array([0.0, 1.0, 0.0])
@@ -195,6 +195,15 @@ def test_without_ground_the_usual_height_is_assumed():
     wall = np.full((120, 160), 6.0, np.float32)
     level, origin = level_query(wall, CAMERA)
     assert (level.height_m, origin) == (pytest.approx(1.5, abs=0.05), "assumed")
+
+
+@pytest.mark.parametrize(
+    ("height_m", "origin", "expected"),
+    [(3.0, "estimated", True), (0.75, "estimated", True), (3.0, "given", False), (1.5, "estimated", False),
+     (2.2, "estimated", False), (0.3, "estimated", False), (3.0, "assumed", False)],
+)  # fmt: skip
+def test_half_and_twice_the_usual_height_are_suspicious_unless_given(height_m, origin, expected):
+    assert is_suspicious_height(height_m, origin) == expected
 
 
 def test_a_plane_with_points_below_it_is_no_ground():
