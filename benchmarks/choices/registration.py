@@ -13,12 +13,12 @@ from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.error_measures import distance_errors
 from model_training.evaluation.predict import predict
-from service.localization import refine
 from service.localization.localizer import Localizer
 from service.registration.kernel import QueryPoints
 from service.registration.points import PointSettings
+from service.scoring import measured
 
-#: The function of ``refine`` that makes points. The benchmark patches it to change the result.
+#: The function of ``scoring.measured`` that makes points. The benchmark patches it to change the result.
 POINTS = "points_from"
 Sureness = Callable[[QueryPoints], QueryPoints]
 
@@ -57,7 +57,7 @@ def registration_rows(report: Report, runs: Runs, dataset: Dataset) -> None:
         runs: simulates, builds and answers, or reuses what is kept on disk.
         dataset: the validation city.
     """
-    bundle, points_from = runs.bundle(dataset), getattr(refine, POINTS)
+    bundle, points_from = runs.bundle(dataset), getattr(measured, POINTS)
     plain = Localizer.open(bundle)
     for name in dataset.query_sets(with_truth=True):
         with bars() as show:
@@ -68,7 +68,7 @@ def registration_rows(report: Report, runs: Runs, dataset: Dataset) -> None:
             def points(*given: Any, _as: Sureness = sureness, **named: Any) -> QueryPoints:
                 return _as(points_from(*given, **named))
 
-            with bars() as show, patch.object(refine, POINTS, points):
+            with bars() as show, patch.object(measured, POINTS, points):
                 found[how] = predict(weighed, dataset, name, report=show)
         for how, answers in found.items():
             row = f"choices.registration.{how}.{name.rpartition('_')[2]}"

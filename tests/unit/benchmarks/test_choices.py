@@ -11,7 +11,7 @@ from benchmarks.choices.trainings import VARIATIONS
 from benchmarks.choices.watch import Seen, watch_plan
 from model_training.training.loop import TrainingConfig
 from model_training.training.recipe import WATCH_SEEDS
-from service.localization import refine
+from service.scoring import measured
 
 
 def test_a_place_is_as_like_a_query_as_its_best_view_at_the_best_turn():
@@ -55,5 +55,5 @@ def test_choices_are_measured_in_a_watch_city():
 
 
 def test_what_registration_is_measured_without_is_a_function_that_it_calls():
-    assert callable(getattr(refine, POINTS))
-    assert f"return {POINTS}(" in Path(refine.__file__).read_text()
+    assert callable(getattr(measured, POINTS))
+    assert f"points = {POINTS}(" in Path(measured.__file__).read_text()
