@@ -1,6 +1,8 @@
 """A street of places that differ, as panoramas and as what a camera sees of them; made up, not simulated."""
 
+import itertools
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,18 @@ GRID = ViewGrid()
 CAMERA = PinholeCamera(640, 480, 320.0, 320.0, 319.5, 239.5).scaled_to(SIDE, SIDE)
 LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, WALL_M = 1.8, 1.5, 2.6
 STEP_M = 3.0
+#: What one reading of the processor's clock adds in these tests, seconds.
+READING_S = 0.05
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _counted_clock():
+    """Count readings of the processor's clock in place of time: a budget means the same number of steps everywhere."""
+    readings = itertools.count()
+    clock = SimpleNamespace(process_time=lambda: READING_S * next(readings))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("research.baselines.learning.time", clock)
+        yield
 
 
 def walls_of(seed: int) -> np.ndarray:

@@ -9,18 +9,18 @@ from service.errors import DatasetError
 
 
 def spend(training: Training, seconds: float) -> None:
-    """Processor time of this thread, not of the wall."""
+    """Read the tests' clock until the seconds have passed."""
     until = training.processor_s + seconds
     while training.processor_s < until:
-        sum(range(2000))
+        pass
 
 
 def test_the_budget_is_of_processor_time_and_ends_the_run(tmp_path: Path) -> None:
-    training = Training(tmp_path, {"a": 1}, budget_s=0.05)
+    training = Training(tmp_path, {"a": 1}, budget_s=0.5)
     assert training.ended is None
 
     training.point(10, 1.0, 0.5, {"x": 1})
-    spend(training, 0.06)
+    spend(training, 0.6)
 
     assert training.share_spent == 1.0
     assert training.ended == "budget"
@@ -28,7 +28,7 @@ def test_the_budget_is_of_processor_time_and_ends_the_run(tmp_path: Path) -> Non
 
 def test_a_run_goes_on_with_what_it_has_spent(tmp_path: Path) -> None:
     first = Training(tmp_path, {"a": 1}, budget_s=10.0)
-    spend(first, 0.05)
+    spend(first, 0.5)
     point = first.point(128, 0.7, 0.6, {"net": {"w": torch.ones(2)}})
 
     again = Training(tmp_path, {"a": 1}, budget_s=10.0)
