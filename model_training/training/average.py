@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from model_training.training.draws import augmented_batches
-from model_training.training.encoder_net import EncoderNet
+from model_training.training.encoder_net import EncoderNet, queries_first
 from model_training.training.loop import TrainingConfig, load_run, read_checkpoint, read_config, read_packs
 from service.errors import DatasetError
 
@@ -83,7 +83,7 @@ def _renew_statistics(
     net.train()
     with torch.no_grad():
         for step, (planes, queries) in enumerate(islice(augmented_batches(packs, config, seed=seed), batches), 1):
-            net.of_both(planes, queries)
+            net(planes, queries_first(planes, queries))
             report(step)
     for norm in norms:
         norm.momentum = 0.1

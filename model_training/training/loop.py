@@ -18,7 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 from model_training.datasets.files import read_bytes, reading
 from model_training.training.augment import Augmentation, Augmenter
 from model_training.training.batches import Batch, City, open_cities
-from model_training.training.encoder_net import EncoderNet, EncoderShape
+from model_training.training.encoder_net import EncoderNet, EncoderShape, queries_first
 from model_training.training.from_onnx import net_of, require_shape
 from model_training.training.losses import Side, hardest_triplet, paired_info_nce
 from model_training.training.memory import DescriptorMemory
@@ -215,7 +215,7 @@ def train(
             planes = views_of(batch, augment, place, blind=config.blind)
             count = len(batch.query_xy)
             with forward_in(config.precision, place.type):
-                descriptors = net.of_both(planes, count)
+                descriptors = net(planes, queries_first(planes, count))
             descriptors = descriptors.float()
             scale = log_scale.exp().clamp(max=config.largest_scale)
             q = Side(descriptors[:count], batch.query_xy.to(place))

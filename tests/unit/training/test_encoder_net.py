@@ -5,7 +5,7 @@ torch = pytest.importorskip("torch", reason="needs the extra `training`")
 
 from torch import nn  # noqa: E402  # after the skip
 
-from model_training.training.encoder_net import LAYERS, VIEWS_AT_ONCE, EncoderNet, EncoderShape  # noqa: E402
+from model_training.training.encoder_net import LAYERS, EncoderNet, EncoderShape, queries_first  # noqa: E402
 from model_training.training.export import export  # noqa: E402
 from service.errors import EncoderError  # noqa: E402
 from service.retrieval.encoder import Encoder  # noqa: E402
@@ -53,19 +53,10 @@ def test_the_two_sides_read_one_view_differently(net, shape):
     assert float((survey - query).abs().max()) > 1e-3
 
 
-@pytest.mark.parametrize("mode", ["train", "eval"])
-def test_a_batch_of_both_sides_is_read_as_each_side_is(net, shape, mode):
-    getattr(net, mode)()
-    planes, side = planes_of(shape, 5), torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0])
-    with torch.no_grad():
-        torch.testing.assert_close(net.of_both(planes, 2), net(planes, side), atol=1e-5, rtol=1e-4)
-
-
-def test_more_views_than_are_normalised_at_once_are_read_alike(net, shape):
-    count = 2 * VIEWS_AT_ONCE + 3
-    planes, side = planes_of(shape, count), torch.zeros(count)
-    with torch.no_grad():
-        torch.testing.assert_close(net.of_both(planes, 0), net(planes, side), atol=1e-5, rtol=1e-4)
+def test_queries_come_first(shape):
+    planes = planes_of(shape, 5)
+    assert queries_first(planes, 2).tolist() == [1.0, 1.0, 0.0, 0.0, 0.0]
+    assert queries_first(planes, 0).tolist() == [0.0] * 5
 
 
 def test_a_view_does_not_depend_on_its_batch(net, shape):
