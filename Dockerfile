@@ -2,8 +2,8 @@
 #   docker build -t streetfix .
 #   docker run --read-only --tmpfs /tmp -p 8000:8000 -p 50051:50051 -v "$PWD/maps:/maps:ro" \
 #     -v "$PWD/keys.txt:/keys.txt:ro" -e STREETFIX_API_KEYS=/keys.txt streetfix
-# A container listens on all of its addresses, so it asks for API keys (streetfix keys) or client certificates; where the port is
-# published to loopback or a private network alone, -e STREETFIX_INSECURE_PUBLIC=true lets it start without.
+# A container listens on all of its addresses, so it requires API keys (streetfix keys) or client certificates. If the port is published
+# only to loopback or a private network, -e STREETFIX_INSECURE_PUBLIC=true lets it start without them.
 
 # Both images are pinned by the digest of their multi-architecture index; a newer patch release is a change of these lines.
 FROM python:3.11.16-bookworm@sha256:b99029c95d3d37fb1e4e76d287f7984373dca77c665885986e31b2c95260c13c AS build
@@ -15,7 +15,7 @@ RUN python -m venv --without-pip /opt/streetfix \
     --requirement locks/service.txt \
  && python -m venv /opt/build \
  && /opt/build/bin/pip install --no-cache-dir --only-binary :all: --require-hashes --requirement locks/build.txt
-# The C code is built by this image's gcc, as the reports' was. Nothing is fetched from here on.
+# This image's gcc builds the C code, as for the reports. From here on nothing is downloaded.
 COPY pyproject.toml README.md LICENSE ./
 COPY native native
 COPY docker docker
@@ -28,7 +28,7 @@ RUN PATH=/opt/build/bin:$PATH /opt/build/bin/pip wheel --no-cache-dir --no-deps 
 
 FROM python:3.11.16-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 LABEL org.opencontainers.image.title="streetfix" \
-      org.opencontainers.image.description="Where is this robot? Street and pose from one RGB and one depth picture." \
+      org.opencontainers.image.description="Where is this robot? Street and pose from one RGB and one depth image." \
       org.opencontainers.image.licenses="Apache-2.0"
 RUN python -m pip uninstall --yes pip setuptools wheel \
  && useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin streetfix \

@@ -1,5 +1,5 @@
 # Needs make and a Python of 3.11 or later with venv and pip; each target makes .venv and installs what it needs, once.
-# The demo needs no torch; `test`, `check` and what trains do.
+# The demo needs no torch. `test`, `check` and training do.
 
 PYTHON ?= python3
 # The CPU build where pip is offered one; `make TORCH="torch==2.13.0 --index-url ..." test` takes another.
@@ -27,10 +27,10 @@ UV := $(BIN)/uv
 INSTALL = $(UV) pip install --quiet --python $(BIN)/python
 LOCK = --quiet --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --no-annotate --no-header
 COMPILE = $(UV) pip compile pyproject.toml $(LOCK)
-# what builds the image's wheel: not of this package, so without it
+# packages that build the image's wheel, without this package
 COMPILE_BUILD = $(UV) pip compile --group build $(LOCK)
 
-# ONNX Runtime reports its use to its maker unless told not to.
+# ONNX Runtime sends usage data to its vendor by default.
 export ORT_DISABLE_TELEMETRY := 1
 
 .DEFAULT_GOAL := help
@@ -38,10 +38,10 @@ export ORT_DISABLE_TELEMETRY := 1
 .DELETE_ON_ERROR:
 .PHONY: help demo demo-real test test-service check check-native sanitize console check-console test-console format generate release-proto lock evaluate evaluate-real bench-kitti choices paper bench-training bench-serving fuzz chaos sbom audit reports docs docs-blocks house pictures encoder paper-encoder calibration install-demo install-test clean
 
-help: ## say what there is
+help: ## list all targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-16s %s\n", $$1, $$2}' Makefile
 
-demo: .venv/.mapping ## simulate streets, build their map, serve it, ask it over HTTP; ARGS="--once" ends then
+demo: .venv/.mapping ## simulate streets, build and serve their map, send queries over HTTP; ARGS="--once" stops afterwards
 	$(BIN)/streetfix demo $(ARGS)
 
 demo-real: .venv/.mapping ## the same with real stereo frames: make demo-real DATA=../shared/data/kitti_stereo
@@ -53,12 +53,14 @@ TEST_PROCESSES = --numprocesses auto --maxprocesses 4 --dist loadfile --no-loads
 test: .venv/.torch ## all tests, in a process for each core
 	$(BIN)/python -m pytest $(TEST_PROCESSES) $(ARGS)
 
-# Without torch and the simulator: what can be tested where the latter's ray caster has no wheel (Linux on ARM).
-test-service: .venv/.dev ## the tests of the service alone
-	$(BIN)/python -m pytest $(TEST_PROCESSES) tests/unit/test_*.py \
-		$(addprefix tests/unit/,bridge client contract geometry grpc http imaging localization maps registration runtime) $(ARGS)
+# Without torch and the simulator, whose ray caster has no wheel for Linux on ARM. Two files of these folders simulate.
+SIMULATING = tests/unit/imaging/test_pca_on_a_city.py tests/unit/http/test_same_as_evaluate.py
+test-service: .venv/.dev ## the tests of the service, without torch and the simulator
+	$(BIN)/python -m pytest $(TEST_PROCESSES) $(addprefix --ignore ,$(SIMULATING)) tests/unit/test_*.py \
+		$(addprefix tests/unit/,bridge client confidence console contract doctor geometry grpc http imaging localization maps \
+		registration retrieval runtime scoring) $(ARGS)
 
-check: .venv/.torch ## lint, types, layers, and the contracts as the code says them
+check: .venv/.torch ## lint, types, layers, and whether the contracts equal the code
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/clang-format --dry-run --Werror $(C_CODE)
@@ -71,7 +73,7 @@ check: .venv/.torch ## lint, types, layers, and the contracts as the code says t
 	cd proto && ../$(BIN)/buf lint
 	cd proto && ../$(BIN)/buf breaking --against released.binpb
 
-# A user's build stops at no warning; ours does.
+# A user's build does not stop at a warning. This one does.
 check-native: .venv/.torch ## compile the C code with every warning an error
 	$(BIN)/cmake -S native -B build/check -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja -DCMAKE_BUILD_TYPE=Release \
 		-DCMAKE_COMPILE_WARNING_AS_ERROR=ON > /dev/null
@@ -80,8 +82,8 @@ check-native: .venv/.torch ## compile the C code with every warning an error
 sanitize: .venv/.torch ## run the C code's tests and random inputs under AddressSanitizer and UndefinedBehaviorSanitizer
 	$(BIN)/python -m benchmarks.native.sanitizers
 
-# The page's sources change with Node alone; who has none takes the build that lies in the repository, whose hashes `check` compares.
-check-console: ## lint and types of the console's page, where there is Node
+# Only Node can build the page. The built page is committed, and `check` compares its hashes with the sources.
+check-console: ## lint and types of the console's page, if Node is installed
 	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory $(WEB)/node_modules/.installed && cd $(WEB) && npm run --silent check; \
 	else echo "there is no npm: the console's TypeScript is not checked"; fi
 
@@ -97,12 +99,12 @@ test-console: .venv/.torch ## the console in a real browser -> reports/console.j
 	$(BIN)/python -m pytest tests/console --ignore tests/console/test_flows.py
 	$(BIN)/python -m benchmarks.console $(ARGS)
 
-# By the lock file, as `npm ci` would; that refuses a lock without the packages of platforms that a registry does not offer.
+# By the lock file, as `npm ci` would. `npm ci` refuses a lock file that lacks packages of other platforms.
 $(WEB)/node_modules/.installed: $(WEB)/package-lock.json
 	cd $(WEB) && npm install --no-save --ignore-scripts --no-audit --no-fund --silent
 	@touch $@
 
-format: .venv/.torch ## put the code in shape
+format: .venv/.torch ## format the code
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 	$(BIN)/clang-format -i $(C_CODE)
@@ -112,7 +114,7 @@ generate: .venv/.torch ## write openapi/openapi.json from the code, and the gRPC
 	$(BIN)/python -m grpc_tools.protoc -I service/grpc/generated=proto --python_out=. --pyi_out=. --grpc_python_out=. \
 		service/grpc/generated/streetfix/v1/localization.proto
 
-release-proto: .venv/.torch ## what later messages must stay compatible with: done once a release, by hand
+release-proto: .venv/.torch ## record the gRPC messages of a release; later ones must stay compatible; run by hand, once a release
 	cd proto && ../$(BIN)/buf build --output released.binpb
 
 lock: .venv/.uv ## renew the lock files; ARGS="--upgrade" takes newer packages
@@ -130,7 +132,7 @@ evaluate-real: .venv/.torch ## measure on real recordings and round trips -> rep
 bench-kitti: .venv/.torch ## place recognition on KITTI that you own: make bench-kitti ROOT=/data/kitti -> reports/kitti.json
 	$(BIN)/python -m benchmarks.kitti $(if $(ROOT),--root $(ROOT)) $(ARGS)
 
-choices: .venv/.torch ## what each design choice brings, in a watch city -> reports/choices.json; hours
+choices: .venv/.torch ## what each design choice brings, in a validation city -> reports/choices.json; hours
 	$(BIN)/python -m benchmarks.choices $(ARGS)
 
 paper: .venv/.torch ## the paper's method, its baseline and others beside ours -> reports/paper.json, paper.md; hours; ARGS=--reduced: minutes
@@ -142,24 +144,24 @@ bench-training: .venv/.torch ## measure training and simulation -> reports/train
 bench-serving: .venv/.torch ## measure the service under load -> reports/serving.json; ARGS="--only ratios tail" measures parts
 	$(BIN)/python -m benchmarks.serving $(ARGS)
 
-fuzz: .venv/.torch ## a million inputs over all that takes bytes from outside -> reports/serving.json
+fuzz: .venv/.torch ## a million inputs to every parser of untrusted input -> reports/serving.json
 	$(INSTALL) 'atheris>=3,<4'
 	$(BIN)/python -m benchmarks.fuzz $(ARGS)
 
-chaos: .venv/.torch ## 1,000 random steps of operators, disks, clients and deaths against a running service -> reports/serving.json
+chaos: .venv/.torch ## 1,000 random steps against a running service: operator commands, disk faults, client faults and killed workers -> reports/serving.json
 	$(BIN)/python -m benchmarks.chaos $(ARGS)
 
 sbom: .venv/.uv ## software bill of materials of the service's lock file -> out/sbom.json (CycloneDX)
 	mkdir -p out
 	$(UV) tool run --from 'cyclonedx-bom==7.3.1' cyclonedx-py requirements locks/service.txt --output-reproducible -o out/sbom.json
 
-audit: .venv/.uv ## known vulnerabilities of the locked packages; what cannot be looked up fails too
+audit: .venv/.uv ## known vulnerabilities of the locked packages; fails also if a package cannot be looked up
 	$(UV) tool run --from 'pip-audit==2.10.1' pip-audit --strict --disable-pip --require-hashes --requirement locks/service.txt --requirement locks/build.txt
 
 reports: .venv/.torch ## all reports as one page with plots
 	$(BIN)/python -m benchmarks.render $(ARGS)
 
-docs: .venv/.torch ## the site of docs/ -> out/site; a link that leads nowhere fails
+docs: .venv/.torch ## the site of docs/ -> out/site; a broken link fails
 	$(INSTALL) 'mkdocs-material>=9.5,<10'
 	NO_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict
 
@@ -174,24 +176,24 @@ docs-blocks: .venv/.torch ## run every code block of README and docs that can ru
 pictures: .venv/.torch ## the pictures of README and docs
 	$(BIN)/python -m benchmarks.pictures $(ARGS)
 
-encoder: .venv/.torch ## train and export the stock encoder anew; goes on where it was stopped
+encoder: .venv/.torch ## train and export the stock encoder again; resumes an interrupted run
 	$(BIN)/streetfix train --run runs/stock --cities 26 --turn 7.5 --steps $(STEPS) --precision bfloat16
 	$(BIN)/streetfix train --run runs/second --cities 26 --turn 7.5 --steps $(SECOND_STEPS) --rate 1e-3 --seed 7 --precision bfloat16 --start-from runs/stock
 	$(BIN)/streetfix train --recipe matched --run runs/third --turn 7.5 --steps $(THIRD_STEPS) --rate 6e-4 --seed 11 --start-from runs/second
 	$(BIN)/streetfix export runs/third --out runs/third/encoder.onnx
 	$(BIN)/streetfix quantize runs/third/encoder.onnx --out model_training/stock/encoder.onnx
 
-calibration: .venv/.torch ## ask calibration cities and fit confidence anew, for the stock encoder
+calibration: .venv/.torch ## run the calibration cities and fit confidence again, for the stock encoder
 	$(BIN)/streetfix calibrate --anew $(ARGS)
 
-paper-encoder: .venv/.torch ## an encoder that has seen the paper's city: the stock one, trained on there
+paper-encoder: .venv/.torch ## the stock encoder, trained further on the paper's city
 	$(BIN)/streetfix train --recipe paper --start-from runs/third --rate 5e-4 --steps $(PAPER_STEPS) --precision bfloat16 --run runs/paper
 	$(BIN)/streetfix export runs/paper --out runs/paper/encoder.onnx
 
-install-demo: .venv/.mapping ## what the demo needs, and no more
-install-test: .venv/.torch ## what tests and checks need
+install-demo: .venv/.mapping ## install only what the demo needs
+install-test: .venv/.torch ## install what tests and checks need
 
-clean: ## remove what demos and tools left; .venv, data and runs stay
+clean: ## remove the output of demos and tools; .venv, data and runs stay
 	rm -rf out dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	cd native && rm -rf .cmake CMakeCache.txt CMakeFiles CMakeInit.txt build.ninja cmake_install.cmake .ninja_deps .ninja_log .skbuild-info.json
 	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
@@ -214,7 +216,7 @@ clean: ## remove what demos and tools left; .venv, data and runs stay
 	$(INSTALL) --no-deps --editable .
 	@touch $@
 
-# By pip, outside the lock: which build of torch fits is a matter of the machine.
+# By pip, outside the lock file: the right build of torch depends on the machine.
 .venv/.torch: .venv/.dev
 	$(PIP) install --quiet $(TORCH)
 	@touch $@

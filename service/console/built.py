@@ -1,4 +1,4 @@
-"""Whether the built page is that of the sources beside it, without Node: ``python -m service.console.built [--check]``."""
+"""Check that the committed page was built from the sources, without Node: ``python -m service.console.built [--check]``."""
 
 import hashlib
 import json
@@ -9,12 +9,17 @@ from service.console.page import STATIC
 
 WEB = STATIC.with_name("web")
 NOTE = STATIC.with_name("built.json")
-#: What a build is made from; ``package-lock.json`` names every package by its hash.
+#: Inputs of a build. ``package-lock.json`` has the hash of every package.
 _SOURCES = ("index.html", "package.json", "package-lock.json", "tsconfig.json", "vite.config.ts", "src/**/*")
 
 
 def note_of(web: Path = WEB, static: Path = STATIC) -> dict[str, object]:
-    """One hash of all sources, and one of each built file."""
+    """Return one hash of all sources, and one of each built file.
+
+    Args:
+        web: folder of the sources.
+        static: folder of the built page.
+    """
     sources = sorted({path for pattern in _SOURCES for path in web.glob(pattern) if path.is_file()})
     together = hashlib.sha256()
     for path in sources:
@@ -27,12 +32,12 @@ def note_of(web: Path = WEB, static: Path = STATIC) -> dict[str, object]:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the note after a build, or with ``--check`` compare."""
+    """Write ``built.json`` after a build, or compare with it (``--check``). Return the exit code."""
     if "--check" not in arguments:
         NOTE.write_text(json.dumps(note_of(), indent=1) + "\n")
         return 0
     if not NOTE.exists() or json.loads(NOTE.read_text()) != note_of():
-        sys.stderr.write("service/console/static is not what service/console/web says; run: make console\n")
+        sys.stderr.write("service/console/static was not built from service/console/web; run: make console\n")
         return 1
     return 0
 

@@ -1,4 +1,4 @@
-"""A map's cloud and its survey track, small enough for a browser."""
+"""Serialize the cloud and the survey track of a map, small enough for a browser."""
 
 import struct
 import threading
@@ -11,28 +11,33 @@ from numpy.typing import NDArray
 from service.maps.reader import MapBundle
 from service.registration.surfel_map import SurfelMap
 
-#: What ``points`` is rounded down to, so that few clouds are made and kept.
+#: ``points`` is rounded down to one of these, so that few clouds are computed and kept.
 LEVELS = (20_000, 50_000, 100_000, 200_000, 500_000, 1_000_000, 2_000_000)
 _KEPT = 2
 CLOUD_MAGIC, PLACES_MAGIC = b"SFC1", b"SFP1"
-#: x, y, z in steps of the header's, and how upright the surface is: 0 flat ground, 65535 a wall.
+#: x, y, z in steps of the header, and how upright the surface is: 0 flat ground, 65535 a wall.
 _POINT = np.dtype([("xyz", "<u2", (3,)), ("upright", "<u2")])
 _PLACE = np.dtype([("xyz", "<f4", (3,)), ("heading_rad", "<f4"), ("street", "<i4")])
 _STEPS = 65535
 
 
 class Clouds:
-    """Makes clouds and keeps the last ones: of a large map it takes a second. Safe to call from several threads."""
+    """Cache of serialized clouds. A large map takes a second. Safe to call from several threads."""
 
     def __init__(self) -> None:
         self._made: OrderedDict[tuple[str, str, int], bytes] = OrderedDict()
         self._making = threading.Lock()
 
     def of(self, bundle: MapBundle, points: int) -> bytes:
-        """As ``cloud_bytes``, of the level that ``points`` reaches."""
+        """Return ``cloud_bytes`` of a map, from the cache if possible.
+
+        Args:
+            bundle: the map.
+            points: most points; rounded down to one of ``LEVELS``.
+        """
         level = max((each for each in LEVELS if each <= points), default=LEVELS[0])
         name = (str(bundle.path), bundle.manifest.version, level)
-        with self._making:  # two browsers that open at once wait for one cloud, not for two
+        with self._making:  # two browsers that open at once wait for the same cloud
             if name not in self._made:
                 self._made[name] = cloud_bytes(bundle.cloud, level)
             self._made.move_to_end(name)
@@ -42,13 +47,14 @@ class Clouds:
 
 
 def cloud_bytes(cloud: SurfelMap | None, most: int) -> bytes:
-    """The points, thinned evenly over the ground, in an order that makes any beginning of them a thinner cloud.
+    """Return the points of a cloud, thinned evenly over the ground. Any first part of them is a thinner cloud.
 
-    ``SFC1``, count (uint32), origin and step (float64 x 3 each, metres, map frame), then ``_POINT`` for each, all little-endian.
+    Format: ``SFC1``, count (uint32), origin and step (float64 x 3 each, metres, map frame), then one ``_POINT`` per point. All numbers
+    are little-endian.
 
     Args:
-        cloud: of a map; None of one without.
-        most: points at most.
+        cloud: cloud of a map; None for a map without a cloud.
+        most: most points.
     """
     if cloud is None or not len(cloud.surfels):
         return CLOUD_MAGIC + struct.pack("<I6d", 0, *(0.0,) * 3, *(1.0,) * 3)
@@ -64,18 +70,18 @@ def cloud_bytes(cloud: SurfelMap | None, most: int) -> bytes:
 
 
 def thinned(surfels: NDArray[Any], tiles: NDArray[np.float64], most: int) -> NDArray[np.intp]:
-    """Rows of at most so many surfels, as many to an area everywhere: one of each cell of a lattice.
+    """Return rows of surfels with an even density: one surfel of each cell of a lattice.
 
-    Tile by tile, so that a map larger than the memory is read, not held.
+    It works tile by tile, so a map may be larger than the memory.
 
     Args:
-        surfels: sorted by tile.
-        tiles: first surfel and count in the last two columns.
-        most: of all rows.
+        surfels: surfels of the map, sorted by tile.
+        tiles: tiles of the map, with the first surfel and the count in the last two columns.
+        most: most rows.
     """
     if len(surfels) <= most:
         return np.arange(len(surfels))
-    # Surfaces fill an area: half as many points stand on a lattice that is wider by the root of two.
+    # Surfaces are two-dimensional, so half of the points need a cell that is larger by the square root of two.
     cell_m = _spacing_m(surfels, tiles) * float(np.sqrt(len(surfels) / most))
     kept = []
     for first, count in tiles[:, 2:].astype(np.intp):
@@ -90,7 +96,7 @@ def thinned(surfels: NDArray[Any], tiles: NDArray[np.float64], most: int) -> NDA
 
 
 def _spacing_m(surfels: NDArray[Any], tiles: NDArray[np.float64]) -> float:
-    """Between neighbours, in the fullest tile: the edge of a cell that holds one of them."""
+    """Return the spacing of neighbouring surfels in the fullest tile, m: the edge of a cell with about one surfel."""
     first, count = tiles[int(np.argmax(tiles[:, 3])), 2:].astype(np.intp)
     xyz = surfels["xyz"][first : first + count]
     for cell_m in (0.1, 0.2, 0.3, 0.4, 0.6, 0.8):
@@ -101,7 +107,10 @@ def _spacing_m(surfels: NDArray[Any], tiles: NDArray[np.float64]) -> float:
 
 
 def places_bytes(bundle: MapBundle) -> bytes:
-    """The survey's places: ``SFP1``, count (uint32), origin (float64 x 3, metres, map frame), ``_PLACE`` for each, little-endian."""
+    """Return the places of the survey.
+
+    Format: ``SFP1``, count (uint32), origin (float64 x 3, metres, map frame), then one ``_PLACE`` per place, all little-endian.
+    """
     T = bundle.T_map_place
     origin_m = T[:, :3, 3].mean(axis=0)
     packed = np.empty(len(T), _PLACE)

@@ -1,4 +1,4 @@
-"""What the machine saw on the way to an answer: the same functions that answered, and pictures of what they gave."""
+"""Compute the intermediate images of an answer, with the functions that compute the answer."""
 
 from dataclasses import dataclass
 
@@ -24,8 +24,8 @@ from service.runtime.engine import EncodedQuery, Engine, Located
 from service.runtime.memory import EXPLAIN_PEAK
 from service.scoring.rendered_depth import REACH_M, SURFEL_M
 
-_WIDTH, _MAP_WIDTH = 320, 160  # of depth pictures; in a larger one the gaps between surfels show
-_POINTS_ACROSS = 160  # of the query's points in the map
+_WIDTH, _MAP_WIDTH = 320, 160  # width of depth images, px; in a larger one the gaps between surfels would be visible
+_POINTS_ACROSS = 160  # columns of the query's points in the map
 _CELL_PIXELS = 4
 _POINT = np.dtype([("xyz", "<f4", (3,)), ("rgb", "u1", (3,)), ("pad", "u1")])
 POINT_BYTES = _POINT.itemsize
@@ -33,14 +33,14 @@ POINT_BYTES = _POINT.itemsize
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explanation:
-    """An answer and what led to it.
+    """An answer with its intermediate images.
 
     Attributes:
         located: the same answer as without explanation.
-        pictures: PNG, by name: what could not be drawn is not among them.
-        points: of the query, where the best guess puts them; only a LOCALIZED answer confirms it. Each is x, y, z (float32, metres
-            from ``origin_m``), red, green, blue, nothing.
-        origin_m: map frame.
+        pictures: PNG images by name. A map without a cloud has no ``view`` and no ``map_depth``.
+        points: points of the query at the best pose, which only a LOCALIZED answer confirms. Each has x, y, z (float32, metres from
+            ``origin_m``), red, green, blue and one byte of padding.
+        origin_m: origin of ``points``, map frame.
     """
 
     located: Located
@@ -50,7 +50,11 @@ class Explanation:
 
 
 def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
-    """Localize, and draw what was seen, in the thread of the caller.
+    """Localize a query and draw the intermediate images, in the thread of the caller.
+
+    Args:
+        engine: the engine of the service.
+        encoded: the query with its encoded images.
 
     Raises:
         StreetfixError: as ``Engine.localize``.
@@ -82,7 +86,13 @@ def explain(engine: Engine, encoded: EncodedQuery) -> Explanation:
 def mapped_depth(
     frame: Frame, registered: Registered | None, settings: RefineSettings
 ) -> Float32[NDArray[np.float32], "H W"]:
-    """The depth picture as registration believes it: its scale and disparity offset taken out."""
+    """Return the depth image corrected by the scale and the disparity offset that registration estimated, m.
+
+    Args:
+        frame: frame of the query.
+        registered: result of registration; None returns the depth image unchanged.
+        settings: settings of registration. They give focal length x baseline if the query does not.
+    """
     depth_m = frame.query.depth_m
     if registered is None:
         return depth_m
@@ -91,7 +101,7 @@ def mapped_depth(
 
 
 def _fused(frame: Frame, grid: ViewGrid) -> NDArray[np.uint8]:
-    """The view of the turn that looks straight ahead."""
+    """Return an image of the query view at the turn closest to 0."""
     ahead = int(np.argmin(np.abs(frame.views.turns_rad)))
     return enlarged(picture_of(frame.views.planes[ahead, :3], grid.max_range_m), _CELL_PIXELS)
 
@@ -99,7 +109,7 @@ def _fused(frame: Frame, grid: ViewGrid) -> NDArray[np.uint8]:
 def _map_view(
     bundle: MapBundle, cloud: SurfelMap, position_m: Float64[NDArray[np.float64], "3"], heading_rad: float
 ) -> NDArray[np.uint8]:
-    """The map from a place along a heading, on the view grid: what the most similar view was made from, without its scan."""
+    """Return an image of the map on the view grid, rendered from the cloud at a position and heading."""
     T_map_camera = transform_from(rotation_z(heading_rad) @ R_BODY_OPTICAL, position_m)
     camera = camera_over(bundle.grid)
     depth_m = _drawn_map(cloud, T_map_camera, camera)
@@ -112,7 +122,11 @@ def _map_view(
 
 
 def camera_over(grid: ViewGrid) -> PinholeCamera:
-    """A camera whose picture holds a whole view, at about twice its columns; views wider than 140 degrees lose their sides."""
+    """Return a camera that sees a whole view, with about twice its columns. Views wider than 140 degrees are cropped.
+
+    Args:
+        grid: view grid of the map.
+    """
     half = np.deg2rad(min(grid.azimuth_span_deg, 140.0) / 2)
     width = 2 * grid.columns
     focal = float((width - 1) / 2 / np.tan(half))
@@ -134,7 +148,7 @@ def _scaled(query: Query) -> PinholeCamera:
 
 
 def _small(depth_m: Float32[NDArray[np.float32], "H W"], width: int = _WIDTH) -> Float32[NDArray[np.float32], "h w"]:
-    """Thinned, never averaged: a mean over an edge is a depth that nothing has."""
+    """Return the depth image at a width, by the nearest pixel. A mean across a depth edge would be a wrong depth."""
     height = max(1, round(width * depth_m.shape[0] / depth_m.shape[1]))
     small: NDArray[np.float32] = cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST).astype(
         np.float32

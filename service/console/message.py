@@ -1,4 +1,4 @@
-"""An explanation as the contract says it."""
+"""Convert an explanation to the message of the contract."""
 
 from base64 import b64encode
 
@@ -8,7 +8,11 @@ from service.contract.convert import answer_from, vector_from
 
 
 def explanation_message(explanation: Explanation) -> schema.Explanation:
-    """Pictures and points in base64: one answer is one JSON document."""
+    """Return the message. Images and points are base64, so that the answer is one JSON document.
+
+    Args:
+        explanation: an answer with its intermediate images.
+    """
     pictures = {name: _text(png) for name, png in explanation.pictures.items()}
     return schema.Explanation(
         answer=answer_from(explanation.located),

@@ -1,4 +1,4 @@
-"""The console's built files, and what a browser may do with them."""
+"""The built files of the console, and their HTTP headers."""
 
 import gzip
 import hashlib
@@ -8,7 +8,7 @@ from pathlib import Path
 STATIC = Path(__file__).with_name("static")
 INDEX = "index.html"
 
-#: Nothing from another host, nothing inline, no plug-ins, no frames; pictures of the user's own and of answers are blobs.
+#: No other host, no inline code, no plug-ins, no frames. Images of queries and answers are blobs.
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; font-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -30,7 +30,7 @@ _MEDIA_TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class BuiltFile:
-    """One file; ``lasts`` where its name changes with its content."""
+    """One built file. ``lasts`` says that its name changes with its content, so browsers may cache it."""
 
     content: bytes
     compressed: bytes
@@ -40,9 +40,12 @@ class BuiltFile:
 
 
 def built_files(folder: Path = STATIC) -> dict[str, BuiltFile]:
-    """All files by their path below the page's address; empty where nothing was built.
+    """Return all built files by their path below the page's address; empty without a build.
 
-    They are read once: no request ever names a path of the file system.
+    Files are read once, so no request can name a path of the file system.
+
+    Args:
+        folder: folder of the built page.
     """
     found = {}
     for path in sorted(folder.rglob("*")):

@@ -1,4 +1,4 @@
-"""What a machine saw, drawn for people."""
+"""Images of depth and views for the console."""
 
 import cv2
 import numpy as np
@@ -7,20 +7,27 @@ from numpy.typing import NDArray
 
 Drawn = UInt8[NDArray[np.uint8], "H W 3"]
 
-#: Depths beyond are drawn like this one, so that near differences are seen.
+#: Larger depths get the colour of this one, so that differences of near depths stay visible.
 FARTHEST_M = 40.0
 
 
 def png_of(rgb: Drawn) -> bytes:
-    """Encoded, fast rather than small: it is looked at once."""
+    """Return an image as PNG, with fast compression because it is viewed once.
+
+    Args:
+        rgb: the image.
+    """
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     return cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
 def depth_picture(depth_m: Float32[NDArray[np.float32], "H W"]) -> Drawn:
-    """Depth in Google's Turbo colours, near red, far blue, on a scale of square roots; black where nothing is known.
+    """Return a depth image in the Turbo colour map on a square-root scale: near red, far blue, black without a measurement.
 
-    The same scale for every picture, so that two can be laid over each other.
+    All images have the same scale, so that two can be compared.
+
+    Args:
+        depth_m: depth, m; 0 without a measurement.
     """
     nearness = 1.0 - np.sqrt(np.clip(depth_m / FARTHEST_M, 0, 1))
     coloured = cv2.applyColorMap(np.rint(255 * nearness).astype(np.uint8), cv2.COLORMAP_TURBO)
@@ -29,5 +36,10 @@ def depth_picture(depth_m: Float32[NDArray[np.float32], "H W"]) -> Drawn:
 
 
 def enlarged(picture: Drawn, times: int) -> Drawn:
-    """Cells as squares: a view has 32 x 128 of them."""
+    """Return an image with each pixel repeated, so that the cells of a view are visible.
+
+    Args:
+        picture: the image.
+        times: factor of both sides.
+    """
     return np.repeat(np.repeat(picture, times, axis=0), times, axis=1)

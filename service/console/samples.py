@@ -1,4 +1,4 @@
-"""Pairs of pictures that lie ready beside a map: for who has none of their own at hand."""
+"""Sample pairs of a map, for users without images of their own."""
 
 import json
 import re
@@ -19,12 +19,12 @@ PICTURES = {
 }
 MOST = 64
 _MOST_JSON_BYTES = 65_536
-_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")  # it becomes a part of an address
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")  # the name becomes a part of a URL
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A file and what a browser is told that it is."""
+    """An image file and its media type."""
 
     path: Path
     media_type: str
@@ -32,7 +32,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A pair; the truth where it is known."""
+    """A sample pair. ``truth`` is the ground truth, or None."""
 
     name: str
     pictures: dict[str, Picture]
@@ -40,41 +40,49 @@ class Sample:
     truth: Truth | None
 
     def message(self) -> SamplePair:
-        """As the contract says it; addresses are relative to the list's."""
+        """Return the message of the contract. Addresses are relative to that of the list."""
         rgb, depth = (f"samples/{self.name}/{part}" for part in ("rgb", "depth"))
         return SamplePair(name=self.name, rgb=rgb, depth=depth, request=self.request, truth=self.truth)
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """A folder of pairs, looked at once; nothing but what was found then is ever read."""
+    """The sample pairs of a folder. The folder is read once, and no other file is served later."""
 
     by_name: dict[str, Sample] = field(default_factory=dict)
 
     @classmethod
     def open(cls, folder: Path) -> "Samples":
-        """Read ``NAME/rgb.*``, ``depth.*``, ``request.json`` and, where there is one, ``truth.json``.
+        """Read ``NAME/rgb.*``, ``depth.*``, ``request.json`` and, if it exists, ``truth.json``.
+
+        Args:
+            folder: folder of the sample pairs.
 
         Raises:
-            DatasetError: the folder or a part of a pair is not there, lies outside the folder, or is no such thing.
+            DatasetError: the folder or a part of a pair is missing, invalid, or outside the folder.
         """
         if not folder.is_dir():
             raise DatasetError(
-                f"{folder}: there is no such folder of sample pairs; unset STREETFIX_SAMPLES", field="samples"
+                f"{folder}: this folder of sample pairs does not exist; correct or unset STREETFIX_SAMPLES",
+                field="samples",
             )
         inside = sorted(path for path in folder.iterdir() if path.is_dir() and _NAME.fullmatch(path.name))
         return cls({path.name: _sample(path, folder.resolve()) for path in inside[:MOST]})
 
     def picture(self, name: str, part: str) -> Picture:
-        """One picture of one pair.
+        """Return one image of a sample pair.
+
+        Args:
+            name: name of the pair.
+            part: ``rgb`` or ``depth``.
 
         Raises:
-            UnknownSampleError: there is no such pair.
+            UnknownSampleError: no pair has this name.
         """
         sample = self.by_name.get(name)
         if sample is None or part not in sample.pictures:
             known = ", ".join(self.by_name) or "none"
-            raise UnknownSampleError(f"there is no sample {name[:100]!r}; there are: {known}", field="sample")
+            raise UnknownSampleError(f"there is no sample {name[:100]!r}; known samples: {known}", field="sample")
         return sample.pictures[part]
 
 
@@ -90,7 +98,7 @@ def _sample(path: Path, root: Path) -> Sample:
         )
     except ValidationError as error:
         raise DatasetError(
-            f"{path}: {error.errors()[0]['msg']} at {error.errors()[0]['loc']}; mend the file", field="samples"
+            f"{path}: {error.errors()[0]['msg']} at {error.errors()[0]['loc']}; correct the file", field="samples"
         ) from error
 
 
@@ -99,7 +107,7 @@ def _picture(path: Path, part: str, root: Path) -> Picture:
         file = path / f"{part}{suffix}"
         if file.is_file():
             return Picture(_confined(file, root), media_type)
-    raise DatasetError(f"{path}: there is no {part} picture ({', '.join(PICTURES[part])}) in it", field="samples")
+    raise DatasetError(f"{path}: the folder has no {part} image ({', '.join(PICTURES[part])})", field="samples")
 
 
 def _json(file: Path, root: Path) -> Any:
@@ -107,12 +115,14 @@ def _json(file: Path, root: Path) -> Any:
         with _confined(file, root).open("rb") as stream:
             return json.loads(stream.read(_MOST_JSON_BYTES))
     except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{file}: it cannot be read as JSON ({error}); write it again", field="samples") from error
+        raise DatasetError(
+            f"{file}: the file is not readable JSON ({error}); write it again", field="samples"
+        ) from error
 
 
 def _confined(file: Path, root: Path) -> Path:
-    """The file itself, which a link may not lead out of the folder."""
+    """Return the resolved path of a file. A link must not lead out of the folder."""
     real = file.resolve()
     if not real.is_relative_to(root):
-        raise DatasetError(f"{file}: it leads out of the folder of samples; copy it there", field="samples")
+        raise DatasetError(f"{file}: the link leads out of the folder of samples; copy the file there", field="samples")
     return real

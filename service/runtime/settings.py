@@ -31,7 +31,7 @@ _HOST_PATTERN = re.compile(rf"\*|(\*\.)?{_LABEL}(\.{_LABEL})*")
 
 
 class Limits(BaseModel):
-    """What one request may cost; checked before memory is taken."""
+    """Limits of one request, checked before memory is allocated."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -41,8 +41,8 @@ class Limits(BaseModel):
         16 * 2**20, ge=1024, le=2**31 - 1,
         description="one gRPC message, no more than max_request_bytes; memory is kept for this size while a message is read",
     )  # fmt: skip
-    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, le=2**31 - 1, description="one picture, encoded")
-    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, le=2**30, description="one picture, decoded")
+    max_part_bytes: int = Field(DEFAULT_LIMITS.max_bytes, ge=1024, le=2**31 - 1, description="one image, encoded")
+    max_pixels: int = Field(DEFAULT_LIMITS.max_pixels, ge=1, le=2**30, description="one image, decoded")
 
     @property
     def message_bytes(self) -> int:
@@ -51,51 +51,56 @@ class Limits(BaseModel):
 
 
 class Settings(BaseSettings):
-    """All that an operator may set. Nested names are joined by two underscores: ``STREETFIX_LIMITS__MAX_PIXELS``."""
+    """All settings of the service. Nested names are joined by two underscores: ``STREETFIX_LIMITS__MAX_PIXELS``."""
 
     model_config = SettingsConfigDict(
         env_prefix="STREETFIX_", env_nested_delimiter="__", frozen=True, extra="forbid", cli_parse_args=False
     )
 
-    maps: Annotated[tuple[Path, ...], NoDecode] = Field((), description="map bundles, or folders of them; ':' between")
+    maps: Annotated[tuple[Path, ...], NoDecode] = Field(
+        (), description="map bundles, or folders of them, separated by ':'"
+    )
     strict: bool = Field(
         False,
-        description="do not start if any bundle cannot be mounted, or if there is none; else those that can be serve",
+        description="do not start if any bundle cannot be mounted, or if there is none; by default, serve the others",
     )
-    host: str = Field("127.0.0.1", description="address to listen on; loopback unless told otherwise")
+    host: str = Field(
+        "127.0.0.1", description="address to listen on; beyond loopback only with keys or client certificates"
+    )
     port: int = Field(8000, ge=0, le=65535, description="0 lets the system choose")
     grpc_port: int | None = Field(
         None, ge=0, le=65535, description="gRPC beside REST, on the same host; default: not served"
     )
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = Field(
         (),
-        description="names by which clients reach the service, ',' between; '*.example.org' stands for all below, '*' for any",
+        description="host names that clients use, separated by ','; '*.example.org': all names below, '*': any",
     )
     health_port: int | None = Field(
-        None, ge=0, le=65535, description="/livez and /readyz alone, always without TLS and keys; default: not served"
+        None,
+        ge=0,
+        le=65535,
+        description="port for /livez and /readyz alone, always without TLS and keys; default: not served",
     )
-    health_host: str | None = Field(None, description="address of the health port; default: as host")
+    health_host: str | None = Field(None, description="address of the health port; default: that of host")
     health_metrics: bool = Field(
-        False, description="serve /metrics on the health port too, to everybody who reaches it"
+        False, description="serve /metrics on the health port too, to everybody who can reach it"
     )
     api_keys: Path | None = Field(
         None, description="file of API keys (streetfix keys); with it every request needs one"
     )
-    tls_certificate: Path | None = Field(None, description="PEM chain; with it both faces speak TLS alone")
+    tls_certificate: Path | None = Field(None, description="PEM chain; REST and gRPC accept only TLS")
     tls_key: Path | None = Field(None, description="PEM private key of the certificate")
     tls_client_ca: Path | None = Field(
-        None, description="PEM authorities; clients need a certificate of theirs (mutual TLS)"
+        None, description="PEM authorities; clients need a certificate from them (mutual TLS)"
     )
-    insecure_public: bool = Field(
-        False, description="listen beyond loopback although nobody has to show a key or certificate"
-    )
+    insecure_public: bool = Field(False, description="listen beyond loopback without keys or client certificates")
     watch_s: float = Field(
         10.0,
         ge=0,
         le=86400,
-        description="look for new bundles, keys and certificates this often, seconds; 0: on SIGHUP alone",
+        description="seconds between two checks for new bundles, keys and certificates; 0: only on SIGHUP",
     )
-    log_style: Literal["text", "json"] = Field("text", description="of the log on stderr")
+    log_style: Literal["text", "json"] = Field("text", description="format of the log on stderr")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "warning", description="info: a line for each request"
     )
@@ -103,16 +108,16 @@ class Settings(BaseSettings):
         None, description="OpenTelemetry collector, as http://127.0.0.1:4318/v1/traces; needs the extra otel"
     )
     traces_share: float = Field(
-        0.05, ge=0, le=1, description="share of the requests without a trace of their own that get one"
+        0.05, ge=0, le=1, description="traced share of the requests that bring no trace of their own"
     )
     grpc_streams: int = Field(32, ge=0, le=1000, description="gRPC streams that may be open at once")
-    grpc_idle_s: float = Field(300.0, gt=0, le=86400, description="a stream that sends no frame for so long is ended")
+    grpc_idle_s: float = Field(
+        300.0, gt=0, le=86400, description="the service ends a stream that sends no frame for this many seconds"
+    )
     drain_s: float = Field(
-        0.0, ge=0, le=600, description="after SIGTERM: not ready, but answering, so long, for balancers to notice"
+        0.0, ge=0, le=600, description="seconds after SIGTERM in which /readyz fails but requests are still answered"
     )
-    grace_s: float = Field(
-        20.0, ge=0, le=3600, description="how long running requests may take to end when the service stops"
-    )
+    grace_s: float = Field(20.0, ge=0, le=3600, description="seconds after the drain in which running requests may end")
     workers: int = Field(
         1, ge=1, le=64, description="processes that answer on the same ports; maps are in memory once for all of them"
     )
@@ -123,24 +128,26 @@ class Settings(BaseSettings):
         description="requests that a process works on at once; default: its share of the usable cores",
     )
     provider: Provider = Field(
-        "cpu", description="what runs the encoder: ONNX Runtime's provider, where it is installed"
+        "cpu", description="execution provider of ONNX Runtime that runs the encoder; it must be installed"
     )
-    queue: int = Field(64, ge=0, le=100_000, description="requests that may wait in a process before 503")
+    queue: int = Field(64, ge=0, le=100_000, description="requests that may wait in a process; the next gets 503")
     request_memory_mib: int | None = Field(
         None,
         ge=1,
         le=2**24,
-        description="memory for requests in all processes together; default: what the container's limit leaves",
+        description="memory for the requests of all processes together; default: computed from the container's limit",
     )
-    request_timeout_s: float = Field(30.0, gt=0, le=86400, description="from a request's first byte to its answer")
+    request_timeout_s: float = Field(
+        30.0, gt=0, le=86400, description="seconds from a request's first byte to its answer"
+    )
     false_accept_rate: float = Field(
         FALSE_ACCEPT_RATE, ge=LEAST_FALSE_ACCEPT_RATE, lt=1,
-        description="share of the queries taken outside the map that one can live with being answered LOCALIZED",
+        description="largest share of out-of-map queries with status LOCALIZED",
     )  # fmt: skip
-    console: bool = Field(True, description="serve the browser console at /console, and what it asks for")
+    console: bool = Field(True, description="serve the browser console at /console, and its endpoints")
     samples: Path | None = Field(
         None,
-        description="folder of sample pairs that the console offers: NAME/rgb.*, depth.*, request.json, truth.json",
+        description="folder of sample pairs for the console: NAME/rgb.*, depth.*, request.json, truth.json",
     )
     limits: Limits = Limits()
 
@@ -153,8 +160,8 @@ class Settings(BaseSettings):
         guarded = self.api_keys is not None or self.tls_client_ca is not None
         if not (guarded or self.insecure_public or is_loopback(self.host)):
             raise ValueError(
-                f"host {self.host} can be reached from other machines, and anybody could ask; set api_keys (streetfix keys) or "
-                "tls_client_ca, or insecure_public if something before this service keeps strangers out"
+                f"host {self.host} can be reached from other machines without a key; set api_keys (streetfix keys) or "
+                "tls_client_ca, or insecure_public if a proxy or firewall protects the service"
             )
         return self
 
@@ -188,13 +195,13 @@ def _host_pattern(value: str) -> str:
     """Return a host pattern in lower case: a name, ``*.name`` or ``*``. An IP address passes too; addresses are always allowed.
 
     Raises:
-        ValueError: the value has a scheme, a port or a path, or is no name.
+        ValueError: the value has a scheme, a port or a path, or is not a host name.
     """
     value = value.lower().rstrip(".")
     if _HOST_PATTERN.fullmatch(value) or _address(value.strip("[]")) is not None:
         return value
     raise ValueError(
-        f"{value!r} is no host name; write names without scheme and port, as maps.example.org or *.example.org"
+        f"{value!r} is not a valid host name; write names without scheme and port, as maps.example.org or *.example.org"
     )
 
 
@@ -241,7 +248,7 @@ def load_settings(config: Path | None = None, **flags: object) -> Settings:
         ) from error
     if CLIENT_KEY in os.environ and settings.api_keys is None:
         raise RequestError(
-            f"{CLIENT_KEY} is the key that a client sends, and no request would need one; set {CLIENT_KEY}S to the file of keys "
+            f"{CLIENT_KEY} is the key of a client, but the service has no keys; set {CLIENT_KEY}S to the file of keys "
             f"(streetfix keys), or unset {CLIENT_KEY}",
             field="api_keys",
         )

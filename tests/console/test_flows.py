@@ -27,8 +27,8 @@ def test_a_sample_pair_is_asked_with_one_click(url: str, page_of: Pages, shoot: 
     assert page.inner_text(".verdict .status") == "LOCALIZED"
     assert "street 5" in page.inner_text(".verdict .street")
     assert float(page.inner_text(".verdict .figures div:nth-child(2) b").removesuffix(" m")) < 1.0
-    assert page.locator(".seen img").count() == 6
-    widths = page.eval_on_selector_all(".seen img", "images => images.map(image => image.naturalWidth)")
+    assert page.locator(".images img").count() == 6
+    widths = page.eval_on_selector_all(".images img", "images => images.map(image => image.naturalWidth)")
     assert all(width >= 64 for width in widths)
     shoot(page, "sample_light")
     page.click("button:has-text('3D')")
@@ -43,7 +43,7 @@ def test_ones_own_files_are_sorted_and_asked(url: str, demo_map: Demo, page_of: 
     page.wait_for_selector(".chosen li.given >> nth=3")
     page.click("button.primary")
     page.wait_for_selector(".verdict", timeout=ANSWER_MS)
-    assert "from the truth" in page.inner_text(".verdict .figures")
+    assert "from the ground truth" in page.inner_text(".verdict .figures")
     shoot(page, "upload_dark")
 
 
@@ -95,7 +95,7 @@ def test_a_wrong_file_is_told_with_what_to_do(url: str, demo_map: Demo, page_of:
     open_console(page, url)
     page.set_input_files("#files", [{"name": "notes.pdf", "mimeType": "application/pdf", "buffer": b"%PDF"}])
     page.wait_for_selector(".problem")
-    assert "notes.pdf: no picture" in page.inner_text(".problem")
+    assert "notes.pdf: this file is not an image" in page.inner_text(".problem")
     rgb, _, request, _ = files_of(demo_map, "05")
     damaged = {"name": "depth.png", "mimeType": "image/png", "buffer": b"\x89PNG\r\n\x1a\nnothing of the kind"}
     page.set_input_files("#files", [rgb, request])
@@ -153,10 +153,10 @@ def test_a_map_is_swapped_and_rolled_back_by_those_who_may(
         assert page.inner_text(".versions .serves code") == second
         page.click("button:has-text('Roll back')")
         page.wait_for_selector(f".versions .serves code:text('{first}')")
-        assert f"{first} serves now" in page.inner_text(".told")
+        assert f"{first} is serving now" in page.inner_text(".message")
         assert httpx.get(f"{url}/v1/maps").json()["maps"][0]["version"] == first
         page.wait_for_selector(f"[data-ready$='{first}']")
-        page.click("button:has-text('Show where')")
+        page.click("button:has-text('Show coverage')")
         shoot(page, "map_rolled_back")
         page.click("button:has-text('Swap in')")
         page.wait_for_selector(f".versions .serves code:text('{second}')")

@@ -61,7 +61,7 @@ def test_everything_can_be_done_by_keyboard(url: str, page_of: Pages) -> None:
     for key in ("ArrowLeft", "ArrowUp", "+", "-", "0", "3"):
         page.keyboard.press(key)
     assert page.get_attribute("button:text-is('3D')", "aria-pressed") == "true"
-    page.focus("role=tab[name='Ask']")
+    page.focus("role=tab[name='Query']")
     page.keyboard.press("ArrowRight")
     assert page.get_attribute("role=tab[name='Maps']", "aria-selected") == "true"
 
@@ -140,7 +140,7 @@ def test_a_key_opens_what_it_may_and_no_more(demo_map: Demo, page_of: Pages, sho
         page.wait_for_selector("[data-ready]")
         click_sample(page, "01")
         page.click("role=tab[name='Live']")
-        page.wait_for_selector(".told.bad:has-text('operator')")
+        page.wait_for_selector(".message.bad:has-text('operator')")
         page.fill("#key", "high-key")
         page.press("#key", "Enter")
         page.wait_for_selector("button[aria-label^='Show answer']")

@@ -16,6 +16,9 @@ HEAD = """# 0007. Is it so?
 
 ## Measured
 Nothing else.
+
+## Reopen if
+There are more queries.
 """
 
 
@@ -38,9 +41,11 @@ def test_a_head_is_read_field_by_field(tmp_path: Path) -> None:
         ("0007. Is", "0008. Is", "0008"),
         ("in use", "undecided", "undecided"),
         ("retrieval", "weather", "weather"),
+        ("## Reopen if\n", "## Later\n", "Reopen if"),
+        ("There are more queries.\n", "", "Reopen if"),
     ],
 )
-def test_a_wrong_head_is_named(tmp_path: Path, old: str, new: str, named: str) -> None:
+def test_a_wrong_form_is_named(tmp_path: Path, old: str, new: str, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         read_decision(written(tmp_path, HEAD.replace(old, new)))
 

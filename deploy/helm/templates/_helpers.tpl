@@ -21,7 +21,7 @@ app.kubernetes.io/managed-by: {{ .Release.Service }}
 {{- end -}}
 {{- end -}}
 
-{{/* What the named secrets hold, where the cluster may be asked: `helm template` sees nothing of it. */}}
+{{/* Checksum of the named secrets, if Helm can read the cluster. `helm template` cannot. */}}
 {{- define "streetfix.secrets" -}}
 {{- $namespace := .Release.Namespace -}}
 {{- range list .Values.keys.secret .Values.tls.secret .Values.tls.clientCa -}}

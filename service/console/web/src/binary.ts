@@ -5,13 +5,13 @@ export interface Cloud {
   count: number;
   origin: Vector;
   step: Vector;
-  /** x, y, z in steps, and how upright the surface is: four for each point. */
+  /** x, y, z in steps, and how upright the surface is (0 flat, 65535 a wall): four values per point. */
   records: Uint16Array<ArrayBuffer>;
 }
 
 export interface Places {
   count: number;
-  /** x, y, z in map metres, three for each place. */
+  /** x, y, z in map metres, three values per place. */
   positions: Float64Array;
 }
 
@@ -44,7 +44,7 @@ function vectorAt(data: DataView, offset: number): Vector {
 export function cloudFrom(buffer: ArrayBuffer): Cloud {
   const data = view(buffer, 'SFC1');
   const count = data.getUint32(4, true);
-  const records = new Uint16Array(buffer, CLOUD_HEADER, 4 * count); // every machine that runs a browser is little-endian
+  const records = new Uint16Array(buffer, CLOUD_HEADER, 4 * count); // all platforms with a browser are little-endian
   return { count, origin: vectorAt(data, 8), step: vectorAt(data, 32), records };
 }
 

@@ -1,8 +1,8 @@
-// The whole page: what stands where, and what one part tells another.
+// The whole page: its layout, and the messages between its parts.
 import { AnswerPanel } from './answer/answer_panel';
-import { AskPanel } from './ask/ask_panel';
-import { bodyFrom, requestFrom, type Question } from './ask/question';
-import { samplesOfMap } from './ask/samples_of_map';
+import { QueryPanel } from './query/query_panel';
+import { bodyFrom, requestFrom, type Query } from './query/query';
+import { samplesOfMap } from './query/samples_of_map';
 import { cloudFrom, placesFrom, queryPointsFrom } from './binary';
 import type { MapEntry, SamplePair } from './contract';
 import { button, element } from './element';
@@ -16,7 +16,7 @@ import { Tabs } from './tabs';
 import { Theme } from './theme';
 
 const CLOUD_POINTS = 2_000_000;
-const LOOK_MS = 10_000;
+const REFRESH_MS = 10_000;
 
 export class ConsolePage {
   readonly element: HTMLElement;
@@ -24,7 +24,7 @@ export class ConsolePage {
   readonly #map = new MapView();
   readonly #legend = new Legend();
   readonly #answer = new AnswerPanel();
-  readonly #ask: AskPanel;
+  readonly #query: QueryPanel;
   readonly #maps: MapsPanel;
   readonly #live: LivePanel;
   readonly #tabs: Tabs;
@@ -37,11 +37,11 @@ export class ConsolePage {
   #entries: MapEntry[] = [];
   #samples: SamplePair[] = [];
   #shown: MapEntry | null = null;
-  #asking = 0;
+  #queries = 0;
 
   constructor() {
-    this.#ask = new AskPanel(this.#service, {
-      ask: (question) => { void this.#localize(question); },
+    this.#query = new QueryPanel(this.#service, {
+      send: (query) => { void this.#localize(query); },
       drawsPrior: (draws) => { this.#map.drawsPrior = draws; this.#nameTurn(); },
       priorChanged: (prior) => { this.#map.prior.prior = prior; this.#map.changed(); },
       map: () => this.#mapName(),
@@ -49,23 +49,23 @@ export class ConsolePage {
       failed: (error) => { this.#answer.fail(error); },
     });
     this.#map.onPriorDrawn = () => {
-      this.#ask.prior.show(this.#map.prior.prior);
-      this.#ask.prior.draw.click(); // one prior drawn, the map moves again
+      this.#query.prior.show(this.#map.prior.prior);
+      this.#query.prior.draw.click(); // one prior is drawn, then dragging moves the map again
     };
     this.#maps = new MapsPanel(this.#service, {
-      served: () => { void this.#look(); },
+      served: () => { void this.#refresh(); },
       coverage: (shows) => { void this.#showCoverage(shows); },
     });
     this.#live = new LivePanel(this.#service, (position) => { this.#map.showAt(position.x, position.y); });
     this.#tabs = new Tabs([
-      { name: 'Ask', content: this.#ask.element },
+      { name: 'Query', content: this.#query.element },
       { name: 'Maps', content: this.#maps.element },
       { name: 'Live', content: this.#live.element },
     ], (name) => {
       if (name === 'Live') this.#live.start();
       else this.#live.stop();
     });
-    this.#turn = button('3D', () => { this.#turnMap(); }, { 'aria-pressed': 'false', title: 'From above or around (3)' });
+    this.#turn = button('3D', () => { this.#turnMap(); }, { 'aria-pressed': 'false', title: 'From above or in 3D (3)' });
     this.#all = button('⁙', () => {
       const draws = this.#all.getAttribute('aria-pressed') !== 'true';
       this.#all.setAttribute('aria-pressed', String(draws));
@@ -80,18 +80,18 @@ export class ConsolePage {
 
   async start(): Promise<void> {
     this.#theme.start();
-    await Promise.all([this.#look(), this.#showSamples()]);
+    await Promise.all([this.#refresh(), this.#showSamples()]);
     window.setInterval(() => {
-      if (!document.hidden) void this.#look();
-    }, LOOK_MS);
+      if (!document.hidden) void this.#refresh();
+    }, REFRESH_MS);
   }
 
   #arranged(): HTMLElement {
-    const key = element('input', { type: 'password', id: 'key', autocomplete: 'off', placeholder: 'API key', 'aria-label': 'API key, kept in this tab alone' });
+    const key = element('input', { type: 'password', id: 'key', autocomplete: 'off', placeholder: 'API key', 'aria-label': 'API key, kept only in this tab' });
     key.value = this.#service.key;
     key.addEventListener('change', () => {
       this.#service.key = key.value.trim();
-      void this.#look();
+      void this.#refresh();
       void this.#showSamples();
     });
     const zoom = (label: string, name: string, factor: number): HTMLButtonElement =>
@@ -142,14 +142,14 @@ export class ConsolePage {
     this.#turn.setAttribute('aria-pressed', String(this.#map.mode === 'around'));
   }
 
-  /** Which maps are there, and whether the one that is shown still serves. */
-  async #look(): Promise<void> {
+  /** Read the list of maps, and whether the shown version still serves. */
+  async #refresh(): Promise<void> {
     try {
       this.#entries = await this.#service.maps();
-      this.#tell('good', 'serving');
+      this.#showState('good', 'serving');
     } catch (error) {
       const ours = error instanceof ServiceError ? error : null;
-      this.#tell('bad', ours?.status === 401 ? 'needs an API key' : ours?.status === 0 ? 'does not answer' : String(ours?.title ?? error));
+      this.#showState('bad', ours?.status === 401 ? 'needs an API key' : ours?.status === 0 ? 'does not answer' : String(ours?.title ?? error));
       if (this.#shown === null) this.#answer.fail(error);
       return;
     }
@@ -174,14 +174,14 @@ export class ConsolePage {
     try {
       this.#loading.textContent = 'Loading the map…';
       const [streets, places] = await Promise.all([this.#service.streets(version), this.#service.places(version)]);
-      if (this.#shown !== entry) return; // another one was chosen meanwhile
+      if (this.#shown !== entry) return; // another map was chosen meanwhile
       this.#map.setMap(streets, placesFrom(places));
       const cloud = cloudFrom(await this.#service.cloud(version, CLOUD_POINTS));
       if (this.#isStillShown(entry)) this.#map.setCloud(cloud);
       this.#loading.textContent = '';
       this.element.dataset['ready'] = version;
     } catch (error) {
-      if (this.#isStillShown(entry)) this.#shown = null; // the next look tries again
+      if (this.#isStillShown(entry)) this.#shown = null; // the next refresh tries again
       this.#loading.textContent = `The map cannot be drawn: ${error instanceof Error ? error.message : String(error)}`;
     }
   }
@@ -195,13 +195,13 @@ export class ConsolePage {
       this.#samples = await this.#service.samples();
       this.#offerSamples();
     } catch (error) {
-      this.#ask.offer({ samples: [], otherMaps: [] });
-      if (!(error instanceof ServiceError)) throw error; // why a service answers nothing is told once, above
+      this.#query.offer({ samples: [], otherMaps: [] });
+      if (!(error instanceof ServiceError)) throw error; // `#refresh` already shows why the service does not answer
     }
   }
 
   #offerSamples(): void {
-    if (this.#shown !== null) this.#ask.offer(samplesOfMap(this.#samples, this.#shown.name));
+    if (this.#shown !== null) this.#query.offer(samplesOfMap(this.#samples, this.#shown.name));
   }
 
   async #showCoverage(shows: boolean): Promise<void> {
@@ -212,24 +212,24 @@ export class ConsolePage {
     }
   }
 
-  async #localize(question: Question): Promise<void> {
-    const turn = ++this.#asking;
+  async #localize(query: Query): Promise<void> {
+    const turn = ++this.#queries;
     const began = performance.now();
-    this.#ask.busy = true;
+    this.#query.busy = true;
     try {
-      const request = requestFrom(question, this.#mapName(), this.#map.prior.prior);
-      const explanation = await this.#service.explain(bodyFrom(question, request));
-      if (turn !== this.#asking || question.rgb === null) return; // a later question was asked meanwhile
-      this.#answer.show(explanation, question.rgb.blob, question.truth, performance.now() - began);
-      this.#map.showAnswer({ answer: explanation.answer, camera: request.camera, truth: question.truth }, queryPointsFrom(explanation.points));
-      this.#tell('good', 'serving');
+      const request = requestFrom(query, this.#mapName(), this.#map.prior.prior);
+      const explanation = await this.#service.explain(bodyFrom(query, request));
+      if (turn !== this.#queries || query.rgb === null) return; // a later query was sent meanwhile
+      this.#answer.show(explanation, query.rgb.blob, query.truth, performance.now() - began);
+      this.#map.showAnswer({ answer: explanation.answer, camera: request.camera, truth: query.truth }, queryPointsFrom(explanation.points));
+      this.#showState('good', 'serving');
     } catch (error) {
-      if (turn !== this.#asking) return;
+      if (turn !== this.#queries) return;
       this.#map.clearAnswer();
       this.#answer.fail(error);
-      if (error instanceof ServiceError && error.status === 0) this.#tell('bad', 'does not answer');
+      if (error instanceof ServiceError && error.status === 0) this.#showState('bad', 'does not answer');
     } finally {
-      if (turn === this.#asking) this.#ask.busy = false;
+      if (turn === this.#queries) this.#query.busy = false;
     }
   }
 
@@ -237,12 +237,12 @@ export class ConsolePage {
     return this.#entries.length > 1 ? (this.#shown?.name ?? null) : null;
   }
 
-  #tell(kind: 'good' | 'bad', text: string): void {
+  #showState(kind: 'good' | 'bad', text: string): void {
     this.#state.className = `state ${kind}`;
     if (this.#state.textContent !== text) this.#state.textContent = text;
   }
 
-  /** Files may be dropped anywhere: a near miss must not make the browser leave the page. */
+  /** Files may be dropped anywhere. Otherwise a file dropped beside the field would make the browser leave the page. */
   #takeDrops(): void {
     this.element.addEventListener('dragover', (event) => {
       event.preventDefault();
@@ -254,8 +254,8 @@ export class ConsolePage {
     this.element.addEventListener('drop', (event) => {
       event.preventDefault();
       this.element.classList.remove('dropping');
-      this.#tabs.choose('Ask');
-      void this.#ask.takeFiles([...(event.dataTransfer?.files ?? [])]);
+      this.#tabs.choose('Query');
+      void this.#query.takeFiles([...(event.dataTransfer?.files ?? [])]);
     });
   }
 }

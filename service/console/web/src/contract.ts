@@ -1,4 +1,4 @@
-// What the service says, as openapi/openapi.json has it; metres and degrees.
+// The messages of the service as in openapi/openapi.json; metres and degrees.
 
 export interface Vector {
   x: number;
@@ -20,7 +20,7 @@ export interface Pose {
 export type Status = 'LOCALIZED' | 'AMBIGUOUS' | 'OUT_OF_MAP';
 
 export interface Hypothesis {
-  /** Only the first hypothesis of a LOCALIZED answer is. */
+  /** True only for the first hypothesis of a LOCALIZED answer. */
   confirmed: boolean;
   pose: Pose;
   share: number;
@@ -41,7 +41,7 @@ export interface MapVersion {
   version: string;
 }
 
-/** Where the camera may be: over all hypotheses and the rest of the map. It is not a pose. */
+/** Mean and covariance of the position over all hypotheses and the rest of the map. It is not a pose. */
 export interface Spread {
   mean: Vector;
   /** 3 x 3, row by row. */
@@ -50,7 +50,7 @@ export interface Spread {
   hypotheses_weight: number;
 }
 
-/** What may be wrong with the question or the map. */
+/** A possible cause in the query or the map. */
 export interface Reason {
   check: string;
   /** Standard deviations from the mean of calibration. */
@@ -58,7 +58,7 @@ export interface Reason {
   remedy: string;
 }
 
-/** Height of the camera above the ground: of the request, found in the depth image, or the usual one because no ground is seen. */
+/** Height of the camera above the ground: from the request, estimated from the depth image, or assumed because no ground is visible. */
 export interface CameraHeight {
   height_m: number;
   origin: 'given' | 'estimated' | 'assumed';

@@ -1,4 +1,4 @@
-// Elements by name; text is always text, never markup.
+// Makes elements. Text is never parsed as markup.
 
 type Child = Node | string | null;
 type Attributes = Record<string, string | boolean>;

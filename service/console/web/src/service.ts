@@ -1,9 +1,9 @@
-// The service's REST interface. The key stays in this tab: in memory, and in the session's storage so that a reload keeps it.
+// The service's REST interface. The key stays in this tab: in memory and in `sessionStorage`, so that a reload keeps it.
 import type { Explanation, LastAnswer, MapEntry, SamplePair, StreetFeature } from './contract';
 
 const KEY = 'streetfix-key';
 
-/** What the service refused (problem+json), or that it cannot be reached: `status` 0. */
+/** A problem of the service (problem+json), or an unreachable service: `status` 0. */
 export class ServiceError extends Error {
   constructor(
     readonly status: number,
@@ -26,7 +26,7 @@ interface Problem {
 }
 
 export class Service {
-  /** Where the service's paths begin, whatever a proxy puts before them. */
+  /** Base address of the service, also behind a proxy with a path prefix. */
   readonly base = new URL('../', document.baseURI);
   #key = sessionStorage.getItem(KEY) ?? '';
 
@@ -65,8 +65,8 @@ export class Service {
     return (await this.#json<{ samples: SamplePair[] }>('v1/samples')).samples;
   }
 
-  async samplePicture(address: string): Promise<Blob> {
-    return (await this.#ask(`v1/${address}`)).blob();
+  async sampleImage(address: string): Promise<Blob> {
+    return (await this.#send(`v1/${address}`)).blob();
   }
 
   explain(body: FormData): Promise<Explanation> {
@@ -86,26 +86,26 @@ export class Service {
   }
 
   async metrics(): Promise<string> {
-    return (await this.#ask('metrics')).text();
+    return (await this.#send('metrics')).text();
   }
 
   async #json<T>(path: string, init: RequestInit = {}): Promise<T> {
-    return (await (await this.#ask(path, init)).json()) as T;
+    return (await (await this.#send(path, init)).json()) as T;
   }
 
   async #bytes(path: string): Promise<ArrayBuffer> {
-    return (await this.#ask(path)).arrayBuffer();
+    return (await this.#send(path)).arrayBuffer();
   }
 
-  async #ask(path: string, init: RequestInit = {}): Promise<Response> {
+  async #send(path: string, init: RequestInit = {}): Promise<Response> {
     const headers = new Headers(init.headers);
     if (this.#key !== '') headers.set('X-Api-Key', this.#key);
     let response: Response;
     try {
       response = await fetch(new URL(path, this.base), { ...init, headers, cache: 'no-store' });
     } catch (error) {
-      const told = `${this.base.host} does not answer. Is the service running? (${String(error)})`;
-      throw new ServiceError(0, 'unreachable', 'The service cannot be reached.', told);
+      const detail = `${this.base.host} does not answer. Check that the service is running (${String(error)}).`;
+      throw new ServiceError(0, 'unreachable', 'The service cannot be reached.', detail);
     }
     if (!response.ok) throw await problemOf(response);
     return response;
@@ -118,7 +118,7 @@ async function problemOf(response: Response): Promise<ServiceError> {
   try {
     problem = JSON.parse(text) as Problem;
   } catch {
-    problem = { detail: text.slice(0, 300) }; // a proxy's own page
+    problem = { detail: text.slice(0, 300) }; // an error page of a proxy
   }
   return new ServiceError(
     response.status,

@@ -1,4 +1,4 @@
-// Tabs as ARIA has them: arrow keys change between them.
+// Tabs by the ARIA pattern: arrow keys change between them.
 import { element } from './element';
 
 interface Tab {
@@ -23,7 +23,7 @@ export class Tabs {
       });
       return made;
     });
-    this.element = element('div', { class: 'tabs' }, element('div', { role: 'tablist', 'aria-label': 'What to do' }, ...this.#buttons));
+    this.element = element('div', { class: 'tabs' }, element('div', { role: 'tablist', 'aria-label': 'Panels' }, ...this.#buttons));
     for (const { name, content } of tabs) {
       content.id = `panel-${name}`;
       content.setAttribute('role', 'tabpanel');

@@ -1,4 +1,4 @@
-// Light and dark: as the system has it, until somebody chooses.
+// Light or dark: that of the system, until the user chooses.
 import type { Shade } from './map/cloud_points';
 
 const KEY = 'streetfix-theme';

@@ -1,11 +1,11 @@
-// The answer in words and numbers, and what led to it.
+// The answer in words and numbers, and its intermediate images.
 import type { Answer, Explanation, Pose, Truth } from '../contract';
 import { element, facts } from '../element';
 import { ellipseOf } from '../map/ellipse';
 import { degrees, metres, milliseconds, percent } from '../numbers';
 import { ServiceError } from '../service';
-import { errorOf } from '../ask/truth';
-import { SeenPictures } from './seen_pictures';
+import { errorOf } from '../query/truth';
+import { IntermediateImages } from './intermediate_images';
 
 const STATUS_TEXT = {
   LOCALIZED: 'Localized',
@@ -13,38 +13,38 @@ const STATUS_TEXT = {
   OUT_OF_MAP: 'Out of map',
 } as const;
 const STATUS_MEANING = {
-  LOCALIZED: 'Act on it.',
-  AMBIGUOUS: 'In the map, but not sure where: there is no pose. Look at the hypotheses; a prior or more frames decide.',
-  OUT_OF_MAP: 'The map does not show what the pictures do. There is no pose; do not use the hypotheses as one.',
+  LOCALIZED: 'Use the pose with its covariance.',
+  AMBIGUOUS: 'In the map, but the position is uncertain. There is no pose. See the hypotheses. A prior or more frames can decide.',
+  OUT_OF_MAP: 'The images do not match the map. There is no pose. Do not use the hypotheses as one.',
 } as const;
-/** What confidence promises: a position within this of the true one. */
+/** Confidence is the probability that the position is within this distance of the true one, metres. */
 const WRONG_M = 1;
 const STAGES = ['decode', 'fuse', 'encode', 'search', 'register'] as const;
 
 export class AnswerPanel {
   readonly element = element('div', { class: 'panel', 'aria-live': 'polite' });
-  readonly #pictures = new SeenPictures();
+  readonly #images = new IntermediateImages();
 
   constructor() {
     this.element.append(
       element(
         'div',
         { class: 'empty' },
-        element('h2', {}, 'Where was this picture taken?'),
-        element('p', {}, 'Click a sample pair, or drop an RGB and a depth picture with their camera. The answer is drawn on the map, and what the machine saw stands here.'),
+        element('h2', {}, 'Localize an image pair'),
+        element('p', {}, 'Click a sample pair, or drop an RGB image and a depth image with their camera. The map shows the answer. This panel shows the intermediate images.'),
       ),
     );
   }
 
   show(explanation: Explanation, rgb: Blob, truth: Truth | null, elapsedMs: number): void {
     const { answer } = explanation;
-    this.#pictures.show(rgb, explanation);
+    this.#images.show(rgb, explanation);
     this.element.replaceChildren(
       this.#head(answer, truth),
       answer.pose === null ? this.#why(answer) : '',
       answer.pose === null ? this.#spread(answer) : this.#pose(answer, answer.pose),
       answer.hypotheses.length > (answer.pose === null ? 0 : 1) ? this.#hypotheses(answer) : '',
-      element('section', {}, element('h2', {}, 'What the machine saw'), this.#pictures.element),
+      element('section', {}, element('h2', {}, 'Intermediate images'), this.#images.element),
       this.#neighbours(answer),
       this.#times(answer, elapsedMs),
     );
@@ -52,13 +52,13 @@ export class AnswerPanel {
 
   fail(error: unknown): void {
     const ours = error instanceof ServiceError ? error : null;
-    const told = error instanceof Error ? error.message : String(error);
+    const detail = error instanceof Error ? error.message : String(error);
     this.element.replaceChildren(
       element(
         'div',
         { class: 'problem', role: 'alert' },
-        element('h2', {}, ours?.title ?? 'This cannot be asked.'),
-        element('p', {}, told),
+        element('h2', {}, ours?.title ?? 'The query is invalid.'),
+        element('p', {}, detail),
         ours === null || ours.status === 0
           ? null
           : element('p', { class: 'hint' }, [`HTTP ${ours.status}`, ours.code, ours.field && `field ${ours.field}`, ours.requestId && `request ${ours.requestId}`].filter(Boolean).join(' · ')),
@@ -72,13 +72,13 @@ export class AnswerPanel {
       'div',
       { class: `verdict ${answer.status.toLowerCase()}` },
       element('p', { class: 'status' }, STATUS_TEXT[answer.status]),
-      element('p', { class: 'street' }, answer.pose === null ? 'no pose' : (answer.street?.name ?? 'in no street')),
+      element('p', { class: 'street' }, answer.pose === null ? 'no pose' : (answer.street?.name ?? 'no street')),
       element('p', { class: 'meaning' }, STATUS_MEANING[answer.status]),
       element(
         'div',
         { class: 'figures' },
         figure(answer.confidence === null ? 'not calibrated' : percent(answer.confidence), 'within 1 m'),
-        error === null ? null : figure(metres(error.metres), error.degrees === null ? 'from the truth' : `and ${degrees(error.degrees)} from the truth`, error.metres > WRONG_M),
+        error === null ? null : figure(metres(error.metres), error.degrees === null ? 'from the ground truth' : `and ${degrees(error.degrees)} from the ground truth`, error.metres > WRONG_M),
       ),
     );
   }
@@ -89,15 +89,15 @@ export class AnswerPanel {
         'section',
         { class: 'why' },
         element('h2', {}, 'Why there is no pose'),
-        element('p', {}, 'All evidence lies in the range that calibration saw. The place may be outside the map, or look like another place of it.'),
+        element('p', {}, 'All confidence features are in the range of the calibration data. The place may be outside the map or a perceptual alias.'),
       );
     }
     const list = element('ol');
     for (const { check, evidence, remedy } of answer.reasons) {
-      const away = Object.entries(evidence).map(([name, deviations]) => `${name} ${deviations > 0 ? '+' : '−'}${Math.abs(deviations).toFixed(1)} σ`);
-      list.append(element('li', {}, element('b', {}, check), element('span', {}, remedy), away.length === 0 ? null : element('span', { class: 'hint' }, away.join(', '))));
+      const deviations = Object.entries(evidence).map(([name, value]) => `${name} ${value > 0 ? '+' : '−'}${Math.abs(value).toFixed(1)} σ`);
+      list.append(element('li', {}, element('b', {}, check), element('span', {}, remedy), deviations.length === 0 ? null : element('span', { class: 'hint' }, deviations.join(', '))));
     }
-    return element('section', { class: 'why' }, element('h2', {}, 'What to check, the likeliest first'), list);
+    return element('section', { class: 'why' }, element('h2', {}, 'What to check, the likeliest cause first'), list);
   }
 
   #spread(answer: Answer): HTMLElement {
@@ -106,11 +106,11 @@ export class AnswerPanel {
       const ellipse = ellipseOf(answer.spread.covariance);
       rows.push(['σ on the ground', `${metres(ellipse.major)} × ${metres(ellipse.minor)}`]);
       rows.push(['σ heading', degrees(answer.spread.heading_std_deg)]);
-      rows.push(['in one of the hypotheses', percent(answer.spread.hypotheses_weight)]);
+      rows.push(['weight of hypotheses', percent(answer.spread.hypotheses_weight)]);
     }
     rows.push(...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
-    return element('section', {}, element('h2', {}, 'Where it may be'), facts(rows));
+    return element('section', {}, element('h2', {}, 'Possible positions'), facts(rows));
   }
 
   #pose(answer: Answer, pose: Pose): HTMLElement {
@@ -135,7 +135,7 @@ export class AnswerPanel {
       {},
       element('h2', {}, answer.pose === null ? 'Hypotheses, not confirmed' : 'Hypotheses'),
       table(
-        ['', 'support', 'on the map', 'x, y', 'heading'],
+        ['', 'support', 'inliers', 'x, y', 'heading'],
         answer.hypotheses.map((each, k) => [
           `${k + 1}`,
           percent(each.share),
@@ -154,7 +154,7 @@ export class AnswerPanel {
       {},
       element('h2', {}, 'Most similar places'),
       table(
-        ['', 'place', 'similarity', 'street', ...(pose === null ? [] : ['away'])],
+        ['', 'place', 'similarity', 'street', ...(pose === null ? [] : ['distance'])],
         answer.neighbours.map((each, k) => [
           `n${k + 1}`,
           `${each.place}`,
@@ -180,7 +180,7 @@ export class AnswerPanel {
       {},
       element('h2', {}, 'Time'),
       bars,
-      element('p', { class: 'hint' }, `${milliseconds(times.total)} in the service, ${milliseconds(elapsedMs)} from the click to the answer`),
+      element('p', { class: 'hint' }, `${milliseconds(times.total)} in the service, ${milliseconds(elapsedMs)} from sending to the answer`),
     );
   }
 }

@@ -1,4 +1,4 @@
-// What was answered: the pose with its covariance and field of view, or where the camera may be; and the places it was found by.
+// The answer: the pose with its covariance and field of view, or the hypotheses and the spread; and the most similar places.
 import type { Answer, Camera, Pose, Truth, Vector } from '../contract';
 import { ellipseOf } from './ellipse';
 import type { Ink, Overlay, Point } from './overlay';
@@ -115,7 +115,7 @@ function positionOn(overlay: Overlay, pose: Pose): Point | null {
   return overlay.at(pose.position.x, pose.position.y, pose.position.z);
 }
 
-/** A short arrow of constant length: the direction is seen at every zoom. */
+/** A short arrow of constant length, so that the direction is visible at every zoom. */
 function drawArrow(overlay: Overlay, pose: Pose, at: Point, colour: string, palette: Palette): void {
   const heading = (pose.heading_deg * Math.PI) / 180;
   const ahead = overlay.at(pose.position.x + Math.cos(heading), pose.position.y + Math.sin(heading), pose.position.z);

@@ -1,4 +1,4 @@
-// Two ways to look at a map: from above, true to scale, and from anywhere.
+// Two cameras: orthographic from above, and perspective.
 import { OrthographicCamera, PerspectiveCamera, Vector3 } from 'three';
 import { MapControls } from 'three/examples/jsm/controls/MapControls.js';
 
@@ -37,7 +37,7 @@ export class Cameras {
     for (const [name, controls] of Object.entries(this.#controls)) controls.enabled = name === mode;
   }
 
-  /** Whether dragging moves the map; a tool may want to drag for itself. */
+  /** Whether dragging moves the map. A tool such as the prior may need dragging itself. */
   set movable(movable: boolean) {
     this.#controls[this.#mode].enabled = movable;
   }
@@ -46,7 +46,7 @@ export class Cameras {
     return this.#mode === 'above' ? this.above : this.around;
   }
 
-  /** CSS pixels of a metre: everywhere from above, at a distance of one metre from around. */
+  /** CSS pixels per metre: everywhere from above, at a distance of one metre in perspective. */
   get metrePx(): number {
     if (this.#mode === 'above') return (this.above.zoom * this.#height) / (this.above.top - this.above.bottom);
     return this.#height / (2 * Math.tan((this.around.fov * Math.PI) / 360));
@@ -63,7 +63,7 @@ export class Cameras {
     this.around.updateProjectionMatrix();
   }
 
-  /** Show a part of the map from above: its centre and how many metres at least in every direction. */
+  /** Show a part of the map from above: its centre and the least half width, metres. */
   show(x: number, y: number, radius: number): void {
     const half = radius * Math.max(1, this.#height / this.#width);
     this.above.top = half;
@@ -75,7 +75,7 @@ export class Cameras {
     this.#controls.above.update();
   }
 
-  /** Look from behind and above a camera along its heading. */
+  /** View along the heading of a camera, from behind and above it. */
   follow(at: Vector3, headingRad: number): void {
     const back = new Vector3(-Math.cos(headingRad), -Math.sin(headingRad), 0);
     this.#controls.around.target.copy(at).addScaledVector(back, -12);
@@ -84,7 +84,7 @@ export class Cameras {
     this.#controls.around.update();
   }
 
-  /** What lies in the middle. */
+  /** Centre of the view. */
   get target(): Vector3 {
     return this.#controls[this.#mode].target;
   }
@@ -99,7 +99,7 @@ export class Cameras {
     this.#controls[this.#mode].update();
   }
 
-  /** Shares of the picture's height, right and up. */
+  /** Shares of the height of the view, to the right and up. */
   panBy(right: number, up: number): void {
     const camera = this.active;
     const metres =

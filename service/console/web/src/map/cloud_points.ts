@@ -1,9 +1,9 @@
-// The cloud as one draw call, coloured by height; whoever moves the map sees a beginning of it, which is a thinner cloud.
+// The cloud as one draw call, coloured by height. While the map moves, only its first part is drawn, which is a thinner cloud.
 import { BufferGeometry, Color, InterleavedBuffer, InterleavedBufferAttribute, Points, ShaderMaterial } from 'three';
 import type { Cloud } from '../binary';
 import type { LocalFrame } from './local_frame';
 
-/** Heights (metres over the track's ground) of the colours below. */
+/** Heights above the ground of the track (m) of the colours below. */
 export const HEIGHTS_M = [0, 2, 6, 14, 30];
 export const COLOURS = {
   light: ['#c9c5b8', '#8fb3a7', '#3f8f95', '#2f5f8f', '#3b2f63'],
@@ -68,7 +68,7 @@ export class CloudPoints {
     return this.#count;
   }
 
-  /** Draw so many of the points at most. */
+  /** Limit the number of drawn points. */
   limit(points: number): void {
     this.object.geometry.setDrawRange(0, Math.min(this.#count, points));
   }
@@ -79,7 +79,7 @@ export class CloudPoints {
     if (uniforms['shading']) uniforms['shading'].value = shade === 'light' ? 0.3 : 0.15;
   }
 
-  /** How many pixels a metre is: at a distance of one metre, or everywhere where there is no perspective. */
+  /** Pixels per metre: at a distance of one metre, or everywhere without perspective. */
   scale(metrePx: number, pixelRatio: number): void {
     const uniforms = this.#material.uniforms;
     if (uniforms['metrePx']) uniforms['metrePx'].value = 0.4 * metrePx;

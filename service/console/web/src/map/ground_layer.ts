@@ -1,4 +1,4 @@
-// The map itself over the cloud: streets with their names, the survey's track, where the map can answer.
+// The map over the cloud: streets with their names, the survey's track, the coverage.
 import type { Places } from '../binary';
 import type { StreetFeature, Vector } from '../contract';
 import type { Overlay } from './overlay';
@@ -35,7 +35,7 @@ export class GroundLayer {
     this.#drawTrack(overlay, palette, metrePx);
   }
 
-  /** After everything else, so that names of what was found come first. */
+  /** Drawn last, so that labels of the answer have priority. */
   drawNames(overlay: Overlay, palette: Palette): void {
     for (const street of this.#streets) {
       const at = overlay.at(street.middle.x, street.middle.y, street.middle.z);

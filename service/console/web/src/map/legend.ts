@@ -1,4 +1,4 @@
-// What the cloud's colours mean.
+// Legend of the cloud's colours.
 import { element } from '../element';
 import { COLOURS, HEIGHTS_M, type Shade } from './cloud_points';
 

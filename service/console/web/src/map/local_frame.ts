@@ -1,4 +1,4 @@
-// Metres of the map frame less one origin for each map: what a graphics card's 32-bit numbers hold to the millimetre.
+// Map coordinates minus one origin per map, so that the 32-bit numbers of a graphics card are exact to the millimetre.
 import type { Vector } from '../contract';
 
 export class LocalFrame {

@@ -1,4 +1,4 @@
-// The map on the screen: draws when something changed, and only then.
+// The map on the screen. It is drawn only after a change.
 import { Color, Plane, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from 'three';
 import type { Cloud, Places, QueryPoints } from '../binary';
 import type { StreetFeature } from '../contract';
@@ -14,7 +14,7 @@ import { PALETTES } from './palette';
 import { PriorLayer } from './prior_layer';
 import { QueryCloud } from './query_cloud';
 
-/** Of the survey's LiDAR above the ground, about: what heights are coloured from. */
+/** Approximate height of the survey's LiDAR above the ground, m. Colours show the height above that ground. */
 const LIDAR_M = 1.8;
 const REST_MS = 180;
 const ANSWER_M = 55;
@@ -37,7 +37,7 @@ export class MapView {
   #cloud: CloudPoints | null = null;
   #query: QueryCloud | null = null;
   #shade: Shade = 'light';
-  #asked = 0;
+  #frameRequest = 0;
   #moving = false;
   #rest = 0;
   #drawsPrior = false;
@@ -52,7 +52,7 @@ export class MapView {
         class: 'map-surface',
         tabindex: '0',
         role: 'application',
-        'aria-label': 'Map. Arrow keys pan, plus and minus zoom, 0 shows all, 3 changes between from above and around.',
+        'aria-label': 'Map. Arrow keys pan, plus and minus zoom, 0 shows all, 3 switches between the view from above and 3D.',
       },
       this.#surface,
       lines,
@@ -102,7 +102,7 @@ export class MapView {
     this.element.classList.toggle('draws', draws);
   }
 
-  /** Whether every point is drawn, however long that takes. */
+  /** Whether every point is drawn, regardless of the time. */
   set drawsAll(draws: boolean) {
     this.#drawsAll = draws;
     this.changed();
@@ -112,7 +112,7 @@ export class MapView {
     return this.#cloud?.count ?? 0;
   }
 
-  /** Streets and track come first; the cloud follows when it is there. */
+  /** Show streets and track. The cloud follows when it is loaded. */
   setMap(streets: StreetFeature[], places: Places): void {
     const box = boxOf(places);
     this.#frame = new LocalFrame({ x: box.x, y: box.y, z: box.z });
@@ -138,14 +138,14 @@ export class MapView {
     this.#dropQuery();
     const { pose, hypotheses, spread } = shown.answer;
     if (pose !== null) {
-      // Points at a place that nothing confirms would look as if the pictures had been taken there.
+      // Points at an unconfirmed position would suggest that the images were taken there.
       this.#query = new QueryCloud(points, this.#frame, this.#renderer.getPixelRatio());
       this.#scene.add(this.#query.object);
     }
     const poses = pose === null ? hypotheses.map((each) => each.pose) : [pose];
     const positions = poses.map((each) => each.position);
     if (positions.length === 0 && spread !== null) positions.push(spread.mean);
-    this.#look(positions);
+    this.#centre(positions);
     const first = poses[0];
     if (first === undefined) {
       this.#moved();
@@ -168,9 +168,9 @@ export class MapView {
     this.changed();
   }
 
-  /** Look at one position, as from a list of answers. */
+  /** Centre one position, as from a list of answers. */
   showAt(x: number, y: number): void {
-    this.#look([{ x, y }]);
+    this.#centre([{ x, y }]);
     this.changed();
   }
 
@@ -178,17 +178,17 @@ export class MapView {
     this.#cameras.zoomBy(factor);
   }
 
-  /** Draw soon, once for all that changed until then. */
+  /** Draw in the next frame, once for all changes until then. */
   changed(): void {
-    if (this.#asked === 0) {
-      this.#asked = requestAnimationFrame(() => {
-        this.#asked = 0;
+    if (this.#frameRequest === 0) {
+      this.#frameRequest = requestAnimationFrame(() => {
+        this.#frameRequest = 0;
         this.#draw();
       });
     }
   }
 
-  #look(positions: { x: number; y: number }[]): void {
+  #centre(positions: { x: number; y: number }[]): void {
     const xs = positions.map((each) => this.#frame.x(each.x));
     const ys = positions.map((each) => this.#frame.y(each.y));
     const [left, right] = [Math.min(...xs), Math.max(...xs)];
@@ -230,7 +230,7 @@ export class MapView {
     if (this.#moving && this.#cloud && !this.#drawsAll) this.#measure(began, Math.min(this.#budget.points, this.#cloud.count));
   }
 
-  /** The graphics card works on after the call: the next frame's beginning tells how long. */
+  /** The graphics card still works after the call, so the start of the next frame ends the measurement. */
   #measure(began: number, drawn: number): void {
     requestAnimationFrame(() => {
       this.#budget.took(performance.now() - began, drawn);
@@ -246,8 +246,8 @@ export class MapView {
     this.#overlay.canvas.width = Math.round(width * ratio);
     this.#overlay.canvas.height = Math.round(height * ratio);
     this.#cameras.resize(width, height);
-    this.#asked ||= requestAnimationFrame(() => {
-      this.#asked = 0;
+    this.#frameRequest ||= requestAnimationFrame(() => {
+      this.#frameRequest = 0;
       this.#draw();
     });
   }

@@ -1,4 +1,4 @@
-// Lines, marks and names over the cloud: drawn flat, so that they stay crisp at every zoom.
+// Lines, marks and labels over the cloud, drawn in 2D so that they stay sharp at every zoom.
 import { Vector3, type Camera } from 'three';
 import type { Vector } from '../contract';
 import type { LocalFrame } from './local_frame';
@@ -12,7 +12,7 @@ export interface Ink {
   dash?: number[];
 }
 
-/** A surface in CSS pixels that map coordinates are projected on. */
+/** A surface in CSS pixels onto which map coordinates are projected. */
 export class Overlay {
   readonly context: CanvasRenderingContext2D;
   #frame: LocalFrame | null = null;
@@ -24,7 +24,7 @@ export class Overlay {
 
   constructor(readonly canvas: HTMLCanvasElement) {
     const context = canvas.getContext('2d');
-    if (context === null) throw new Error('this browser draws no canvas');
+    if (context === null) throw new Error('This browser has no 2D canvas.');
     this.context = context;
   }
 
@@ -40,7 +40,7 @@ export class Overlay {
     this.context.lineCap = 'round';
   }
 
-  /** Where a point of the map is seen; null behind the camera. */
+  /** Position of a map point on the surface; null behind the camera. */
   at(x: number, y: number, z: number): Point | null {
     if (this.#frame === null || this.#camera === null) return null;
     const point = this.#scratch.set(this.#frame.x(x), this.#frame.y(y), this.#frame.z(z));
@@ -73,7 +73,7 @@ export class Overlay {
     this.#ink(ink, true);
   }
 
-  /** A name, unless another one stands there already. */
+  /** A label, unless it would cover another one. */
   label(text: string, at: Point, colour: string, halo: string, bold = false): void {
     const context = this.context;
     context.font = `${bold ? 600 : 500} 12px system-ui, sans-serif`;

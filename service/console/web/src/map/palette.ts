@@ -1,4 +1,4 @@
-// Colours of what is drawn over the cloud; the style sheet has those of the page.
+// Colours of the overlay. The style sheet has the colours of the page.
 import type { Shade } from './cloud_points';
 
 export interface Palette {

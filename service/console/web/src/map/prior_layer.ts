@@ -1,4 +1,4 @@
-// A prior that the mouse draws: press where the camera is believed to be, drag as far as that is uncertain.
+// A prior drawn with the mouse: press at the assumed position, drag to its standard deviation.
 import type { Prior } from '../contract';
 import type { Overlay } from './overlay';
 import type { Palette } from './palette';

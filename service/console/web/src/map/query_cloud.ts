@@ -1,4 +1,4 @@
-// The query's points where the answer puts them, in the picture's own colours.
+// The query's points at the pose of the answer, in the colours of the image.
 import { BufferAttribute, BufferGeometry, Points, PointsMaterial } from 'three';
 import type { QueryPoints } from '../binary';
 import type { LocalFrame } from './local_frame';

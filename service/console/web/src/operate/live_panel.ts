@@ -1,26 +1,26 @@
-// What the service does now: rates, and its last answers.
+// Current rates of the service, and its last answers.
 import type { LastAnswer, Vector } from '../contract';
 import { button, element } from '../element';
 import { milliseconds, percent } from '../numbers';
 import { ServiceError, type Service } from '../service';
-import { lookAt, rate, type Look } from './rates';
+import { snapshotOf, rate, type Snapshot } from './rates';
 
 const EVERY_MS = 2000;
-const LOOKS = 60;
+const SNAPSHOTS = 60;
 
 export class LivePanel {
   readonly element = element('div', { class: 'panel' });
   readonly #figures = element('div', { class: 'figures' });
   readonly #chart = element('canvas', { class: 'chart', 'aria-hidden': 'true', width: '640', height: '120' });
   readonly #list = element('div', { class: 'scroll', tabindex: '0', role: 'group', 'aria-label': 'Last answers' });
-  readonly #told = element('div', { class: 'told', role: 'status' });
-  #looks: Look[] = [];
+  readonly #message = element('div', { class: 'message', role: 'status' });
+  #snapshots: Snapshot[] = [];
   #timer = 0;
 
   constructor(readonly service: Service, readonly chosen: (position: Vector) => void) {
     this.element.append(
-      element('section', {}, element('h2', {}, 'Now'), this.#figures, this.#chart, element('p', { class: 'hint' }, 'answers a second, the last two minutes')),
-      this.#told,
+      element('section', {}, element('h2', {}, 'Now'), this.#figures, this.#chart, element('p', { class: 'hint' }, 'answers per second, the last two minutes')),
+      this.#message,
       element('section', {}, element('h2', {}, 'Last answers of this process'), this.#list),
     );
   }
@@ -28,7 +28,7 @@ export class LivePanel {
   start(): void {
     this.stop();
     const turn = (): void => {
-      void this.#look().finally(() => {
+      void this.#refresh().finally(() => {
         if (this.#timer !== 0) this.#timer = window.setTimeout(turn, EVERY_MS);
       });
     };
@@ -40,29 +40,29 @@ export class LivePanel {
     this.#timer = 0;
   }
 
-  async #look(): Promise<void> {
+  async #refresh(): Promise<void> {
     try {
-      const look = lookAt(await this.service.metrics(), performance.now());
-      this.#looks = [...this.#looks.slice(1 - LOOKS), look];
-      this.#showFigures(look);
+      const snapshot = snapshotOf(await this.service.metrics(), performance.now());
+      this.#snapshots = [...this.#snapshots.slice(1 - SNAPSHOTS), snapshot];
+      this.#showFigures(snapshot);
       this.#list.replaceChildren(this.#table(await this.service.lastAnswers()));
-      this.#told.textContent = '';
+      this.#message.textContent = '';
     } catch (error) {
       const forbidden = error instanceof ServiceError && error.status === 403;
-      this.#told.className = 'told bad';
-      this.#told.textContent = forbidden
-        ? 'The last answers say where robots are: enter an operator’s key above (streetfix keys --operator).'
+      this.#message.className = 'message bad';
+      this.#message.textContent = forbidden
+        ? 'The last answers contain positions of robots. Enter an operator’s key above (streetfix keys --operator).'
         : error instanceof Error ? error.message : String(error);
     }
   }
 
-  #showFigures(look: Look): void {
-    const before = this.#looks.at(-2) ?? look;
-    const of = (status: string): string => String(look.answers.get(status) ?? 0);
+  #showFigures(snapshot: Snapshot): void {
+    const before = this.#snapshots.at(-2) ?? snapshot;
+    const of = (status: string): string => String(snapshot.answers.get(status) ?? 0);
     const rows: [string, string][] = [
-      [rate(before, look).toFixed(1), 'answers a second'],
-      [`${look.working}`, 'at work'],
-      [`${look.waiting} of ${look.capacity}`, 'waiting'],
+      [rate(before, snapshot).toFixed(1), 'answers per second'],
+      [`${snapshot.working}`, 'running'],
+      [`${snapshot.waiting} of ${snapshot.capacity}`, 'waiting'],
       [of('LOCALIZED'), 'localized'],
       [of('AMBIGUOUS'), 'ambiguous'],
       [of('OUT_OF_MAP'), 'out of map'],
@@ -75,11 +75,11 @@ export class LivePanel {
     const context = this.#chart.getContext('2d');
     if (context === null) return;
     const { width, height } = this.#chart;
-    const rates = this.#looks.slice(1).map((look, k) => rate(this.#looks[k] ?? look, look));
+    const rates = this.#snapshots.slice(1).map((snapshot, k) => rate(this.#snapshots[k] ?? snapshot, snapshot));
     const most = Math.max(1, ...rates);
     context.clearRect(0, 0, width, height);
     context.fillStyle = getComputedStyle(this.#chart).color;
-    const step = width / (LOOKS - 1);
+    const step = width / (SNAPSHOTS - 1);
     rates.forEach((each, k) => {
       const tall = Math.max(2, (each / most) * (height - 6));
       context.fillRect(width - (rates.length - k) * step, height - tall, step - 2, tall);
@@ -98,7 +98,7 @@ export class LivePanel {
         element('td', {}, milliseconds(answer.total_ms)),
       ),
     );
-    const heads = ['at', 'street', 'sure', 'took'];
+    const heads = ['time', 'street', 'confidence', 'duration'];
     return element(
       'table',
       {},
@@ -107,7 +107,7 @@ export class LivePanel {
     );
   }
 
-  /** Pressed, the map shows the place. An answer that is not localized has none. */
+  /** A button that shows the position on the map. An answer that is not LOCALIZED has no position. */
   #street(answer: LastAnswer): HTMLElement {
     const { position } = answer;
     if (position === null) return element('span', {}, 'no pose');

@@ -1,31 +1,31 @@
-// The mounted maps: versions, which one serves, where they answer; swap and roll back for those who may.
+// The mounted maps: versions, the serving version, coverage. Operators can swap and roll back.
 import type { MapEntry } from '../contract';
 import { button, element, facts } from '../element';
 import { count } from '../numbers';
 import type { Service } from '../service';
 
 export interface MapsActions {
-  /** The version that serves has changed: show it. */
+  /** The serving version has changed. */
   served: (entry: MapEntry) => void;
   coverage: (shows: boolean) => void;
 }
 
 export class MapsPanel {
   readonly element = element('div', { class: 'panel' });
-  readonly #told = element('div', { class: 'told', role: 'status' });
+  readonly #message = element('div', { class: 'message', role: 'status' });
   #coverage = false;
 
   constructor(readonly service: Service, readonly actions: MapsActions) {}
 
   show(entries: MapEntry[]): void {
-    const coverage = button('Show where maps can answer', () => {
+    const coverage = button('Show coverage of the maps', () => {
       this.#coverage = !this.#coverage;
       coverage.setAttribute('aria-pressed', String(this.#coverage));
       this.actions.coverage(this.#coverage);
     }, { 'aria-pressed': String(this.#coverage) });
     this.element.replaceChildren(
       element('div', { class: 'row' }, coverage),
-      this.#told,
+      this.#message,
       ...entries.map((entry) => this.#map(entry)),
     );
   }
@@ -41,7 +41,7 @@ export class MapsPanel {
           { class: serves ? 'serves' : '' },
           element('code', {}, version),
           serves
-            ? element('span', { class: 'tag' }, 'serves')
+            ? element('span', { class: 'tag' }, 'serving')
             : button(newerServes ? 'Roll back' : 'Swap in', () => {
                 void this.#serve(entry, version);
               }, { class: 'small' }),
@@ -56,12 +56,12 @@ export class MapsPanel {
         ['places', count(entry.places)],
         ['views', count(entry.views)],
         ['streets', count(entry.streets)],
-        ['every', `${entry.spacing_m} m`],
-        ['made', new Date(entry.made_at).toLocaleString()],
+        ['spacing', `${entry.spacing_m} m`],
+        ['built', new Date(entry.made_at).toLocaleString()],
         ['georeferenced', entry.georeferenced ? 'yes' : 'no'],
         ['licence', entry.licence === '' ? '–' : entry.licence],
       ]),
-      element('h3', {}, 'Versions, the newest first'),
+      element('h3', {}, 'Versions, newest first'),
       versions,
     );
   }
@@ -69,12 +69,12 @@ export class MapsPanel {
   async #serve(entry: MapEntry, version: string): Promise<void> {
     try {
       const served = await this.service.serve(entry.name, version);
-      this.#told.className = 'told good';
-      this.#told.textContent = `${served.name} ${served.version} serves now.`;
+      this.#message.className = 'message good';
+      this.#message.textContent = `${served.name} ${served.version} is serving now.`;
       this.actions.served(served);
     } catch (error) {
-      this.#told.className = 'told bad';
-      this.#told.textContent = error instanceof Error ? error.message : String(error);
+      this.#message.className = 'message bad';
+      this.#message.textContent = error instanceof Error ? error.message : String(error);
     }
   }
 }

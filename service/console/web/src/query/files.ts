@@ -1,29 +1,29 @@
-// Which of the files that were dropped is what: by their content where it tells, else by their names.
-import type { Question } from './question';
+// Sorts dropped files by kind: by content if it decides, otherwise by name.
+import type { Query } from './query';
 import { truthFrom } from './truth';
 
 const DEPTH_ALONE = /\.(npy|tiff?|sfd1|rvl|raw16|exr|zst)$/i;
 const DEPTH_NAME = /depth|disp|(^|[/_-])d[_-]?\d/i;
-const PICTURE = /\.(png|jpe?g|webp)$/i;
+const IMAGE = /\.(png|jpe?g|webp)$/i;
 const IHDR_DEPTH = 24;
 
 export interface Sorted {
-  question: Partial<Question>;
-  /** Files that are nothing we know. */
+  query: Partial<Query>;
+  /** Names of files of no known kind. */
   unknown: string[];
 }
 
 export async function sorted(files: File[]): Promise<Sorted> {
-  const question: Partial<Question> = {};
+  const query: Partial<Query> = {};
   const unknown: string[] = [];
   for (const file of files) {
     const kind = await kindOf(file);
     if (kind === 'unknown') unknown.push(file.name);
-    else if (kind === 'rgb' || kind === 'depth') question[kind] = { name: file.name, blob: file };
-    else if (kind === 'request') question.request = await file.text();
-    else question.truth = truthFrom(await file.text(), question.rgb?.name ?? files[0]?.name ?? '');
+    else if (kind === 'rgb' || kind === 'depth') query[kind] = { name: file.name, blob: file };
+    else if (kind === 'request') query.request = await file.text();
+    else query.truth = truthFrom(await file.text(), query.rgb?.name ?? files[0]?.name ?? '');
   }
-  return { question, unknown };
+  return { query, unknown };
 }
 
 async function kindOf(file: File): Promise<'rgb' | 'depth' | 'request' | 'truth' | 'unknown'> {
@@ -31,7 +31,7 @@ async function kindOf(file: File): Promise<'rgb' | 'depth' | 'request' | 'truth'
   if (/\.(txt|tum)$/i.test(file.name)) return 'truth';
   if (DEPTH_ALONE.test(file.name)) return 'depth';
   if (/\.png$/i.test(file.name)) return (await isDeepGrey(file)) || DEPTH_NAME.test(file.name) ? 'depth' : 'rgb';
-  return PICTURE.test(file.name) ? 'rgb' : 'unknown';
+  return IMAGE.test(file.name) ? 'rgb' : 'unknown';
 }
 
 /** A PNG of one channel with 16 bits is depth, whatever its name. */

@@ -1,119 +1,119 @@
-// Everything that a question is put together from.
+// The inputs of a query: images, request, prior.
 import type { Prior } from '../contract';
 import { button, element } from '../element';
 import type { Service } from '../service';
 import { asCurl, asPython } from './copy_as';
 import { sorted } from './files';
 import { PriorFields } from './prior_fields';
-import { NO_QUESTION, requestFrom, type NamedBlob, type Question } from './question';
+import { NO_QUERY, requestFrom, type NamedBlob, type Query } from './query';
 import type { Offer } from './samples_of_map';
 import { SampleStrip } from './sample_strip';
 
-export interface Asked {
-  ask: (question: Question) => void;
+export interface QueryActions {
+  send: (query: Query) => void;
   drawsPrior: (draws: boolean) => void;
   priorChanged: (prior: Prior | null) => void;
-  /** Name of the map that is shown. */
+  /** Name of the shown map. */
   map: () => string | null;
   prior: () => Prior | null;
   failed: (error: unknown) => void;
 }
 
-export class AskPanel {
+export class QueryPanel {
   readonly element: HTMLElement;
   readonly strip: SampleStrip;
   readonly prior: PriorFields;
   readonly #samplesHead = element('p', { class: 'hint' });
   readonly #chosen = element('ul', { class: 'chosen' });
   readonly #request = element('textarea', { id: 'request', rows: '5', spellcheck: 'false', placeholder: '{"camera": {"width": 640, "height": 480, "fx": …}}' });
-  readonly #ask: HTMLButtonElement;
+  readonly #send: HTMLButtonElement;
   readonly #copied = element('span', { class: 'hint', role: 'status' });
-  #question: Question = NO_QUESTION;
-  /** Name of the sample that was chosen. */
+  #query: Query = NO_QUERY;
+  /** Name of the chosen sample. */
   #sample: string | null = null;
 
-  constructor(service: Service, readonly asked: Asked) {
+  constructor(service: Service, readonly actions: QueryActions) {
     this.strip = new SampleStrip(service, (name, loading) => {
-      loading.then((question) => {
+      loading.then((query) => {
         this.#sample = name;
-        this.#take(question);
-        asked.ask(question);
-      }, asked.failed);
+        this.#take(query);
+        actions.send(query);
+      }, actions.failed);
     });
-    this.prior = new PriorFields(asked.drawsPrior, asked.priorChanged);
-    this.#ask = button('Where was this?', () => {
-      asked.ask(this.#question);
+    this.prior = new PriorFields(actions.drawsPrior, actions.priorChanged);
+    this.#send = button('Localize', () => {
+      actions.send(this.#query);
     }, { class: 'primary', disabled: true });
     this.#request.addEventListener('input', () => {
-      this.#question = { ...this.#question, request: this.#request.value };
+      this.#query = { ...this.#query, request: this.#request.value };
       this.#refresh();
     });
     const copy = (label: string, made: typeof asCurl): HTMLButtonElement =>
       button(label, () => {
-        this.#copy(() => made(this.#question, requestFrom(this.#question, null, asked.prior()), service.base, service.key !== ''));
+        this.#copy(() => made(this.#query, requestFrom(this.#query, null, actions.prior()), service.base, service.key !== ''));
       }, { class: 'small' });
     this.element = element(
       'div',
       { class: 'panel' },
       element('section', {}, element('h2', {}, 'Sample pairs'), this.#samplesHead, this.strip.element),
-      element('section', {}, element('h2', {}, 'Your own'), this.#dropZone(), this.#chosen),
+      element('section', {}, element('h2', {}, 'Your images'), this.#dropZone(), this.#chosen),
       element('section', {}, element('h2', {}, element('label', { for: 'request' }, 'Request')), this.#request),
-      element('details', {}, element('summary', {}, 'Prior: where the camera is believed to be'), this.prior.element),
-      element('div', { class: 'row sticky' }, this.#ask, copy('Copy as curl', asCurl), copy('as Python', asPython)),
+      element('details', {}, element('summary', {}, 'Prior: rough position of the camera'), this.prior.element),
+      element('div', { class: 'row sticky' }, this.#send, copy('Copy as curl', asCurl), copy('as Python', asPython)),
       this.#copied,
     );
     this.#refresh();
   }
 
-  /** Show the sample pairs of the map that is shown, and name the other maps that have some. */
+  /** Show the sample pairs of the shown map, and name the other maps that have samples. */
   offer({ samples, otherMaps }: Offer): void {
-    const none = otherMaps.length > 0 ? 'None of this map.' : 'None here. "streetfix demo" makes some; STREETFIX_SAMPLES names a folder of them.';
-    const others = otherMaps.length > 0 ? ` Others belong to: ${otherMaps.join(', ')}.` : '';
-    this.#samplesHead.textContent = (samples.length > 0 ? 'Click one: it is asked at once.' : none) + others;
+    const none = otherMaps.length > 0 ? 'There are no samples of this map.' : 'There are no samples. Run `streetfix demo`, or set STREETFIX_SAMPLES.';
+    const others = otherMaps.length > 0 ? ` Other maps with samples: ${otherMaps.join(', ')}.` : '';
+    this.#samplesHead.textContent = (samples.length > 0 ? 'Click a sample to send it.' : none) + others;
     this.strip.show(samples);
     if (this.#sample !== null && samples.some((each) => each.name === this.#sample)) {
       this.strip.mark(this.#sample);
-    } else if (this.#sample !== null) { // it is of another map
+    } else if (this.#sample !== null) { // the sample is of another map
       this.#sample = null;
-      this.#take(NO_QUESTION);
+      this.#take(NO_QUERY);
     }
   }
 
   set busy(busy: boolean) {
-    this.#ask.classList.toggle('busy', busy);
+    this.#send.classList.toggle('busy', busy);
     this.element.setAttribute('aria-busy', String(busy));
   }
 
   /** Files that were chosen, or dropped anywhere on the page. */
   async takeFiles(files: File[]): Promise<void> {
     try {
-      const { question, unknown } = await sorted(files);
+      const { query, unknown } = await sorted(files);
       this.strip.mark(null);
       this.#sample = null;
-      this.#take({ ...this.#question, ...(question.rgb ? { truth: null } : {}), ...question });
-      if (unknown.length > 0) throw new Error(`${unknown.join(', ')}: no picture, request or truth file. Drop RGB, depth and camera.json.`);
+      this.#take({ ...this.#query, ...(query.rgb ? { truth: null } : {}), ...query });
+      if (unknown.length > 0) throw new Error(`${unknown.join(', ')}: this file is not an image, a request or a ground truth. Drop RGB, depth and camera.json.`);
     } catch (error) {
-      this.asked.failed(error);
+      this.actions.failed(error);
     }
   }
 
-  #take(question: Question): void {
-    this.#question = question;
-    this.#request.value = question.request;
+  #take(query: Query): void {
+    this.#query = query;
+    this.#request.value = query.request;
     this.#refresh();
   }
 
   #refresh(): void {
-    const { rgb, depth, request, truth } = this.#question;
+    const { rgb, depth, request, truth } = this.#query;
     const row = (name: string, given: NamedBlob | null): HTMLElement =>
       element('li', { class: given ? 'given' : '' }, element('b', {}, name), given ? given.name : 'missing');
     this.#chosen.replaceChildren(
       row('RGB', rgb),
       row('Depth', depth),
       element('li', { class: request === '' ? '' : 'given' }, element('b', {}, 'Camera'), request === '' ? 'missing' : 'in the request below'),
-      element('li', { class: truth ? 'given' : 'optional' }, element('b', {}, 'Truth'), truth ? 'given' : 'optional'),
+      element('li', { class: truth ? 'given' : 'optional' }, element('b', {}, 'Ground truth'), truth ? 'given' : 'optional'),
     );
-    this.#ask.disabled = rgb === null || depth === null || request.trim() === '';
+    this.#send.disabled = rgb === null || depth === null || request.trim() === '';
   }
 
   #dropZone(): HTMLElement {
@@ -129,7 +129,7 @@ export class AskPanel {
       'label',
       { class: 'drop', for: 'files' },
       element('b', {}, 'Drop or choose files'),
-      element('span', {}, 'RGB, depth, camera.json, and a truth file if there is one'),
+      element('span', {}, 'RGB, depth, camera.json, and optionally a ground truth'),
       input,
     );
   }
@@ -141,11 +141,11 @@ export class AskPanel {
           this.#copied.textContent = 'Copied.';
         },
         (error: unknown) => {
-          this.asked.failed(new Error(`The browser did not let the page copy: ${String(error)}`));
+          this.actions.failed(new Error(`The browser did not allow copying: ${String(error)}`));
         },
       );
     } catch (error) {
-      this.asked.failed(error);
+      this.actions.failed(error);
     }
   }
 }

@@ -1,10 +1,10 @@
-// What the machine saw, in pictures; the map's depth over the query's, by a slider.
+// The intermediate images of an answer. A slider lays the map's depth over the query's depth.
 import { bytesFrom } from '../binary';
 import type { Explanation } from '../contract';
 import { element } from '../element';
 
-export class SeenPictures {
-  readonly element = element('div', { class: 'seen' });
+export class IntermediateImages {
+  readonly element = element('div', { class: 'images' });
   #addresses: string[] = [];
 
   show(rgb: Blob, explanation: Explanation): void {
@@ -15,18 +15,18 @@ export class SeenPictures {
       element(
         'div',
         { class: 'pair' },
-        this.#figure('RGB', this.#address(rgb), 'The query’s colour picture'),
-        this.#figure('Depth', this.#png(depth), 'The query’s depth, near red, far blue'),
+        this.#figure('RGB', this.#address(rgb), 'RGB image of the query'),
+        this.#figure('Depth', this.#png(depth), 'Depth image of the query, near red, far blue'),
       ),
-      this.#figure('Fused 2.5D image: what is encoded', this.#png(fused), 'Range in place of intensity, colour kept', 'cells'),
-      view === null ? '' : this.#figure('LiDAR view it matched (place n1)', this.#png(view), 'The map seen from the most similar place', 'cells'),
+      this.#figure('Fused 2.5D image: input of the encoder', this.#png(fused), 'Range instead of intensity, with the colour of the image', 'cells'),
+      view === null ? '' : this.#figure('Map view of the most similar place (n1)', this.#png(view), 'Map rendered at the most similar place', 'cells'),
       mapDepth === null ? '' : this.#overlay(depth, mapDepth, explanation.answer.pose === null ? 'the best guess, not confirmed' : 'the answer'),
     );
   }
 
   #overlay(depth: string, mapDepth: string, where: string): HTMLElement {
-    const over = element('img', { src: this.#png(mapDepth), alt: `The map’s depth, drawn at ${where}`, class: 'over' });
-    const slider = element('input', { type: 'range', min: '0', max: '100', value: '50', 'aria-label': 'How much of the map’s depth lies over the query’s' });
+    const over = element('img', { src: this.#png(mapDepth), alt: `Depth of the map, rendered at ${where}`, class: 'over' });
+    const slider = element('input', { type: 'range', min: '0', max: '100', value: '50', 'aria-label': 'Share of the map’s depth over the query’s depth' });
     const place = (): void => {
       over.style.clipPath = `inset(0 0 0 ${slider.value}%)`;
       line.style.left = `${slider.value}%`;
@@ -37,7 +37,7 @@ export class SeenPictures {
     return element(
       'figure',
       { class: 'compare' },
-      element('div', { class: 'stack' }, element('img', { src: this.#png(depth), alt: 'The query’s depth' }), over, line, slider),
+      element('div', { class: 'stack' }, element('img', { src: this.#png(depth), alt: 'Depth image of the query' }), over, line, slider),
       element('figcaption', {}, element('span', {}, '◂ query’s depth'), element('span', {}, `map’s depth at ${where} ▸`)),
     );
   }

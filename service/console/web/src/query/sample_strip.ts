@@ -1,20 +1,20 @@
-// Pairs that lie ready beside the map: a click asks.
+// Sample pairs of the map: a click sends one.
 import type { SamplePair } from '../contract';
 import { element } from '../element';
 import type { Service } from '../service';
-import type { Question } from './question';
+import type { Query } from './query';
 
 export class SampleStrip {
   readonly element = element('div', { class: 'strip', role: 'list', 'aria-label': 'Sample pairs' });
-  readonly #pictures = new Map<string, Promise<Blob>>();
+  readonly #images = new Map<string, Promise<Blob>>();
 
   constructor(
     readonly service: Service,
-    readonly chosen: (name: string, question: Promise<Question>) => void,
+    readonly chosen: (name: string, query: Promise<Query>) => void,
   ) {}
 
   show(samples: SamplePair[]): void {
-    this.#pictures.clear();
+    this.#images.clear();
     this.element.replaceChildren(...samples.map((sample) => element('div', { role: 'listitem' }, this.#card(sample))));
   }
 
@@ -25,28 +25,28 @@ export class SampleStrip {
   }
 
   #card(sample: SamplePair): HTMLButtonElement {
-    const picture = element('img', { alt: '', width: '112', height: '84', loading: 'lazy' });
+    const image = element('img', { alt: '', width: '112', height: '84', loading: 'lazy' });
     const card = element(
       'button',
-      { type: 'button', class: 'sample', 'aria-pressed': 'false', 'aria-label': `Ask sample ${sample.name}` },
-      picture,
+      { type: 'button', class: 'sample', 'aria-pressed': 'false', 'aria-label': `Send sample ${sample.name}` },
+      image,
       element('span', {}, sample.name),
     );
     card.dataset['sample'] = sample.name;
-    void this.#picture(sample.rgb).then((blob) => {
-      picture.src = URL.createObjectURL(blob);
+    void this.#image(sample.rgb).then((blob) => {
+      image.src = URL.createObjectURL(blob);
     }, () => {
-      card.classList.add('broken'); // asking it says why
+      card.classList.add('broken'); // sending the sample shows why
     });
     card.addEventListener('click', () => {
       this.mark(sample.name);
-      this.chosen(sample.name, this.#question(sample));
+      this.chosen(sample.name, this.#query(sample));
     });
     return card;
   }
 
-  async #question(sample: SamplePair): Promise<Question> {
-    const [rgb, depth] = await Promise.all([this.#picture(sample.rgb), this.#picture(sample.depth)]);
+  async #query(sample: SamplePair): Promise<Query> {
+    const [rgb, depth] = await Promise.all([this.#image(sample.rgb), this.#image(sample.depth)]);
     const named = (part: string, blob: Blob): { name: string; blob: Blob } => ({
       name: `${part}.${{ 'image/jpeg': 'jpg', 'image/png': 'png', 'image/webp': 'webp', 'image/tiff': 'tiff' }[blob.type] ?? 'npy'}`,
       blob,
@@ -59,13 +59,13 @@ export class SampleStrip {
     };
   }
 
-  #picture(address: string): Promise<Blob> {
-    let picture = this.#pictures.get(address);
-    if (picture === undefined) {
-      picture = this.service.samplePicture(address);
-      picture.catch(() => this.#pictures.delete(address)); // the next click tries again
-      this.#pictures.set(address, picture);
+  #image(address: string): Promise<Blob> {
+    let image = this.#images.get(address);
+    if (image === undefined) {
+      image = this.service.sampleImage(address);
+      image.catch(() => this.#images.delete(address)); // the next click tries again
+      this.#images.set(address, image);
     }
-    return picture;
+    return image;
   }
 }

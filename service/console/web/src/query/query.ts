@@ -1,4 +1,4 @@
-// What is asked: two pictures and the JSON beside them, as the user put them together.
+// A query: two images and the JSON of the request, as the user gave them.
 import type { LocalizeRequest, Prior, Truth } from '../contract';
 
 export interface NamedBlob {
@@ -6,23 +6,23 @@ export interface NamedBlob {
   blob: Blob;
 }
 
-export interface Question {
+export interface Query {
   rgb: NamedBlob | null;
   depth: NamedBlob | null;
-  /** JSON text, as pasted or as a file held it. */
+  /** JSON text, pasted or from a file. */
   request: string;
   truth: Truth | null;
 }
 
-export const NO_QUESTION: Question = { rgb: null, depth: null, request: '', truth: null };
+export const NO_QUERY: Query = { rgb: null, depth: null, request: '', truth: null };
 
-/** The request with the map that is shown, and with the prior that was drawn. */
-export function requestFrom(question: Question, map: string | null, prior: Prior | null): LocalizeRequest {
+/** The request with the shown map and the drawn prior. */
+export function requestFrom(query: Query, map: string | null, prior: Prior | null): LocalizeRequest {
   let read: unknown;
   try {
-    read = JSON.parse(question.request);
+    read = JSON.parse(query.request);
   } catch (error) {
-    throw new Error(`The request is no JSON: ${error instanceof Error ? error.message : String(error)}`, { cause: error });
+    throw new Error(`The request is not JSON: ${error instanceof Error ? error.message : String(error)}`, { cause: error });
   }
   if (typeof read !== 'object' || read === null || !('camera' in read)) {
     throw new Error('The request lacks "camera": width, height, fx, fy, cx, cy in pixels.');
@@ -33,7 +33,7 @@ export function requestFrom(question: Question, map: string | null, prior: Prior
   return request;
 }
 
-/** What was left empty need not be said. */
+/** Leave out empty fields. */
 function withoutNulls(value: unknown): unknown {
   if (Array.isArray(value)) return value.map(withoutNulls);
   if (typeof value !== 'object' || value === null) return value;
@@ -41,11 +41,11 @@ function withoutNulls(value: unknown): unknown {
   return Object.fromEntries(kept.map(([key, each]) => [key, withoutNulls(each)]));
 }
 
-export function bodyFrom(question: Question, request: LocalizeRequest): FormData {
-  if (question.rgb === null || question.depth === null) throw new Error('Give both pictures: RGB and depth.');
+export function bodyFrom(query: Query, request: LocalizeRequest): FormData {
+  if (query.rgb === null || query.depth === null) throw new Error('Add an RGB image and a depth image.');
   const body = new FormData();
-  body.append('rgb', question.rgb.blob, question.rgb.name);
-  body.append('depth', question.depth.blob, question.depth.name);
+  body.append('rgb', query.rgb.blob, query.rgb.name);
+  body.append('depth', query.depth.blob, query.depth.name);
   body.append('request', JSON.stringify(request));
   return body;
 }

@@ -1,4 +1,4 @@
-// The prior in numbers, for those who have no mouse or know better than to the pixel.
+// The prior in numbers, without the mouse or more exactly than by the mouse.
 import type { Prior } from '../contract';
 import { button, element } from '../element';
 

@@ -1,25 +1,25 @@
-// Where the pictures were really taken, if a file says so, and how far an answer is from there.
+// The ground truth of a query, if a file gives it, and the error of an answer.
 import type { Answer, Truth } from '../contract';
 
 /**
  * JSON with `position` and `heading_deg`, or a line of TUM (timestamp x y z qx qy qz qw, camera to map); of several lines the one
- * whose number is in the picture's name.
+ * whose number is in the image's name.
  */
-export function truthFrom(text: string, pictureName: string): Truth {
+export function truthFrom(text: string, imageName: string): Truth {
   if (text.trimStart().startsWith('{')) {
     const read = JSON.parse(text) as Partial<Truth>;
     const { position } = read;
     if (typeof position?.x !== 'number' || typeof position.y !== 'number') {
-      throw new Error('The truth file has no "position" with x, y and z in map metres.');
+      throw new Error('The ground truth has no "position" with x, y and z in map metres.');
     }
     return { position: { x: position.x, y: position.y, z: position.z }, heading_deg: read.heading_deg ?? null };
   }
   const lines = text.split('\n').filter((line) => line.trim() !== '' && !line.startsWith('#'));
-  const number = Number(/(\d+)\.\w+$/.exec(pictureName)?.[1] ?? '0');
+  const number = Number(/(\d+)\.\w+$/.exec(imageName)?.[1] ?? '0');
   const line = lines.length === 1 ? lines[0] : lines[number];
   const values = (line ?? '').trim().split(/\s+/).map(Number);
   if (values.length !== 8 || values.some(Number.isNaN)) {
-    throw new Error('The truth file is neither JSON with "position" nor TUM: timestamp x y z qx qy qz qw.');
+    throw new Error('The ground truth is neither JSON with "position" nor TUM: timestamp x y z qx qy qz qw.');
   }
   const [, x = 0, y = 0, z = 0, qx = 0, qy = 0, qz = 0, qw = 0] = values;
   // The camera looks along its z axis: the third column of the rotation.
@@ -32,7 +32,7 @@ export interface ErrorOfAnswer {
   degrees: number | null;
 }
 
-/** On the ground, and of the heading; null without a pose. */
+/** Horizontal error and heading error; null without a pose. */
 export function errorOf(answer: Answer, truth: Truth): ErrorOfAnswer | null {
   if (answer.pose === null) return null;
   const { position, heading_deg } = answer.pose;
