@@ -106,15 +106,17 @@ def _vote(streets: NDArray[np.int64], likeness: NDArray[np.float32]) -> int:
 def main() -> None:
     """Parse the arguments, train, measure and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "choices")
-    parser.add_argument("--steps", type=int, default=STEPS, help="of each training")
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "choices", help="folder of cities and runs")
+    parser.add_argument("--steps", type=int, default=STEPS, help="steps of each training")
     parser.add_argument("--only", nargs="+", metavar="NAME", help=f"variations of: {' '.join(VARIATIONS)}")
     parser.add_argument(
-        "--train", action="store_true", help="train and stop: so, two lots of --only can run side by side"
+        "--train",
+        action="store_true",
+        help="train and stop; two calls with different --only can so run at the same time",
     )
     arguments = parser.parse_args()
     if unknown := set(arguments.only or ()) - set(VARIATIONS):
-        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(VARIATIONS)}")
+        parser.error(f"--only: {', '.join(sorted(unknown))}: choose from {', '.join(VARIATIONS)}")
     told = " ".join(sys.argv[1:])
     report = Report("choices", "make choices" + (f' ARGS="{told}"' if told else ""))
     if arguments.only:

@@ -112,7 +112,7 @@ class WatchCity:
         for k, scan in enumerate(levelled_scans(self.dataset, self.kept, self.settings), 1):
             planes = np.stack([
                 survey_planes(view, sensor_height_m=scan.level.height_m, rows_seen=self.rows_seen, grid=self.grid)
-                for view in fan_views(scan, turns, self.grid)
+                for view in fan_views(scan.points, scan.start_rad + turns, self.grid)
             ])  # fmt: skip
             for name, (encoder, _) in encoders.items():
                 views[name].append(encoder.encode(planes, "survey"))

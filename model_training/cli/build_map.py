@@ -8,7 +8,8 @@ from rich.console import Console
 
 from model_training.cli.progress import bars
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.build import BuildSettings, build_map, describe
+from model_training.mapping.build import build_map, describe
+from model_training.mapping.settings import BuildSettings
 from model_training.stock import CALIBRATION, ENCODER
 
 
@@ -16,12 +17,23 @@ def command(
     dataset: Annotated[Path, typer.Argument(help="Dataset folder with a survey.")],
     out: Annotated[Path, typer.Option(help="Folder of the map bundle.")],
     encoder: Annotated[
-        Path, typer.Option(help="ONNX file of `streetfix export`. The default is the stock encoder.")
+        Path, typer.Option(help="ONNX file of `streetfix export`.  [default: the stock encoder]", show_default=False)
     ] = ENCODER,
     name: Annotated[str, typer.Option(help="Name of the map in requests.  [default: the dataset's name]")] = "",
     spacing: Annotated[
-        float, typer.Option(help="Travelled distance between places, metres. 0 takes every scan.", min=0)
+        float,
+        typer.Option(
+            help="Travelled distance between the scans that become places, metres. 0 takes every scan.", min=0
+        ),
     ] = 1.0,
+    between: Annotated[
+        float,
+        typer.Option(
+            help="Largest distance between places, metres. Farther scans get places between them, with views rendered "
+            "from both scans. 0 puts none there.",
+            min=0,
+        ),
+    ] = 3.0,
     headings: Annotated[
         int, typer.Option(help="Map views of each place. The stock encoder was trained for 24.", min=1, max=360)
     ] = 24,
@@ -56,7 +68,8 @@ def command(
     calibration: Annotated[
         Path,
         typer.Option(
-            help="File of `streetfix calibrate` for the same encoder. The default is the file of the stock encoder."
+            help="File of `streetfix calibrate` for the same encoder.  [default: the calibration of the stock encoder]",
+            show_default=False,
         ),
     ] = CALIBRATION,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing map bundle.")] = False,
@@ -71,7 +84,8 @@ def command(
     """
     opened = Dataset(dataset)
     settings = BuildSettings(
-        name=name or opened.name, spacing_m=spacing, headings=headings, voxel_m=voxel, expected_lidar_height_m=lidar_height,
+        name=name or opened.name, spacing_m=spacing, between_m=between, headings=headings, voxel_m=voxel,
+        expected_lidar_height_m=lidar_height,
         remove_weather=remove_weather, passes_vote=passes_vote, traffic_vote=traffic_vote, licence=licence, calibration=calibration,
         align_survey=align_survey,
     )  # fmt: skip

@@ -69,17 +69,19 @@ def polygon_of(path: Path) -> Area:
         raise DatasetError(f"{path} cannot be read ({error.strerror}); give a GeoJSON file", field="area") from error
     except (ValueError, RecursionError) as error:
         raise DatasetError(
-            f"{path} is no JSON; give a GeoJSON file of a polygon in map metres", field="area"
+            f"{path} is not valid JSON; give a GeoJSON file of a polygon in map metres", field="area"
         ) from error
     try:
         shapes = [shapely.geometry.shape(geometry) for geometry in _geometries(document)]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, shapely.errors.ShapelyError) as error:
-        raise DatasetError(f"{path}: {error} is no geometry; give a polygon in map metres", field="area") from error
+        raise DatasetError(
+            f"{path}: not a valid geometry ({error}); give a polygon in map metres", field="area"
+        ) from error
     if not shapes or any(shape.geom_type not in ("Polygon", "MultiPolygon") or shape.is_empty for shape in shapes):
         kinds = ", ".join(shape.geom_type for shape in shapes) or "nothing"
-        raise DatasetError(f"{path} holds {kinds}, not a polygon; give one in map metres", field="area")
+        raise DatasetError(f"{path} contains {kinds}, not a polygon; give one in map metres", field="area")
     if not all(shape.is_valid for shape in shapes):
-        raise DatasetError(f"{path}: the polygon's rim crosses itself; mend it", field="area")
+        raise DatasetError(f"{path}: the polygon's boundary crosses itself; correct it", field="area")
     whole = shapely.union_all(shapes)
     shapely.prepare(whole)
     return lambda xy: np.asarray(shapely.intersects_xy(whole, xy[:, 0], xy[:, 1]))

@@ -8,32 +8,22 @@ import os
 import re
 from collections.abc import Callable, Set
 from dataclasses import replace
-from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from model_training.datasets.dataset import Dataset, Transforms
-from model_training.mapping.align_survey import aligned
 from model_training.mapping.calibration_file import calibration_for
 from model_training.mapping.cloud import near, prepared, with_cloud
-from model_training.mapping.passes import moved
+from model_training.mapping.join import of_places
 from model_training.mapping.places import Drive, Places, streets_of, views_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.site_check import HeldScan, held_out, site_of
-from model_training.mapping.survey import (
-    LevelledScan,
-    fan,
-    kept_scans,
-    levelled_scans,
-    require_poses_within,
-    rows_seen_by,
-    thinned,
-    view_ranges,
-)
+from model_training.mapping.stages import ResumedStages
+from model_training.mapping.survey import kept_scans, levelled_scans, require_poses_within
 from model_training.mapping.voxel_map import VoxelMap, lattice_origin
-from model_training.mapping.work import Arrays, Work, key_of, work_beside
+from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
 from service.imaging.view_grid import ViewGrid
 from service.maps.calibration import Calibration, Site
@@ -41,10 +31,6 @@ from service.maps.content import BundleContent
 from service.maps.manifest import NAME, Manifest
 from service.maps.writer import write_bundle
 from service.retrieval.encoder import Encoder
-
-__all__ = [
-    "BuildSettings", "LevelledScan", "build_map", "describe", "fan", "levelled_scans", "thinned", "tool_versions", "view_ranges",
-]  # fmt: skip
 
 #: Progress callback: stage, finished steps, all steps.
 Report = Callable[[str, int, int], None]
@@ -92,25 +78,26 @@ def build_map(
     apart: Set[int] = set() if calibration is None else held_out(len(kept))
     key = key_of(dataset, encoder.sha256, settings, threads=threads, held_out=len(apart))
     with work_beside(out, key) as work:
+        stages = ResumedStages(work, dataset, kept, settings, report)
+        # 1. Rows of the view grid, and poses of the scans.
         grid = ViewGrid(rows=encoder.rows, columns=encoder.columns)
-        rows_seen = work.part("rows", lambda: {"seen": rows_seen_by(dataset, kept, grid, settings)})["seen"]
-        if settings.align_survey:
-            given = poses
-            poses = work.part("poses", lambda: {"aligned": aligned(dataset, given, kept, report=report)})["aligned"]
+        rows_seen = stages.rows_seen(grid)
+        poses = stages.poses(poses)
+        # 2. Places with their map views, and the voxel map of the points.
         drive = Drive(dataset, poses, kept, settings, encoder, grid, rows_seen)
-        cloud = _cloud_around(poses, settings)
-        places = drive.places(cloud, work, apart=apart, report=report)
+        places, cloud = stages.places(drive, _cloud_around(poses, settings), apart=apart)
         content = _content(drive, places, encoder_file)
+        # 3. Confidence on this site, checked with scans that are not in the map yet.
         if calibration is not None:
-            site = _checked(drive, places, content, cloud, calibration, apart, work, report)
+            site = _checked(stages, drive, places, content, cloud, calibration, apart)
             checked = calibration.model_copy(update={"site": site})
             content = replace(content, calibration=checked.model_dump(mode="json"))
-        if settings.traffic_vote:
-            gone = moved(cloud, dataset, poses, kept, settings, work, each_scan=True, report=report)
-            cloud.keep(~np.isin(cloud.sums()[0], gone))
-        if settings.passes_vote:
-            gone = moved(cloud, dataset, poses, kept, settings, work, report=report)
-            cloud.keep(~np.isin(cloud.sums()[0], gone))
+        # 4. Dynamic objects: traffic first, then what other passes see through.
+        for wanted, each_scan in ((settings.traffic_vote, True), (settings.passes_vote, False)):
+            if wanted:
+                gone = stages.dynamic_voxels(cloud, poses, each_scan=each_scan)
+                cloud.keep(~np.isin(cloud.sums()[0], gone))
+        # 5. The bundle.
         report("writing", 0, 2)
         content = with_cloud(content, cloud)
         report("writing", 1, 2)
@@ -141,7 +128,8 @@ def _content(drive: Drive, places: Places, encoder_file: Path) -> BundleContent:
         calibration={"calibrated": False, "why": "no calibration fits this map's encoder; answers carry confidence null"},
         parameters={
             "lidar_height_m": lidar_height_m, "voxel_m": settings.voxel_m, "weather_removed": float(settings.remove_weather),
-            "expected_lidar_height_m": settings.expected_lidar_height_m, "survey_scans": float(len(drive.poses)), **done,
+            "expected_lidar_height_m": settings.expected_lidar_height_m, "survey_scans": float(len(drive.poses)),
+            "between_m": settings.between_m, "places_between": float(places.between), **done,
         },
         licence=settings.licence,
         tool_versions=tool_versions(),
@@ -154,28 +142,26 @@ def tool_versions() -> dict[str, str]:
 
 
 def _checked(
+    stages: ResumedStages,
     drive: Drive,
     places: Places,
     content: BundleContent,
     cloud: VoxelMap,
     calibration: Calibration,
     apart: Set[int],
-    work: Work,
-    report: Report,
 ) -> Site | None:
     """Run the site check on the map without the held-out scans, then add these scans to the cloud; None if none is held out."""
     if not apart:
         return None
     numbers = np.array(sorted(apart))
     scans = levelled_scans(drive.dataset, drive.kept[numbers], drive.settings)
-    held = [HeldScan(int(k), scan.points, places.T_map_level[k]) for k, scan in zip(numbers, scans, strict=True)]
+    held = [HeldScan(scan.points, places.T_map_level[k]) for k, scan in zip(numbers, scans, strict=True)]
 
-    def asked() -> Arrays:
-        site = site_of(replace(content, cloud=prepared(cloud)), held, calibration, report)
-        return {"site": np.frombuffer(site.model_dump_json().encode(), np.uint8)}
+    def check() -> Site:
+        rest = of_places(content, ~places.rendered_from(apart))
+        return site_of(replace(rest, cloud=prepared(cloud)), held, calibration, stages.report)
 
-    name = f"site-{sha256(calibration.model_dump_json().encode()).hexdigest()[:16]}"
-    site = Site.model_validate_json(work.part(name, asked)["site"].tobytes())
+    site = stages.site(calibration, check)
     for scan in held:
         cloud.add(*near(scan.points, scan.T_map_level))
     return site

@@ -26,7 +26,7 @@ def calibration_for(path: Path | None, encoder_sha256: str) -> Calibration | Non
         document = path.read_bytes()
     except OSError as error:
         raise DatasetError(
-            f"{path} cannot be read ({error.strerror}); make it with streetfix calibrate", field="calibration"
+            f"{path} cannot be read ({error.strerror}); create it with streetfix calibrate", field="calibration"
         ) from error
     calibration = read_calibration(document, path=str(path))
     require_features(calibration, str(path))

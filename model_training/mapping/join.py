@@ -18,6 +18,8 @@ from service.maps.content import BundleContent
 _OF_A_DRIVE = (
     "lidar_height_m",
     "survey_scans",
+    "between_m",
+    "places_between",
     "passes_vote",
     "traffic_vote",
     "survey_aligned",
@@ -42,14 +44,15 @@ def require_same(a: BundleContent, b: BundleContent, *, names: tuple[str, str]) 
     for what in sorted(first.keys() | second.keys()):
         if first.get(what) != second.get(what):
             raise BundleError(
-                f"{what}: {names[0]} has {first.get(what)!r}, {names[1]} has {second.get(what)!r}; "
-                f"build one of them again to the other's {what}", field=what,
+                f"{what}: {names[0]} has {first.get(what)!r}, {names[1]} has {second.get(what)!r}; build "
+                f"one of them again with the other's {what}", field=what,
             )  # fmt: skip
     if not np.array_equal(a.rows_seen, b.rows_seen):
         count = int((a.rows_seen != b.rows_seen).sum())
         raise BundleError(
-            f"rows_seen: {names[0]} and {names[1]} differ in {count} of {len(a.rows_seen)} rows of the view grid: their LiDARs look up "
-            "and down differently; give the second survey's dataset to `streetfix map update` instead", field="rows_seen",
+            f"rows_seen: {names[0]} and {names[1]} differ in {count} of {len(a.rows_seen)} rows of "
+            "the view grid: their LiDARs have different vertical fields of view; give the second "
+            "survey's dataset to `streetfix map update` instead", field="rows_seen",
         )  # fmt: skip
 
 
@@ -87,8 +90,10 @@ def joined(a: BundleContent, b: BundleContent, *, newer_streets: bool = False) -
         _at_height(a.T_map_place, height_m - heights[0]), _at_height(fresh.T_map_place, height_m - heights[1])
     ])  # fmt: skip
     streets = joined_streets(a.streets, b.streets, newer=newer_streets)
-    scans = a.parameters.get("survey_scans", 0.0) + b.parameters.get("survey_scans", 0.0)
-    parameters = {**a.parameters, "lidar_height_m": height_m, "survey_scans": scans}
+    counted = {
+        name: a.parameters.get(name, 0.0) + b.parameters.get(name, 0.0) for name in ("survey_scans", "places_between")
+    }
+    parameters = {**a.parameters, "lidar_height_m": height_m, **counted}
     for name in _OF_ALL:
         if name not in b.parameters:
             parameters.pop(name, None)
@@ -159,7 +164,8 @@ def joined_streets(
         name = feature["properties"]["id"]
         if not newer and name in features and features[name] != feature:
             raise BundleError(
-                f"streets: both have a street {name!r}, but not the same; give one of them another id, or the same streets.geojson",
+                f"streets: both maps have a street {name!r}, but the two differ; give one of them another id, or the "
+                "same streets.geojson",
                 field="streets.geojson",
             )  # fmt: skip
         features[name] = feature

@@ -46,9 +46,7 @@ def merge_maps(
             ``overwrite`` is False.
     """
     if out.exists() and not overwrite:
-        raise BundleError(
-            f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
-        )
+        raise BundleError(f"{out} already exists; choose another --out or pass --overwrite", field="out")
     a, b = MapBundle.open(first), MapBundle.open(second)
     report("merge", 1, 4)
     one, other = content_of(a), content_of(b)

@@ -13,9 +13,8 @@ Passes are counted per tile of the ground. A tile that comes into reach again af
 within reach stays in the same pass. Votes are bits, one per pass, so their order does not matter.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from model_training.datasets.dataset import Dataset
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import clear_scan, travelled_m
 from model_training.mapping.voxel_map import VoxelMap
-from model_training.mapping.work import Arrays, Work
+from model_training.mapping.work import Arrays
 from service.geometry.rigid import inverse, transform_points
 
 #: Edge of a tile of the ground, metres.
@@ -35,8 +34,6 @@ REACH_M = 30.0
 AWAY_M = 30.0
 #: Largest number of a pass, counted from 0; later passes share it.
 MOST = 63
-#: Number of scans whose votes are stored as one part.
-CHUNK = 64
 
 #: Edge of a cell of the range image, degrees.
 _CELL_DEG = 0.5
@@ -46,8 +43,6 @@ _ROWS, _COLUMNS = 180, 720
 _NEAREST_M = 2.0
 #: Number of tiles along an axis that have a number of their own.
 _SPAN = 1 << 24
-#: Progress callback: stage, finished steps, all steps.
-Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,100 +165,99 @@ class Targets:
         return np.concatenate(ranges) if ranges else np.zeros(0, np.int64)
 
 
-def moved(
-    cloud: VoxelMap,
-    dataset: Dataset,
-    poses: NDArray[np.float64],
-    numbers: NDArray[np.int64],
-    settings: BuildSettings,
-    work: Work,
-    *,
-    earlier: NDArray[np.int64] | None = None,
-    each_scan: bool = False,
-    report: Report = lambda *_: None,
-) -> NDArray[np.int64]:
-    """Return the keys of the voxels that the vote removes, ascending (m,).
-
-    A voxel is removed if more passes see through it than hit it, at least two. With ``each_scan`` it is removed if at least as many
-    scans see through it as hit it. The vote reads the scans again, one at a time.
-
-    Args:
-        cloud: the voxel map of all scans. It is not changed.
-        dataset: the dataset with the scans.
-        poses: T_map_lidar of all scans (N, 4, 4).
-        numbers: indices of the scans that vote, in the order of the traversal (n,).
-        settings: settings of the map: the spacing, and whether weather is removed.
-        work: store for the votes of finished chunks.
-        earlier: keys of the voxels that were in the map before this survey (k,). The map counts as one more pass that hit them.
-        each_scan: every scan votes on its own, not with its pass. This finds traffic.
-        report: called after every scan.
-    """
-    targets = Targets.of(cloud)
-    drive = poses[numbers]
-    passes = Passes.each_scan(drive) if each_scan else Passes.of(drive, spacing_m=settings.spacing_m)
-    ballot = Ballot(targets, passes, behind_m=(1 if each_scan else 2) * cloud.voxel_m)
-    kind, stage = ("traffic", "traffic") if each_scan else ("votes", "passes")
-
-    def told(done: int) -> None:
-        report(stage, done, len(numbers))
-
-    hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
-    for first in range(0, len(numbers), CHUNK):
-        scans = range(first, min(first + CHUNK, len(numbers)))
-        make = partial(_votes, ballot, cloud, dataset, poses, numbers, settings, scans, told)
-        votes = work.part(f"{kind}-{first:07d}", make)
-        hit[votes["of"]] |= votes["hit"]
-        through[votes["of"]] |= votes["through"]
-        told(scans.stop)
-    hits = np.maximum(np.bitwise_count(hit), 1).astype(np.int64)
-    if earlier is not None:
-        known = np.isin(targets.keys, earlier)
-        hits = np.where(known, np.bitwise_count(hit) + 1, hits)
-    against = np.bitwise_count(through & ~hit).astype(np.int64)
-    return np.asarray(targets.keys[against >= hits if each_scan else against > hits])
-
-
 @dataclass(frozen=True, eq=False)
-class Ballot:
+class Vote:
     """The setup of a vote.
 
     Attributes:
         targets: the voxels of the vote.
-        passes: the pass of each scan that votes.
-        behind_m: distance behind a voxel beyond which a ray must end to see through it, metres.
+        cloud: the voxel map of all scans. It is not changed.
+        dataset: the dataset with the scans.
+        T_map_lidar: poses of the scans that vote, in the order of the traversal (n, 4, 4).
+        numbers: indices of these scans in the dataset (n,).
+        passes: the pass of each of these scans.
+        settings: settings of the map: whether weather is removed.
+        each_scan: every scan votes on its own, not with its pass. This finds traffic.
     """
 
     targets: Targets
+    cloud: VoxelMap
+    dataset: Dataset
+    T_map_lidar: NDArray[np.float64]
+    numbers: NDArray[np.int64]
     passes: Passes
-    behind_m: float
+    settings: BuildSettings
+    each_scan: bool
 
+    @classmethod
+    def of(
+        cls, cloud: VoxelMap, dataset: Dataset, poses: NDArray[np.float64], numbers: NDArray[np.int64], settings: BuildSettings,
+        *, each_scan: bool,
+    ) -> "Vote":  # fmt: skip
+        """Set up a vote.
 
-def _votes(
-    ballot: Ballot,
-    cloud: VoxelMap,
-    dataset: Dataset,
-    poses: NDArray[np.float64],
-    numbers: NDArray[np.int64],
-    settings: BuildSettings,
-    scans: range,
-    told: Callable[[int], None],
-) -> Arrays:
-    targets, passes = ballot.targets, ballot.passes
-    hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
-    for scan in scans:
-        T = poses[numbers[scan]]
-        points = clear_scan(dataset, int(numbers[scan]), settings)[:, :3].astype(np.float64)
-        near = points[np.linalg.norm(points, axis=1) <= REACH_M]
-        touched = np.unique(cloud.keys_of(transform_points(T, near)))
-        at = np.searchsorted(targets.keys, touched)
-        inside = at < len(targets.keys)
-        at = at[inside][targets.keys[at[inside]] == touched[inside]]
-        hit[at] |= passes.bits(scan, targets.tile[at])
-        seen = looked_through(targets, targets.of_tiles(passes.tiles[scan]), points, T, behind_m=ballot.behind_m)
-        through[seen] |= passes.bits(scan, targets.tile[seen])
-        told(scan + 1)
-    of = np.flatnonzero(hit | through)
-    return {"of": of, "hit": hit[of], "through": through[of]}
+        Args:
+            cloud: the voxel map of all scans.
+            dataset: the dataset with the scans.
+            poses: T_map_lidar of all scans (N, 4, 4).
+            numbers: indices of the scans that vote, in the order of the traversal (n,).
+            settings: settings of the map: the spacing, and whether weather is removed.
+            each_scan: every scan votes on its own.
+        """
+        T_map_lidar = poses[numbers]
+        passes = Passes.each_scan(T_map_lidar) if each_scan else Passes.of(T_map_lidar, spacing_m=settings.spacing_m)
+        return cls(Targets.of(cloud), cloud, dataset, T_map_lidar, numbers, passes, settings, each_scan)
+
+    def votes(self, scans: range, report: Callable[[int], None] = lambda _: None) -> Arrays:
+        """Compute the votes of some scans. It reads them again, one at a time.
+
+        Args:
+            scans: rows of the scans in ``numbers``.
+            report: called after every scan with its row plus one.
+
+        Returns:
+            ``of``: indices of the voxels that are hit or seen through (m,). ``hit`` and ``through``: a bit for each pass (m,).
+        """
+        targets, passes = self.targets, self.passes
+        # Behind the voxel a ray must end farther away than this to see through it. Scans of one traversal agree better than passes.
+        behind_m = (1 if self.each_scan else 2) * self.cloud.voxel_m
+        hit, through = np.zeros(len(targets.keys), np.uint64), np.zeros(len(targets.keys), np.uint64)
+        for scan in scans:
+            T = self.T_map_lidar[scan]
+            points = clear_scan(self.dataset, int(self.numbers[scan]), self.settings)[:, :3].astype(np.float64)
+            near = points[np.linalg.norm(points, axis=1) <= REACH_M]
+            touched = np.unique(self.cloud.keys_of(transform_points(T, near)))
+            at = np.searchsorted(targets.keys, touched)
+            inside = at < len(targets.keys)
+            at = at[inside][targets.keys[at[inside]] == touched[inside]]
+            hit[at] |= passes.bits(scan, targets.tile[at])
+            seen = looked_through(targets, targets.of_tiles(passes.tiles[scan]), points, T, behind_m=behind_m)
+            through[seen] |= passes.bits(scan, targets.tile[seen])
+            report(scan + 1)
+        of = np.flatnonzero(hit | through)
+        return {"of": of, "hit": hit[of], "through": through[of]}
+
+    def removed(self, votes: Iterable[Arrays], earlier: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Count the votes; return the keys of the voxels that they remove, ascending (m,).
+
+        A voxel is removed if more passes see through it than hit it, at least two. With ``each_scan`` it is removed if at least as
+        many scans see through it as hit it.
+
+        Args:
+            votes: the votes of all scans, as ``votes`` returns them.
+            earlier: keys of the voxels that were in the map before this survey (k,). The map counts as one more pass that hit them.
+        """
+        keys = self.targets.keys
+        hit, through = np.zeros(len(keys), np.uint64), np.zeros(len(keys), np.uint64)
+        for part in votes:
+            hit[part["of"]] |= part["hit"]
+            through[part["of"]] |= part["through"]
+        hits = np.maximum(np.bitwise_count(hit), 1).astype(np.int64)
+        if earlier is not None:
+            known = np.isin(keys, earlier)
+            hits = np.where(known, np.bitwise_count(hit) + 1, hits)
+        against = np.bitwise_count(through & ~hit).astype(np.int64)
+        return np.asarray(keys[against >= hits if self.each_scan else against > hits])
 
 
 def looked_through(

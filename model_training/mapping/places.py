@@ -1,45 +1,55 @@
 """Compute the places of a survey, the descriptors of their map views and the points around them, in chunks of places."""
 
-from collections.abc import Callable, Set
+from collections.abc import Callable, Iterable, Set
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
+from model_training.mapping.between import PlacedScan, Viewpoint, at_scan, between
 from model_training.mapping.cloud import near
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import fan, fan_views, levelled_scans
 from model_training.mapping.voxel_map import VoxelMap
-from model_training.mapping.work import Arrays, Work
+from model_training.mapping.work import Arrays
 from service.geometry.rigid import heading_of_body
 from service.imaging.view_grid import ViewGrid, survey_planes
 from service.maps.streets import Streets
 from service.retrieval.encoder import Encoder
 
-#: Number of places whose results are stored as one part.
-CHUNK = 64
-#: Progress callback: stage, finished steps, all steps.
-Report = Callable[[str, int, int], None]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """The places of a survey.
+    """The places of a survey: first one for each kept scan, in their order, then those between distant scans.
 
     Attributes:
         T_map_level: pose of the levelled LiDAR at each place (P, 4, 4).
         height_m: height of the LiDAR above the ground, metres (P,).
         heading_rad: heading of each map view, radians, map frame (P, headings).
         descriptors: descriptors of the map views, place by place (P * headings, D).
+        sources: indices of the two kept scans that a place is rendered from; equal for a place at a scan (P, 2).
     """
 
     T_map_level: NDArray[np.float64]
     height_m: NDArray[np.float64]
     heading_rad: NDArray[np.float64]
     descriptors: NDArray[np.float32]
+    sources: NDArray[np.int64]
+
+    @property
+    def between(self) -> int:
+        """Number of places between scans."""
+        return int((self.sources[:, 0] != self.sources[:, 1]).sum())
+
+    def rendered_from(self, scans: Set[int]) -> NDArray[np.bool_]:
+        """Return whether each place is rendered from any of some scans (P,).
+
+        Args:
+            scans: indices of kept scans.
+        """
+        return np.asarray(np.isin(self.sources, list(scans)).any(axis=1))
 
     def at_height(self, lidar_height_m: float) -> NDArray[np.float64]:
         """Return the poses (P, 4, 4), moved vertically to one height above the ground.
@@ -74,46 +84,78 @@ class Drive:
     grid: ViewGrid
     rows_seen: NDArray[np.bool_]
 
-    def places(
-        self, cloud: VoxelMap, work: Work, *, apart: Set[int] = frozenset(), report: Report = lambda *_: None
-    ) -> Places:
-        """Process every kept scan: level it, render and encode its map views, and add its points to the cloud.
+    def chunk(
+        self,
+        scans: range,
+        empty: VoxelMap,
+        apart: Set[int] = frozenset(),
+        report: Callable[[int], None] = lambda _: None,
+    ) -> Arrays:
+        """Process some kept scans: level them, render and encode their map views, and gather their points.
+
+        Before a scan that is farther than ``settings.between_m`` from the one before it, it also renders and encodes views between
+        both (``mapping.between``). So it reads the scan before the first one too.
 
         Args:
-            cloud: the voxel map that the points go into. Chunks are added in order, whether they are computed now or were stored.
-            work: store for finished chunks.
-            apart: indices of the places whose points stay out of the cloud.
-            report: called after every place.
-        """
-        chunks: list[Arrays] = []
-        for first in range(0, len(self.kept), CHUNK):
-            chunk = work.part(f"places-{first:07d}", partial(self._chunk, first, cloud, apart, report))
-            cloud.add_sums(chunk.pop("keys"), chunk.pop("moments"))
-            chunks.append(chunk)
-        return Places(*(np.concatenate([chunk[name] for chunk in chunks]) for name in Places.__slots__))
+            scans: indices of kept scans.
+            empty: an empty voxel map, whose lattice the points are gathered in.
+            apart: indices of the kept scans whose points are left out.
+            report: called after every scan with its index plus one.
 
-    def _chunk(self, first: int, cloud: VoxelMap, apart: Set[int], report: Report) -> Arrays:
-        numbers, turns = self.kept[first : first + CHUNK], fan(self.settings.headings)
-        points = VoxelMap(cloud.voxel_m, cloud.origin)
-        T_map_level = np.zeros((len(numbers), 4, 4))
-        heights, headings, descriptors = np.zeros(len(numbers)), [], []
-        for k, scan in enumerate(levelled_scans(self.dataset, numbers, self.settings)):
-            T = scan.T_map_level(self.poses[scan.number])
-            planes = np.stack([
-                survey_planes(view, sensor_height_m=scan.level.height_m, rows_seen=self.rows_seen, grid=self.grid)
-                for view in fan_views(scan, turns, self.grid)
-            ])  # fmt: skip
-            descriptors.append(self.encoder.encode(planes, "survey"))
-            headings.append((heading_of_body(T) + scan.start_rad + turns + np.pi) % (2 * np.pi) - np.pi)
-            if first + k not in apart:
-                points.add(*near(scan.points, T))
-            T_map_level[k], heights[k] = T, scan.level.height_m
-            report("places", first + k + 1, len(self.kept))
+        Returns:
+            The fields of ``Places``, and ``keys`` and ``moments`` of the voxels.
+        """
+        points = VoxelMap(empty.voxel_m, empty.origin)
+        found: list[Arrays] = []
+        before: PlacedScan | None = None
+        start = max(scans.start - 1, 0)
+        for k, scan in enumerate(levelled_scans(self.dataset, self.kept[start : scans.stop], self.settings), start):
+            placed = PlacedScan(scan, scan.T_map_level(self.poses[scan.number]))
+            if k in scans:
+                if before is not None:
+                    on_the_way = between(before, placed, self.settings.between_m)
+                    found += [self._encoded(viewpoint, (k - 1, k)) for viewpoint in on_the_way]
+                found.append(self._encoded(at_scan(placed), (k, k)))
+                if k not in apart:
+                    points.add(*near(scan.points, placed.T_map_level))
+                report(k + 1)
+            before = placed
         keys, moments = points.sums()
-        return {
-            "T_map_level": T_map_level, "height_m": heights, "heading_rad": np.stack(headings),
-            "descriptors": np.concatenate(descriptors), "keys": keys, "moments": moments,
+        return {name: np.stack([each[name] for each in found]) for name in Places.__slots__} | {
+            "keys": keys, "moments": moments
         }  # fmt: skip
+
+    def _encoded(self, viewpoint: Viewpoint, sources: tuple[int, int]) -> Arrays:
+        """Return the fields of one place in ``Places``; its descriptors are (headings, D)."""
+        turns = fan(self.settings.headings)
+        planes = np.stack([
+            survey_planes(view, sensor_height_m=viewpoint.height_m, rows_seen=self.rows_seen, grid=self.grid)
+            for view in fan_views(viewpoint.points, viewpoint.start_rad + turns, self.grid)
+        ])  # fmt: skip
+        heading_rad = heading_of_body(viewpoint.T_map_level) + viewpoint.start_rad + turns
+        return {
+            "T_map_level": viewpoint.T_map_level, "height_m": np.array(viewpoint.height_m),
+            "heading_rad": (heading_rad + np.pi) % (2 * np.pi) - np.pi, "descriptors": self.encoder.encode(planes, "survey"),
+            "sources": np.array(sources, np.int64),
+        }  # fmt: skip
+
+
+def gathered(chunks: Iterable[Arrays], empty: VoxelMap) -> tuple[Places, VoxelMap]:
+    """Put the chunks of a traversal together: its places, and the voxel map of its points.
+
+    Args:
+        chunks: results of ``Drive.chunk``, in order. The order of sums is that of the chunks, so the result is the same to the bit.
+        empty: the empty voxel map of the chunks.
+    """
+    cloud, fields = VoxelMap(empty.voxel_m, empty.origin), list[Arrays]()
+    for chunk in chunks:
+        cloud.add_sums(chunk["keys"], chunk["moments"])
+        fields.append({name: chunk[name] for name in Places.__slots__})
+    whole = {name: np.concatenate([each[name] for each in fields]) for name in Places.__slots__}
+    order = np.argsort(whole["sources"][:, 0] != whole["sources"][:, 1], kind="stable")  # those at scans first
+    whole = {name: field[order] for name, field in whole.items()}
+    descriptors = whole.pop("descriptors")
+    return Places(**whole, descriptors=descriptors.reshape(-1, descriptors.shape[-1])), cloud
 
 
 def views_of(places: int, headings: int) -> NDArray[np.int32]:

@@ -15,7 +15,8 @@ class BuildSettings:
 
     Attributes:
         name: name of the map in requests.
-        spacing_m: travelled distance between places, metres.
+        spacing_m: travelled distance between the scans that become places, metres.
+        between_m: largest distance between places, metres. Farther scans get places between them; 0 puts none there.
         headings: number of map views per place.
         voxel_m: edge of a voxel of the cloud, metres.
         expected_lidar_height_m: expected height of the LiDAR above the ground, metres. The search for the ground starts there.
@@ -32,6 +33,7 @@ class BuildSettings:
 
     name: str
     spacing_m: float = 1.0
+    between_m: float = 3.0
     headings: int = 24
     voxel_m: float = 0.3
     expected_lidar_height_m: float = 1.8
@@ -44,11 +46,11 @@ class BuildSettings:
 
     def __post_init__(self) -> None:
         """Refuse values that would give an empty fan or a cloud without voxels."""
-        lowest = {"spacing_m": 0.0, "headings": 1, "voxel_m": 0.01, "expected_lidar_height_m": 0.1}
+        lowest = {"spacing_m": 0.0, "between_m": 0.0, "headings": 1, "voxel_m": 0.01, "expected_lidar_height_m": 0.1}
         for field, least in lowest.items():
             value = getattr(self, field)
             if not least <= value < math.inf:
-                raise DatasetError(f"{field}: {value:g} is not {least:g} or more; give a number that is", field=field)
+                raise DatasetError(f"{field}: {value:g} is not valid; give {least:g} or more", field=field)
 
     @classmethod
     def of_map(cls, manifest: Manifest, *, passes_vote: bool = False) -> "BuildSettings":
@@ -61,6 +63,7 @@ class BuildSettings:
         parameters = manifest.parameters
         return cls(
             name=manifest.name, spacing_m=manifest.spacing_m, headings=manifest.headings, voxel_m=parameters["voxel_m"],
+            between_m=parameters.get("between_m", 0.0),
             expected_lidar_height_m=parameters.get("expected_lidar_height_m", parameters["lidar_height_m"]),
             remove_weather=bool(parameters.get("weather_removed", 0.0)), passes_vote=passes_vote, licence=manifest.licence,
             align_survey=bool(parameters.get("survey_aligned", 0.0)), traffic_vote=bool(parameters.get("traffic_vote", 0.0)),

@@ -44,12 +44,10 @@ class HeldScan:
     """A scan that was held out of the map.
 
     Attributes:
-        place: index of its place.
         points: x, y, z (metres, level frame of the LiDAR) and intensity (n, 4).
         T_map_level: pose of the levelled LiDAR (4, 4).
     """
 
-    place: int
     points: NDArray[np.float32]
     T_map_level: NDArray[np.float64]
 
@@ -75,7 +73,7 @@ def site_of(
     camera.
 
     Args:
-        content: the whole map. Its cloud must not contain the held-out scans.
+        content: the map without places that a held-out scan takes part in. Its cloud must not contain the held-out scans.
         held: the held-out scans.
         calibration: the calibration to check.
         report: called after every query.
@@ -85,7 +83,7 @@ def site_of(
     """
     confidence, right = [], []
     with tempfile.TemporaryDirectory(prefix="streetfix-site-") as folder:
-        write_bundle(Path(folder) / "map", _without(content, {scan.place for scan in held}))
+        write_bundle(Path(folder) / "map", _to_check(content))
         localizer = Localizer.open(MapBundle.open(Path(folder) / "map", verify=False))
         for number, scan in enumerate(held):
             query, T_map_camera = _drawn(scan, content.grid, number)
@@ -111,14 +109,10 @@ def _offset(odds: NDArray[np.float64], right: NDArray[np.bool_]) -> float:
     return offset
 
 
-def _without(content: BundleContent, places: set[int]) -> BundleContent:
-    keep = np.array([number not in places for number in range(len(content.T_map_place))])
-    views = keep[content.view_place]
+def _to_check(content: BundleContent) -> BundleContent:
+    """Return the map without calibration, preview and the brightness of its cloud."""
     return replace(
-        content, T_map_place=content.T_map_place[keep], place_street=content.place_street[keep],
-        view_place=np.repeat(np.arange(int(keep.sum()), dtype=np.int32), content.headings),
-        view_heading_rad=content.view_heading_rad[views], descriptors=content.descriptors[views],
-        calibration={"calibrated": False, "why": "asked to check the calibration"}, preview_webp=b"",
+        content, calibration={"calibrated": False, "why": "the calibration is being checked"}, preview_webp=b"",
         cloud=None if content.cloud is None else replace(content.cloud, brightness=None),
     )  # fmt: skip
 

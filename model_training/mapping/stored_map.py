@@ -55,7 +55,7 @@ def voxel_edge_m(bundle: MapBundle) -> float:
     """
     edge = bundle.manifest.parameters.get("voxel_m", 0.0)
     if not edge > 0:
-        raise BundleError(f"{bundle.path}: its parameters lack voxel_m; build the map again", field="voxel_m")
+        raise BundleError(f"{bundle.path}: its parameters have no voxel_m; build the map again", field="voxel_m")
     return edge
 
 
@@ -115,9 +115,9 @@ def read_statistics(bundle: MapBundle) -> NDArray[Any]:
     try:
         found = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, *NPY_HEADER_ERRORS) as error:
-        raise _defect(bundle, f"it is no array of ours ({error})") from error
+        raise _defect(bundle, f"not a valid array file ({error})") from error
     if found.dtype not in (VOXEL, VOXEL_WITHOUT_BRIGHTNESS) or found.ndim != 1:
-        raise _defect(bundle, f"it holds {found.dtype} in {found.ndim} dimensions")
+        raise _defect(bundle, f"unexpected type {found.dtype} in {found.ndim} dimensions")
     numbers = [found[name] for name in ("sums", "brightness") if name in (found.dtype.names or ())]
     if not all(np.isfinite(each).all() for each in numbers) or not (found["points"] > 0).all():
         raise _defect(bundle, "a voxel has no points, or a sum that is not finite")

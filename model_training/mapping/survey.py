@@ -53,23 +53,25 @@ def fan(headings: int) -> NDArray[np.float64]:
     return 2 * np.pi * np.arange(headings) / headings
 
 
-def fan_views(scan: LevelledScan, turns: NDArray[np.float64], grid: ViewGrid) -> Iterator[LidarView]:
-    """Yield the view of a scan in each direction of a fan.
+def fan_views(points: NDArray[np.float32], headings_rad: NDArray[np.float64], grid: ViewGrid) -> Iterator[LidarView]:
+    """Yield the view of points in each direction of a fan.
 
     Args:
-        scan: the levelled scan.
-        turns: headings relative to the principal heading, radians (headings,).
+        points: x, y, z (metres, level frame) and intensity (n, 4).
+        headings_rad: heading of each view, radians, level frame (headings,).
         grid: the view grid.
     """
-    panorama = panorama_from_points(scan.points, grid)
-    for turn in turns:
-        yield view_from_panorama(panorama, scan.start_rad + float(turn), grid)
+    panorama = panorama_from_points(points, grid)
+    for heading_rad in headings_rad:
+        yield view_from_panorama(panorama, float(heading_rad), grid)
 
 
 def view_ranges(
     dataset: Dataset, settings: BuildSettings, grid: ViewGrid, rows_seen: NDArray[np.bool_]
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield the range views (headings, rows, columns), metres, of every place of the map, in the order of the places.
+    """Yield the range views (headings, rows, columns), metres, of every place at a scan, in the order of the places.
+
+    A map has the places between scans after them.
 
     Args:
         dataset: the dataset with the survey.
@@ -80,7 +82,7 @@ def view_ranges(
     kept = thinned(dataset.survey_poses(), settings.spacing_m)
     turns = fan(settings.headings)
     for scan in levelled_scans(dataset, kept, settings):
-        yield np.stack([view[0] for view in fan_views(scan, turns, grid)]) * rows_seen[:, None]
+        yield np.stack([view[0] for view in fan_views(scan.points, scan.start_rad + turns, grid)]) * rows_seen[:, None]
 
 
 def kept_scans(dataset: Dataset, settings: BuildSettings) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

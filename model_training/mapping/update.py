@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.align_survey import aligned
 from model_training.mapping.area import Area, covered_by, polygon_of
 from model_training.mapping.build import tool_versions
 from model_training.mapping.cloud import with_cloud
 from model_training.mapping.join import joined, joined_streets, of_places
-from model_training.mapping.passes import moved
 from model_training.mapping.places import Drive, Places, views_of
 from model_training.mapping.settings import BuildSettings
+from model_training.mapping.stages import ResumedStages
 from model_training.mapping.stored_map import content_of, empty_voxels_of, streets_of_bundle, voxels_of
-from model_training.mapping.survey import kept_scans, require_poses_within, rows_seen_by
+from model_training.mapping.survey import kept_scans, require_poses_within
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import key_of, work_beside
 from service.errors import BundleError, DatasetError
@@ -84,20 +83,14 @@ def update_map(
         replace_covered, replace_area
     ))  # fmt: skip
     with work_beside(out, key) as work:
-        _require_rows(
-            work.part("rows", lambda: {"seen": rows_seen_by(dataset, kept, bundle.grid, settings)})["seen"],
-            bundle,
-            dataset,
-        )
-        if settings.align_survey:
-            given = poses
-            poses = work.part("poses", lambda: {"aligned": aligned(dataset, given, kept, report=report)})["aligned"]
+        stages = ResumedStages(work, dataset, kept, settings, report)
+        _require_rows(stages.rows_seen(bundle.grid), bundle, dataset)
+        poses = stages.poses(poses)
         drive = Drive(dataset, poses, kept, settings, encoder, bundle.grid, bundle.rows_seen)
         cloud = voxels_of(bundle)
-        fresh = VoxelMap(cloud.voxel_m, cloud.origin)
-        places = drive.places(fresh, work, report=report)
+        places, fresh = stages.places(drive, VoxelMap(cloud.voxel_m, cloud.origin))
         if settings.traffic_vote:
-            gone = moved(fresh, dataset, poses, kept, settings, work, each_scan=True, report=report)
+            gone = stages.dynamic_voxels(fresh, poses, each_scan=True)
             fresh.keep(~np.isin(fresh.sums()[0], gone))
         content = content_of(bundle)
         if replace_covered or area is not None:
@@ -106,7 +99,7 @@ def update_map(
         earlier = cloud.sums()[0].copy()
         cloud.add_sums(*fresh.sums())
         if passes_vote:
-            gone = moved(cloud, dataset, poses, kept, settings, work, earlier=earlier, report=report)
+            gone = stages.dynamic_voxels(cloud, poses, each_scan=False, earlier=earlier)
             cloud.keep(~np.isin(cloud.sums()[0], gone))
         whole = joined(content, _content(drive, places, content), newer_streets=area is not None)
         report("writing", 0, 2)
@@ -167,7 +160,7 @@ def _content(drive: Drive, places: Places, old: BundleContent) -> BundleContent:
         view_place=views_of(len(T_map_place), old.headings), view_heading_rad=places.heading_rad.ravel(), descriptors=places.descriptors,
         parameters={
             **{name: value for name, value in old.parameters.items() if name != "passes_vote"}, "lidar_height_m": lidar_height_m,
-            "survey_scans": float(len(drive.poses)), **voted,
+            "survey_scans": float(len(drive.poses)), "places_between": float(places.between), **voted,
         },
         calibration={**old.calibration, "site": None} if old.calibration["calibrated"] else old.calibration,
     )  # fmt: skip

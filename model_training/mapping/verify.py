@@ -54,11 +54,11 @@ def damage_of(path: Path, *, report: Report = lambda *_: None) -> list[str]:
 def _damage_of_file(folder: Path, name: str, entry: FileEntry) -> str:
     file = folder / name
     if not file.is_file() or not file.resolve().is_relative_to(folder.resolve()):
-        return "it is missing, or lies outside the bundle"
+        return "the file is missing, or is outside the bundle"
     size = file.stat().st_size
     if size != entry.size:
-        return f"it has {size} bytes instead of {entry.size}"
-    return "" if sha256_of(file) == entry.sha256 else "its content is not what the manifest says"
+        return f"the file has {size} bytes instead of {entry.size}"
+    return "" if sha256_of(file) == entry.sha256 else "its hash differs from the manifest"
 
 
 def _contradictions(bundle: MapBundle) -> Iterator[str]:
@@ -68,14 +68,14 @@ def _contradictions(bundle: MapBundle) -> Iterator[str]:
         vectors = bundle.view_index.vectors(np.arange(first, min(first + _CHUNK, len(bundle.views))))
         off += int((np.abs(np.linalg.norm(vectors, axis=1) - 1) > _LENGTH_OFF).sum())
     if off:
-        yield f"{bundle.path / index.FILE}: {off} descriptors are no unit vectors"
+        yield f"{bundle.path / index.FILE}: {off} descriptors are not unit vectors"
     R = bundle.T_map_place[:, :3, :3]
     skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6
     if skew.any():
-        yield f"{bundle.path / parts.PLACES_FILE}: {int(skew.sum())} poses are no rigid transforms"
+        yield f"{bundle.path / parts.PLACES_FILE}: {int(skew.sum())} poses are not rigid transforms"
     streets = streets_of_bundle(bundle)
     if streets is not None and (outside := _outside(bundle, streets["features"])):
-        yield f"{bundle.path / parts.PLACES_FILE}: {outside} places lie outside of the streets they name"
+        yield f"{bundle.path / parts.PLACES_FILE}: {outside} places are outside the streets that they name"
 
 
 def _outside(bundle: MapBundle, features: list[dict[str, object]]) -> int:

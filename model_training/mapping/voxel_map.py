@@ -96,9 +96,9 @@ class VoxelMap:
         if len(away) and away.max() > self.reach_m:
             farthest = int(away.argmax())
             raise DatasetError(
-                f"{what(farthest)} lies {away[farthest] / 1000:,.0f} km from the middle of the map, and a map with voxels of "
-                f"{self.voxel_m:g} m reaches {self.reach_m / 1000:.0f} km; bring all poses into one frame (are some UTM?), or make a "
-                "map of each area", field="poses",
+                f"{what(farthest)} is {away[farthest] / 1000:,.0f} km from the middle of the map, but "
+                f"a map with voxels of {self.voxel_m:g} m reaches {self.reach_m / 1000:.0f} km; "
+                "transform all poses into one frame (are some UTM?), or build a map of each area", field="poses",
             )  # fmt: skip
 
     def add(self, points_map: NDArray[np.float64], intensity: NDArray[np.floating[Any]] | None = None) -> None:

@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
@@ -31,6 +31,8 @@ from service.errors import BundleError
 
 #: Arrays of a part, by name.
 Arrays = dict[str, NDArray[Any]]
+#: Number of scans whose results are stored as one part.
+CHUNK = 64
 #: Settings that no part depends on.
 _NOT_IN_PARTS = ("name", "licence", "calibration", "passes_vote")
 #: Folders of the code that computes parts.
@@ -68,6 +70,26 @@ class Work:
             _write(path, kept)
         return kept
 
+    def chunks(
+        self, name: str, scans: int, make: Callable[[range], Arrays], report: Callable[[int], None] = lambda _: None
+    ) -> Iterator[Arrays]:
+        """Yield the parts of a stage that goes through the scans, ``CHUNK`` scans in each, in order.
+
+        Args:
+            name: name of the stage.
+            scans: number of scans.
+            make: computes the part of some scans, given by their indices.
+            report: called after every part, computed or read, with the number of scans so far.
+
+        Raises:
+            BundleError: a part cannot be written.
+        """
+        for first in range(0, scans, CHUNK):
+            span = range(first, min(first + CHUNK, scans))
+            found = self.part(f"{name}-{first:07d}", partial(make, span))
+            report(span.stop)
+            yield found
+
 
 @contextmanager
 def work_beside(out: Path, key: str) -> Iterator[Work]:
@@ -87,7 +109,8 @@ def work_beside(out: Path, key: str) -> Iterator[Work]:
         lock = _locked(folder, out)
     except OSError as error:
         raise BundleError(
-            f"{folder}: the build's work cannot be kept ({error.strerror}); make room or choose another folder", field="out"
+            f"{folder}: the intermediate results of the build cannot be stored ({error.strerror}); free "
+            "disk space or choose another folder", field="out"
         ) from error  # fmt: skip
     with lock:
         for path in folder.iterdir():
@@ -177,7 +200,7 @@ def _locked(folder: Path, out: Path) -> IO[str]:
             holder = lock.read().strip() or "?"
             lock.close()
             raise BundleError(
-                f"{out}: process {holder} is building it already; wait for it, or end it first", field="out"
+                f"{out}: process {holder} already builds this map; wait until it ends, or stop it", field="out"
             ) from error
         if path.exists() and os.fstat(lock.fileno()).st_ino == path.stat().st_ino:
             lock.truncate(0)
@@ -207,5 +230,6 @@ def _write(path: Path, arrays: Arrays) -> None:
         part.replace(path)
     except OSError as error:
         raise BundleError(
-            f"{path.parent}: the build's work cannot be kept ({error.strerror}); make room or choose another folder", field="out"
+            f"{path.parent}: the intermediate results of the build cannot be stored ({error.strerror}); "
+            "free disk space or choose another folder", field="out"
         ) from error  # fmt: skip

@@ -220,12 +220,13 @@ def encoder_file(encoder_of: Any, tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.fixture(scope="session")
 def small_map(small_dataset: Any, encoder_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bundle of ``small_dataset``, six headings a place."""
-    from model_training.mapping.build import BuildSettings, build_map
+    from model_training.mapping.build import build_map
+    from model_training.mapping.settings import BuildSettings
 
     out: Path = tmp_path_factory.mktemp("maps") / "small"
     settings = BuildSettings(
-        name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False, traffic_vote=False
-    )
+        name="small", headings=6, spacing_m=5.0, between_m=0.0, calibration=None, align_survey=False, traffic_vote=False
+    )  # fmt: skip
     build_map(small_dataset, encoder_file, out, settings, threads=1)
     return out
 
@@ -245,7 +246,8 @@ def calibration_file_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..
 @pytest.fixture(scope="session")
 def stock_map(small_dataset: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``small_map`` by the stock encoder, with its calibration."""
-    from model_training.mapping.build import BuildSettings, build_map
+    from model_training.mapping.build import build_map
+    from model_training.mapping.settings import BuildSettings
     from model_training.stock import CALIBRATION, ENCODER
 
     out: Path = tmp_path_factory.mktemp("maps") / "stock"

@@ -10,12 +10,14 @@ import pytest
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 
 #: Its poses are exact, and what is merged is compared with what is built at once; bringing scans into agreement has tests of its own.
+#: Without places between scans: two halves lack the ones between them.
 #: Without the traffic vote, in which scans of two halves vote less than those of the whole: so sums of voxels add up exactly.
 SETTINGS = BuildSettings(
-    name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False, traffic_vote=False
+    name="small", headings=6, spacing_m=5.0, between_m=0.0, calibration=None, align_survey=False, traffic_vote=False
 )
 
 

@@ -6,8 +6,9 @@ import pytest
 
 from model_training.datasets.dataset import Dataset
 from model_training.mapping.align_survey import ROUNDS, aligned
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
 from model_training.mapping.merge import merge_maps
+from model_training.mapping.settings import BuildSettings
 from model_training.mapping.update import update_map
 from service.geometry.rigid import rotation_z, transform_from
 from service.maps.reader import MapBundle
@@ -54,7 +55,7 @@ def test_scans_that_are_said_to_stand_a_little_wrong_are_brought_into_agreement(
 
 
 def test_the_drive_as_a_whole_stays_where_it_was(shifted):
-    """What all scans have in common no scan can tell."""
+    """A common offset of all scans is unobservable."""
     found = aligned(shifted, shifted.survey_poses(), every(shifted))
     drift = (found - shifted.survey_poses())[:, :3, 3].mean(axis=0)
     assert np.abs(drift).max() < 0.02

@@ -5,22 +5,25 @@ import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping import site_check
-from model_training.mapping.build import BuildSettings, build_map, describe, fan, thinned, view_ranges
+from model_training.mapping import build, site_check, work
+from model_training.mapping.build import build_map, describe
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import fan, thinned, view_ranges
 from service.errors import BundleError, DatasetError, EncoderError
 from service.localization.localizer import Localizer
+from service.maps.calibration import Site
 from service.maps.reader import MapBundle
 from service.retrieval.encoder import Encoder
 from service.retrieval.query import Query
 
 SETTINGS = BuildSettings(
-    name="small", headings=6, spacing_m=5.0, calibration=None, align_survey=False, traffic_vote=False
+    name="small", headings=6, spacing_m=5.0, between_m=0.0, calibration=None, align_survey=False, traffic_vote=False
 )
 
 
 @pytest.mark.parametrize(
     ("field", "value", "least"),
-    [("spacing_m", -1.0, "0"), ("headings", 0, "1"), ("voxel_m", 0.0, "0.01"), ("voxel_m", np.nan, "0.01"),
+    [("spacing_m", -1.0, "0"), ("between_m", -1.0, "0"), ("headings", 0, "1"), ("voxel_m", 0.0, "0.01"), ("voxel_m", np.nan, "0.01"),
      ("expected_lidar_height_m", np.inf, "0.1")],
 )  # fmt: skip
 def test_settings_that_make_no_map_are_refused_by_name(field, value, least):
@@ -131,7 +134,7 @@ def test_progress_is_told_for_every_place(small_dataset, encoder_file, bundle, t
     )
     count = bundle.manifest.counts.places
     assert told == [
-        *(("places", k, count) for k in range(1, count + 1)),
+        *(("places", k, count) for k in range(1, count + 1)), ("places", count, count),
         *(("traffic", k, count) for k in range(1, count + 1)), ("traffic", count, count),
         *(("writing", k, 2) for k in range(3)),
     ]  # fmt: skip
@@ -252,12 +255,58 @@ def test_some_scans_are_held_out_to_check_it_and_are_in_the_map_all_the_same(
     )
 
 
+def test_a_sparse_survey_gets_places_between_its_scans(small_dataset, encoder_file, bundle, tmp_path):
+    settings = replace(SETTINGS, between_m=3.0)
+    build_map(small_dataset, encoder_file, tmp_path / "m", settings, threads=1)
+    found = MapBundle.open(tmp_path / "m")
+    scans, places = bundle.manifest.counts.places, found.manifest.counts.places
+    gaps_m = np.linalg.norm(np.diff(bundle.T_map_place[:, :3, 3], axis=0), axis=1)
+    assert places - scans == sum(1 for gap_m in gaps_m if 3.0 < gap_m <= 6.0) > 0
+    assert found.manifest.parameters["places_between"] == places - scans
+    np.testing.assert_allclose(found.T_map_place[:scans, :2, 3], bundle.T_map_place[:, :2, 3], atol=1e-9)
+    middle = 0.5 * (bundle.T_map_place[0, :2, 3] + bundle.T_map_place[1, :2, 3])
+    np.testing.assert_allclose(found.T_map_place[scans, :2, 3], middle, atol=1e-6)
+    assert found.cloud is not None
+    np.testing.assert_array_equal(found.cloud.surfels["points"], bundle.cloud.surfels["points"])
+
+
+def test_a_scan_that_is_held_out_takes_no_part_in_the_map_to_check(
+    small_dataset, encoder_file, calibration_file, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(site_check, "_EACH", 4)
+    monkeypatch.setattr(site_check, "FEWEST", 2)
+    checked = []
+
+    def noted(content, held, *_):
+        checked.append((content.T_map_place[:, :2, 3], [scan.T_map_level[:2, 3] for scan in held]))
+        return Site(offset=0.0, queries=len(held), right=0, expected_calibration_error=0.0)
+
+    monkeypatch.setattr(build, "site_of", noted)
+    settings = replace(SETTINGS, calibration=calibration_file, between_m=3.0)
+    build_map(small_dataset, encoder_file, tmp_path / "m", settings, threads=1)
+    ((places_xy, held_xy),) = checked
+    for xy in held_xy:  # scans are 5 m apart; those between them 2.5 m
+        assert np.hypot(*(places_xy - xy).T).min() > 4.0
+
+
+def test_a_killed_build_continues_with_places_between_chunks(small_dataset, encoder_file, tmp_path, monkeypatch):
+    """A chunk of three scans ends in the middle of a gap. The next chunk puts the places there."""
+    settings = replace(SETTINGS, between_m=3.0)
+    build_map(small_dataset, encoder_file, tmp_path / "whole", settings, threads=1)
+    monkeypatch.setattr(work, "CHUNK", 3)
+    build_map(small_dataset, encoder_file, tmp_path / "chunks", settings, threads=1)
+    whole, chunks = MapBundle.open(tmp_path / "whole"), MapBundle.open(tmp_path / "chunks")
+    np.testing.assert_array_equal(chunks.T_map_place, whole.T_map_place)
+    views = np.arange(len(whole.views))
+    np.testing.assert_array_equal(chunks.view_index.vectors(views), whole.view_index.vectors(views))
+
+
 def test_a_calibration_that_is_missing_or_none_stops_the_build_before_any_place(small_dataset, encoder_file, tmp_path):
     told = []
     (tmp_path / "none.json").write_text("{}")
     for name, error, message in (
-        ("missing.json", DatasetError, "missing.json cannot be read .*make it with streetfix calibrate"),
-        ("none.json", BundleError, "it does not say whether the map is calibrated"),
+        ("missing.json", DatasetError, "missing.json cannot be read .*create it with streetfix calibrate"),
+        ("none.json", BundleError, "the field calibrated is missing or not a boolean"),
     ):
         settings = replace(SETTINGS, calibration=tmp_path / name)
         with pytest.raises(error, match=message):

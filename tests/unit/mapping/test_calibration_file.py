@@ -37,14 +37,16 @@ def test_a_calibration_that_does_not_say_whose_it_is_is_none(calibration_file_of
 def test_a_file_that_cannot_be_read_is_refused_with_what_makes_one(tmp_path, make):
     if make:
         (tmp_path / "c.json").mkdir()
-    with pytest.raises(DatasetError, match=r"c\.json cannot be read \(.*\); make it with streetfix calibrate") as error:
+    with pytest.raises(
+        DatasetError, match=r"c\.json cannot be read \(.*\); create it with streetfix calibrate"
+    ) as error:
         calibration_for(tmp_path / "c.json", OWN)
     assert error.value.field == "calibration"
 
 
 def test_a_file_that_is_no_calibration_is_refused(tmp_path):
     (tmp_path / "c.json").write_text("{")
-    with pytest.raises(BundleError, match=r"c\.json: it is no JSON"):
+    with pytest.raises(BundleError, match=r"c\.json: not valid JSON"):
         calibration_for(tmp_path / "c.json", OWN)
 
 

@@ -63,7 +63,7 @@ def test_info_as_a_person_asks_it(run, small_map):
     code, out, _ = run("info", small_map)
     assert code == 0
     assert out.startswith("map small, version ")
-    assert "sums kept" in out
+    assert "voxel sums stored" in out
     code, out, _ = run("info", small_map, "--json")
     assert json.loads(out)["name"] == "small"
 
@@ -71,7 +71,7 @@ def test_info_as_a_person_asks_it(run, small_map):
 def test_info_of_what_is_no_bundle_is_refused(run, tmp_path):
     code, _, err = run("info", tmp_path)
     assert code == 1
-    assert "there is no readable manifest" in err
+    assert "not a map bundle: manifest.json is missing" in err
 
 
 def test_a_whole_bundle_is_whole(run, small_map, bundle_path):
@@ -90,8 +90,8 @@ def test_every_damaged_file_is_named(run, own):
     code, out, _ = run("verify", own)
     assert code == 1
     assert out.splitlines() == [
-        f"{own}/cloud/surfels.npy: its content is not what the manifest says",
-        f"{own}/streets.geojson: it is missing, or lies outside the bundle",
+        f"{own}/cloud/surfels.npy: its hash differs from the manifest",
+        f"{own}/streets.geojson: the file is missing, or is outside the bundle",
         f"{own}/views.npy: it has {(own / 'views.npy').stat().st_size} bytes instead of {(own / 'views.npy').stat().st_size + 1}",
     ]
 
@@ -99,7 +99,7 @@ def test_every_damaged_file_is_named(run, own):
 def test_what_is_no_bundle_is_one_defect(run, tmp_path):
     code, out, _ = run("verify", tmp_path)
     assert code == 1
-    assert "there is no readable manifest" in out
+    assert "not a map bundle: manifest.json is missing" in out
 
 
 def test_a_manifest_of_another_format_is_named(own):
@@ -111,10 +111,10 @@ def test_a_manifest_of_another_format_is_named(own):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: {"descriptors": 2 * c.descriptors}, r"views\.faiss: \d+ descriptors are no unit vectors"),
-        (lambda c: {"T_map_place": c.T_map_place * SKEWED}, r"places\.npy: 12 poses are no rigid transforms"),
+        (lambda c: {"descriptors": 2 * c.descriptors}, r"views\.faiss: \d+ descriptors are not unit vectors"),
+        (lambda c: {"T_map_place": c.T_map_place * SKEWED}, r"places\.npy: 12 poses are not rigid transforms"),
         (lambda _: {"place_street": np.array([2] * 6 + [1, 1, 2, 2, 2, 2], np.int32)},
-         r"places\.npy: 6 places lie outside of the streets they name"),
+         r"places\.npy: 6 places are outside the streets that they name"),
         (lambda _: {"statistics": np.zeros(3)}, r"voxels\.npy: it holds float64"),
     ],
 )  # fmt: skip
@@ -240,5 +240,5 @@ def test_a_map_that_does_not_say_its_voxels_is_refused(content, tmp_path):
     from model_training.mapping.stored_map import voxels_of
 
     write_bundle(tmp_path / "m", replace(content, parameters={"lidar_height_m": 1.8}))
-    with pytest.raises(BundleError, match="its parameters lack voxel_m"):
+    with pytest.raises(BundleError, match="its parameters have no voxel_m"):
         voxels_of(MapBundle.open(tmp_path / "m"))

@@ -7,7 +7,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from model_training.mapping import stored_map
-from model_training.mapping.join import joined, joined_calibration, joined_streets, require_same, standing_apart
+from model_training.mapping.join import (
+    joined,
+    joined_calibration,
+    joined_streets,
+    of_places,
+    require_same,
+    standing_apart,
+)
 from model_training.mapping.merge import merge_maps
 from model_training.mapping.stored_map import content_of, voxels_of
 from model_training.mapping.verify import damage_of
@@ -48,6 +55,19 @@ def test_a_merged_map_has_the_places_of_one_built_at_once(merged, whole):
     np.testing.assert_allclose(merged.view_heading_rad, whole.view_heading_rad, atol=1e-9)
     views = np.arange(len(whole.views))
     np.testing.assert_allclose(merged.view_index.vectors(views), whole.view_index.vectors(views), atol=1e-6)
+
+
+def test_some_places_of_a_map_keep_their_views_and_get_new_numbers(whole):
+    content = content_of(whole)
+    count = len(content.T_map_place)
+    kept = [place for place in range(count) if place not in (0, 3)]
+    found = of_places(content, np.isin(np.arange(count), kept))
+    np.testing.assert_array_equal(found.T_map_place, content.T_map_place[kept])
+    np.testing.assert_array_equal(found.place_street, content.place_street[kept])
+    views = [content.headings * place + k for place in kept for k in range(content.headings)]
+    np.testing.assert_array_equal(found.descriptors, content.descriptors[views])
+    np.testing.assert_array_equal(found.view_heading_rad, content.view_heading_rad[views])
+    np.testing.assert_array_equal(found.view_place, np.repeat(np.arange(count - 2), content.headings))
 
 
 def test_the_ground_under_each_place_stays_where_it_was(merged, whole):
@@ -151,7 +171,7 @@ def test_another_encoder_is_refused_before_anything_is_written(half_maps, halves
 
 
 def test_what_is_no_bundle_is_refused(half_maps, tmp_path):
-    with pytest.raises(BundleError, match="there is no readable manifest"):
+    with pytest.raises(BundleError, match="not a map bundle: manifest.json is missing"):
         merge_maps(half_maps[0], tmp_path, tmp_path / "m")
 
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from model_training.mapping import passes
-from model_training.mapping.passes import MOST, Passes, Targets, looked_through, moved, tile_of
+from model_training.mapping import passes, work
+from model_training.mapping.passes import MOST, Passes, Targets, Vote, looked_through, tile_of
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.voxel_map import VoxelMap
 from model_training.mapping.work import Work
@@ -49,6 +49,12 @@ def scan_of(T, *, car, van=None):
     return np.c_[ray[seen] * ranges[seen, None], np.zeros(seen.sum())].astype(np.float32)
 
 
+def moved(cloud, dataset, poses, folder, *, earlier=None, each_scan=False):
+    """Keys of the voxels that a vote of all scans removes, in chunks that are stored in a folder."""
+    vote = Vote.of(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, each_scan=each_scan)
+    return vote.removed(Work(folder, "k").chunks("votes", len(poses), vote.votes), earlier)
+
+
 def voted(tmp_path, *, cars, earlier=None):
     """The street driven once for each flag of ``cars``; the cloud before and after the vote."""
     poses = drive(len(cars))
@@ -59,7 +65,7 @@ def voted(tmp_path, *, cars, earlier=None):
         points = dataset.scan(number)[:, :3].astype(np.float64)
         cloud.add(transform_points(T, points[np.linalg.norm(points, axis=1) < 40.0]))
     known = None if earlier is None else cloud.keys_of(earlier)
-    gone = moved(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, Work(tmp_path, "k"), earlier=known)
+    gone = moved(cloud, dataset, poses, tmp_path, earlier=known)
     before = cloud.means()
     removed = np.isin(cloud.sums()[0], gone)
     return before, removed
@@ -117,7 +123,7 @@ def test_traffic_of_a_single_pass_vanishes_and_all_that_stands_stays(tmp_path):
     for number, T in enumerate(poses):
         points = dataset.scan(number)[:, :3].astype(np.float64)
         cloud.add(transform_points(T, points[np.linalg.norm(points, axis=1) < 40.0]))
-    gone = moved(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, Work(tmp_path, "k"), each_scan=True)
+    gone = moved(cloud, dataset, poses, tmp_path, each_scan=True)
     points, removed = cloud.means(), np.isin(cloud.sums()[0], gone)
     lane = (points[:, 1] < -1.8) & (points[:, 1] > -4.2) & (points[:, 2] > 0.5)
     seen_later = lane & (points[:, 0] > 12.0) & (points[:, 0] < 38.0)  # where the last van stands nobody looked later
@@ -146,8 +152,7 @@ def test_two_new_passes_overrule_what_the_map_had(tmp_path_factory):
         earlier = cloud.sums()[0].copy()
         for number, T in enumerate(poses):
             cloud.add(transform_points(T, dataset.scan(number)[:, :3].astype(np.float64)))
-        work = Work(tmp_path_factory.mktemp("work"), "k")
-        gone = moved(cloud, dataset, poses, np.arange(len(poses)), SETTINGS, work, earlier=earlier)
+        gone = moved(cloud, dataset, poses, tmp_path_factory.mktemp("work"), earlier=earlier)
         above = cloud.means()[np.isin(cloud.sums()[0], earlier)][:, 2] > 0.35
         found = np.isin(cloud.sums()[0][np.isin(cloud.sums()[0], earlier)], gone)[above].mean()
         assert found >= share
@@ -155,7 +160,7 @@ def test_two_new_passes_overrule_what_the_map_had(tmp_path_factory):
 
 
 def test_the_votes_of_finished_scans_are_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(passes, "CHUNK", 10)
+    monkeypatch.setattr(work, "CHUNK", 10)
     first = voted(tmp_path, cars=[True, False, False])[1]
     monkeypatch.setattr(passes, "looked_through", lambda *_: pytest.fail("it was finished"))
     np.testing.assert_array_equal(voted(tmp_path, cars=[True, False, False])[1], first)

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model_training.mapping import site_check
+from model_training.mapping.join import of_places
 from model_training.mapping.site_check import FEWEST, MOST, HeldScan, held_out, site_of
 from service.confidence.features import FEATURES
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_z, transform_from
@@ -65,19 +66,18 @@ def test_the_offset_is_where_errors_and_prior_balance(odds_of, bits):
     assert float((probability(odds_of + found) - right).sum()) + found == pytest.approx(0, abs=1e-6)
 
 
-def test_without_some_places_their_views_are_gone_and_the_others_are_renumbered(content):
-    left = site_check._without(content, {0, 7})
-    kept = [1, 2, 3, 4, 5, 6, 8, 9, 10, 11]
-    np.testing.assert_array_equal(left.T_map_place, content.T_map_place[kept])
-    np.testing.assert_array_equal(left.place_street, content.place_street[kept])
-    views = [4 * place + k for place in kept for k in range(4)]
-    np.testing.assert_array_equal(left.descriptors, content.descriptors[views])
-    np.testing.assert_array_equal(left.view_heading_rad, content.view_heading_rad[views])
-    np.testing.assert_array_equal(left.view_place, np.repeat(np.arange(10), 4))
-    assert left.calibration["calibrated"] is False
-    assert left.cloud is not None
-    assert left.cloud.surfels is content.cloud.surfels
-    assert len(content.T_map_place) == 12
+def test_a_map_to_check_has_neither_calibration_nor_brightness_nor_preview(content):
+    """The images are rendered from the same sensor's intensities. They would agree with the map as no camera's do."""
+    cloud = SurfelMap.prepare(np.zeros(3), np.zeros(4, SURFEL), np.zeros((0, 4)), np.ones(4, np.float32))
+    given = replace(content, cloud=cloud, preview_webp=b"x", calibration={"calibrated": True})
+    found = site_check._to_check(given)
+    assert found.calibration["calibrated"] is False
+    assert found.preview_webp == b""
+    assert found.cloud is not None
+    assert found.cloud.brightness is None
+    assert found.cloud.surfels is cloud.surfels
+    assert given.cloud is not None
+    assert given.cloud.brightness is not None
 
 
 def sphere(radius_m, *, intensity=40.0):
@@ -94,18 +94,8 @@ def noiseless(monkeypatch):
 
 
 def drawn(points, number, T_map_level=None):
-    scan = HeldScan(0, points, np.eye(4) if T_map_level is None else T_map_level)
+    scan = HeldScan(points, np.eye(4) if T_map_level is None else T_map_level)
     return site_check._drawn(scan, GRID, number)
-
-
-def test_the_maps_brightness_is_not_asked(content):
-    """The pictures are drawn of the same sensor's intensities: they would agree as no camera's do."""
-    cloud = SurfelMap.prepare(np.zeros(3), np.zeros(4, SURFEL), np.zeros((0, 4)), np.ones(4, np.float32))
-    lit = replace(content, cloud=cloud)
-    left = site_check._without(lit, {1}).cloud
-    assert left is not None
-    assert left.brightness is None
-    assert lit.cloud.brightness is not None
 
 
 @pytest.mark.parametrize("number", range(4))
@@ -191,7 +181,7 @@ def scan_of_pictures(pictures):
     _, depth_m, camera = pictures
     points = (camera.rays_of_pixels() * depth_m[..., None]).reshape(-1, 3) @ R_BODY_OPTICAL.T
     scan = np.c_[points, np.full(len(points), 30.0)].astype(np.float32)
-    return HeldScan(8, scan, transform_from(rotation_z(np.pi / 2), np.array([20.0, 100.0, 1.7])))
+    return HeldScan(scan, transform_from(rotation_z(np.pi / 2), np.array([20.0, 100.0, 1.7])))
 
 
 def asked(content, calibration, scan, *, right, bias, count=30, monkeypatch):
@@ -246,7 +236,8 @@ def test_a_real_map_is_asked_without_what_was_held_out(content, calibrated_at, s
     """The tiny map, its true place held out: what is asked is the rest, where the pictures resemble nothing."""
     told = []
     calibration = calibrated_at(right=np.log(3))
-    found = site_of(content, [scan_of_pictures], calibration, lambda *event: told.append(event))
+    rest = of_places(content, np.arange(len(content.T_map_place)) != 8)
+    found = site_of(rest, [scan_of_pictures], calibration, lambda *event: told.append(event))
     assert told == [("site check", 1, 1)]
     assert found.queries == 1
     assert found.offset <= 0

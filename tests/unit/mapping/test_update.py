@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping import places, update
+from model_training.mapping import work
 from model_training.mapping.area import CELL_M, covered_by, polygon_of
-from model_training.mapping.passes import moved
+from model_training.mapping.stages import ResumedStages
 from model_training.mapping.stored_map import voxels_of
 from model_training.mapping.update import update_map
 from model_training.mapping.verify import damage_of
@@ -221,7 +221,7 @@ def test_a_name_that_is_taken_is_refused(small_map, small_dataset, tmp_path):
 
 
 def test_what_is_no_bundle_is_refused(small_dataset, tmp_path):
-    with pytest.raises(BundleError, match="there is no readable manifest"):
+    with pytest.raises(BundleError, match="not a map bundle: manifest.json is missing"):
         update_map(tmp_path, small_dataset, tmp_path / "m", threads=1)
 
 
@@ -239,7 +239,7 @@ def test_a_street_that_contradicts_the_maps_is_refused_before_the_work(small_map
 
 
 def test_a_killed_update_goes_on_to_the_same_version(half_maps, halves, extended, tmp_path, monkeypatch):
-    monkeypatch.setattr(places, "CHUNK", 2)
+    monkeypatch.setattr(work, "CHUNK", 2)
 
     def report(_stage, done, _total):
         if done == 4:
@@ -278,15 +278,16 @@ def test_a_drive_too_far_from_the_map_is_refused(half_maps, halves, tmp_path, mo
 def test_a_drive_is_cleared_of_traffic_if_the_maps_was(halves, map_of, tmp_path, monkeypatch):
     """And where the map was built without, the update is, too; what is said of the map holds of all of its drives."""
     asked = []
-    real = moved
+    real = ResumedStages.dynamic_voxels
 
-    def listening(*args, each_scan=False, **more):
+    def listening(*args, each_scan, **more):
         asked.append(each_scan)
         return real(*args, each_scan=each_scan, **more)
 
-    monkeypatch.setattr(update, "moved", listening)
-    for voted in (True, False):
-        made = update_map(map_of(halves[0], traffic_vote=voted), halves[1], tmp_path / f"m{voted}", threads=1)
+    maps = {voted: map_of(halves[0], traffic_vote=voted) for voted in (True, False)}
+    monkeypatch.setattr(ResumedStages, "dynamic_voxels", listening)
+    for voted, old in maps.items():
+        made = update_map(old, halves[1], tmp_path / f"m{voted}", threads=1)
         assert asked == [True] * voted
         assert made.parameters.get("traffic_vote") == (1.0 if voted else None)
         asked.clear()

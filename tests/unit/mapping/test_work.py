@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping import build, places, work
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping import build, work
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import thinned
 from model_training.mapping.work import key_of, work_beside, work_folder
 from service.errors import BundleError, DatasetError
 from service.maps.reader import MapBundle
@@ -34,7 +36,7 @@ def files_of(folder):
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    monkeypatch.setattr(places, "CHUNK", 3)
+    monkeypatch.setattr(work, "CHUNK", 3)
 
 
 @pytest.fixture
@@ -61,8 +63,9 @@ def test_a_killed_build_ends_with_the_same_bytes(place, small_dataset, encoder_f
     build_map(small_dataset, encoder_file, out, SETTINGS, threads=1, report=lambda *event: told.append(event))
     assert files_of(out) == undisturbed
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
-    finished = (place - 1) // 3 * 3  # chunks of three: what is finished is not looked at again
-    assert told[0][1] == finished + 1
+    finished = (place - 1) // 3 * 3  # chunks of three: only the end of a finished one is reported
+    ends = list(range(3, finished + 1, 3))
+    assert [done for _, done, _ in told][: len(ends) + 1] == [*ends, finished + 1]
 
 
 def test_a_build_killed_again_and_again_ends_with_the_same_bytes(small_dataset, encoder_file, undisturbed, tmp_path):
@@ -86,10 +89,11 @@ def test_a_build_killed_while_it_writes_leaves_no_bundle_and_goes_on(
     told = []
     build_map(small_dataset, encoder_file, out, SETTINGS, threads=1, report=lambda *event: told.append(event))
     assert files_of(out) == undisturbed
-    count = len(MapBundle.open(out).T_map_place)  # the votes were kept: only their end is told
+    count = len(thinned(small_dataset.survey_poses(), SETTINGS.spacing_m))
+    ends = [*range(3, count, 3), count]  # all parts were kept: only their ends are reported
     assert [event for event in told if event[0] != "writing"] == [
-        ("traffic", count, count)
-    ]  # nothing was looked at again
+        (stage, done, count) for stage in ("places", "traffic") for done in ends
+    ]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["small", "undisturbed"]
 
 
@@ -212,7 +216,10 @@ def test_a_build_that_is_refused_at_once_leaves_nothing(small_dataset, encoder_f
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(BundleError, match="the build's work cannot be kept"), work_beside(tmp_path / "file" / "m", "k"):
+    with (
+        pytest.raises(BundleError, match="the intermediate results of the build cannot be stored"),
+        work_beside(tmp_path / "file" / "m", "k"),
+    ):
         pass
 
 
