@@ -148,20 +148,20 @@ def trained_there_rows(report: Report, work: Path, encoder: Path) -> None:
 def main() -> None:
     """Parse the arguments, run the parts and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--work", type=Path, default=ROOT / "data" / "evaluate", help="where datasets and maps are kept"
-    )
-    parser.add_argument("--encoder", type=Path, default=ENCODER)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate", help="folder of datasets and maps")
+    parser.add_argument("--encoder", type=Path, default=ENCODER, help="encoder; default: the stock encoder")
     parser.add_argument(
         "--paper-encoder",
         type=Path,
         default=ROOT / "runs" / "paper" / "encoder.onnx",
-        help="one trained on the paper's city",
+        help="encoder trained on the paper's city",
     )
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="real recordings")
-    parser.add_argument("--note", help="what a reader of the report must know about this run")
     parser.add_argument(
-        "--only", help="these parts alone, by commas; the rows of the others stay, each with the run that made it"
+        "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the real recordings"
+    )
+    parser.add_argument("--note", help="remark on this run for readers of the report")
+    parser.add_argument(
+        "--only", help="parts to run, separated by commas; the rows of the others stay, each with the run that made it"
     )
     arguments = parser.parse_args()
     told = "" if arguments.only is None else f' ARGS="--only {arguments.only}"'
@@ -188,7 +188,7 @@ def main() -> None:
     }
     wanted = list(parts) if arguments.only is None else arguments.only.split(",")
     if unknown := sorted(set(wanted) - set(parts)):
-        parser.error(f"--only: there is no part {unknown[0]!r}; there are: {', '.join(parts)}")
+        parser.error(f"--only: unknown part {unknown[0]!r}; choose from: {', '.join(parts)}")
     if arguments.only is not None:
         report.keep_others()
     if arguments.note or arguments.only is not None:  # an earlier note does not describe this run

@@ -7,7 +7,7 @@ from benchmarks.plans import SEQUENCE, hard_plan, lidar_16_plan, unseen_plan
 from benchmarks.report import Report
 from benchmarks.runs import Runs, accepted_within, share
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.build import BuildSettings
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.hard import HARD, WEATHER_AND_LIGHT
 from service.maps.reader import MapBundle
 

@@ -44,7 +44,7 @@ class Decision:
 
 
 def read_decision(path: Path) -> Decision:
-    """Read the head of a decision.
+    """Read the head of a decision, and check that it says when to reopen it.
 
     Args:
         path: of the file.
@@ -52,14 +52,17 @@ def read_decision(path: Path) -> Decision:
     Raises:
         ValueError: the file does not have the form that ``docs/contributing.md`` gives.
     """
-    found = _FORM.match(path.read_text())
+    text = path.read_text()
+    found = _FORM.match(text)
     if found is None:
-        raise ValueError(f"{path.name}: the head is not that of docs/contributing.md, section Decisions")
+        raise ValueError(f"{path.name}: the head does not follow docs/contributing.md, section Decisions")
+    if re.search(r"^## Reopen if\n+\S", text, re.MULTILINE) is None:
+        raise ValueError(f"{path.name}: the section 'Reopen if' is missing or empty; say what would change the answer")
     head = {name: " ".join(text.split()) for name, text in found.groupdict().items()}
     if not path.name.startswith(f"{head['number']}-"):
         raise ValueError(f"{path.name}: the title has number {head['number']}; use the number of the file's name")
     if head["topic"] not in TOPICS:
-        raise ValueError(f"{path.name}: topic {head['topic']!r} is none of {', '.join(TOPICS)}")
+        raise ValueError(f"{path.name}: topic {head['topic']!r} is not one of {', '.join(TOPICS)}")
     if _STATUS.fullmatch(head["status"]) is None:
         raise ValueError(f"{path.name}: status {head['status']!r} is not 'in use', 'rejected' or 'replaced by NNNN'")
     return Decision(path.name, **head)
@@ -78,7 +81,7 @@ def decisions(folder: Path = FOLDER) -> list[Decision]:
     numbers = [decision.number for decision in found]
     for decision in found:
         if numbers.count(decision.number) > 1:
-            raise ValueError(f"{decision.file}: the number {decision.number} occurs twice; take the next free one")
+            raise ValueError(f"{decision.file}: the number {decision.number} occurs twice; use the next free one")
         other = decision.status.removeprefix("replaced by ")
         if other.isdigit() and other not in numbers:
             raise ValueError(f"{decision.file}: status names decision {other}, which does not exist")

@@ -13,7 +13,7 @@ from benchmarks.runs import Runs
 from model_training.calibration.fit import expected_calibration_error
 from model_training.datasets.without_streets import WithoutStreets
 from model_training.evaluation.predict import Predictions, joined
-from model_training.mapping.build import BuildSettings
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.conditions import CONDITIONS
 from model_training.simulation.depth_noise import DEPTHS, measured_depth
 from model_training.simulation.hard import HARD

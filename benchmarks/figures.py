@@ -27,11 +27,11 @@ def stock_calibration() -> Calibration:
     """Return the calibration of the stock encoder.
 
     Raises:
-        ValueError: the stock encoder is not calibrated.
+        ValueError: the stock encoder has no calibration.
     """
     calibration = read_calibration(CALIBRATION.read_bytes(), path=str(CALIBRATION))
     if calibration is None:
-        raise ValueError(f"{CALIBRATION}: the stock encoder is not calibrated")
+        raise ValueError(f"{CALIBRATION}: the stock encoder has no calibration")
     return calibration
 
 
@@ -65,15 +65,15 @@ def figure(source: str, name: str, form: str) -> str:
     """
     if source == "code":
         if name not in CODE:
-            raise ValueError(f"figure: {name}: no such figure of the code; there are {', '.join(CODE)}")
+            raise ValueError(f"figure: {name}: unknown figure; choose one of: {', '.join(CODE)}")
         value: float | None = CODE[name]()
     else:
         path = REPORTS / f"{source}.json"
         if not path.exists():
-            raise ValueError(f"figure: {source}: there is no such report; take one of reports/*.json, or code")
+            raise ValueError(f"figure: {source}: report not found; use one of reports/*.json, or code")
         values = {row["id"]: row["value"] for row in json.loads(path.read_text())["rows"]}
         if (value := values.get(name)) is None:
-            raise ValueError(f"figure: {source} {name}: the report has no such row, or no value in it")
+            raise ValueError(f"figure: {source} {name}: the report has no such row, or the row has no value")
     shown = format(value, form)
     return shown.replace("%", " %") if form.endswith("%") else shown
 

@@ -12,7 +12,7 @@ from benchmarks.report import Report
 from benchmarks.runs import Runs
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.importing.kitti_object import import_kitti_object
-from model_training.mapping.build import BuildSettings
+from model_training.mapping.settings import BuildSettings
 from service.geometry.rigid import rotation_z, transform_from, transform_points
 from service.imaging.level import level_camera
 from service.localization.refine import RefineSettings, settings_for_rig
@@ -56,7 +56,7 @@ def kitti_registration_rows(report: Report, runs: Runs, data: Path) -> None:
     settings = BuildSettings(name="kitti", expected_lidar_height_m=1.73)
     cloud = runs.bundle(dataset, settings).cloud
     if cloud is None:
-        raise RuntimeError(f"{dataset.folder}: its scans make no surface")
+        raise RuntimeError(f"{dataset.folder}: its scans do not form a surface")
     errors, own_ms = registration_errors(cloud, dataset)
     found = {"median_m": np.median(errors), "p95_m": np.percentile(errors, 95), "within_1_m": (errors <= 1.0).mean()}
     for key, value in found.items():

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.raw_range import similarities
 from model_training.importing.kitti_object import import_kitti_object
-from model_training.mapping.build import BuildSettings, fan, levelled_scans
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import fan, levelled_scans
 from service.geometry.camera import PinholeCamera
 from service.imaging.query_view import query_view
 from service.imaging.view_grid import Planes, ViewGrid, panorama_from_points, survey_planes, view_from_panorama
@@ -82,7 +83,7 @@ def _gallery(dataset: Dataset, drive: Path, grid: ViewGrid, rows: NDArray[np.boo
     scans = list(levelled_scans(dataset, np.arange(count), settings))
     full = sorted(drive.glob("*/*/velodyne_points/data/*.bin")) or sorted(drive.glob("**/velodyne_points/data/*.bin"))
     if not full:
-        raise FileNotFoundError(f"{drive} holds no velodyne scans")
+        raise FileNotFoundError(f"{drive} has no velodyne scans")
     scans += list(levelled_scans(_Scans(full), np.arange(len(full)), settings))  # type: ignore[arg-type]  # it only calls scan()
     planes, place = [], []
     for number, scan in enumerate(scans):

@@ -48,7 +48,9 @@ DEMO = "demo --once --streets 3 --queries 8 --port 0 --out demo"
 def main() -> None:
     """Make missing prerequisites in the work folder, then draw."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "pictures")
+    parser.add_argument(
+        "--work", type=Path, default=ROOT / "out" / "pictures", help="folder of datasets, maps and runs"
+    )
     work: Path = parser.parse_args().work
     work.mkdir(parents=True, exist_ok=True)
     OUT.mkdir(parents=True, exist_ok=True)

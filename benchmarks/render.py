@@ -33,7 +33,7 @@ def main() -> None:
     (REPORTS / "README.md").write_text("\n".join(lines))
     decisions.write_index()
     for page in write_figures():
-        print(f"figures written anew: {page.relative_to(ROOT)}")
+        print(f"figures updated: {page.relative_to(ROOT)}")
 
 
 def _section(name: str, report: dict[str, Any]) -> list[str]:

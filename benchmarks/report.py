@@ -46,6 +46,7 @@ class Report:
     _dirty: bool | None = field(default_factory=is_dirty)
     _date: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     _made_by: Run | None = None  # run of rows that are added now; None is this run
+    _if_new: set[str] = field(default_factory=set)  # ids of rows that replace no value of an earlier run
     _runs: dict[str, Run | None] = field(default_factory=dict)  # value of ``_made_by`` by row
 
     def row(
@@ -92,6 +93,17 @@ class Report:
         shown = "-" if value is None else f"{value:.4f}"
         print(f"{row_id:62} {shown:>10} {unit:8}{'' if bar is None else f' bar {bar}'}{mark}", flush=True)
 
+    def absent(self, row_id: str, unit: str, why: str) -> None:
+        """Add a row without a value, unless the file already has a value of another run.
+
+        Args:
+            row_id: id of the row.
+            unit: unit of the figure.
+            why: why this run cannot measure it.
+        """
+        self.row(row_id, None, unit, why=why)
+        self._if_new.add(row_id)
+
     def share(
         self,
         row_id: str,
@@ -109,7 +121,7 @@ class Report:
             better: whether higher or lower values are better.
         """
         if not len(right):
-            self.row(row_id, None, "share", bar=bar, better=better, why="no query of this kind")
+            self.row(row_id, None, "share", bar=bar, better=better, why="no query of this type")
             return
         interval = list(wilson_interval(int(right.sum()), len(right)))
         self.row(row_id, float(right.mean()), "share", bar=bar, better=better, n=len(right), ci95=interval)
@@ -147,6 +159,8 @@ class Report:
         keys = {run: add_run(runs, run) for run in dict.fromkeys(self._runs[row["id"]] or this for row in self.rows)}
         rows = {row["id"]: row for row in last["rows"]}
         for row in self.rows:
+            if row["id"] in self._if_new and rows.get(row["id"], {}).get("value") is not None:
+                continue
             run = keys[self._runs[row["id"]] or this]
             rows[row["id"]] = {"id": row["id"], "run": run} | row
         notes = {name: note for name, note in (last.get("notes", {}) | self.notes).items() if note is not None}

@@ -20,7 +20,8 @@ from model_training.evaluation.error_measures import wilson_interval
 from model_training.evaluation.measures import measure, recall_at
 from model_training.evaluation.predict import Predictions, PriorOf, SeenBy, joined, predict
 from model_training.evaluation.raw_range import raw_best_views
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import SimulationPlan
 from model_training.simulation.simulate import simulate
 from model_training.stock import CALIBRATION

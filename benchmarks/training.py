@@ -162,13 +162,13 @@ def walls(report: Report, names: Iterable[str] = WALLS) -> None:
 def main() -> None:
     """Parse the arguments, measure and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "bench")
-    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "bench", help="folder of data and runs")
+    parser.add_argument("--steps", type=int, default=60, help="optimiser steps to measure")
     part = parser.add_mutually_exclusive_group()
     part.add_argument(
-        "--no-walls", action="store_true", help="leave out the demo and the tests, the longest part; their rows stay"
+        "--no-walls", action="store_true", help="leave out the demo and the tests, which take longest; their rows stay"
     )
-    part.add_argument("--only", choices=WALLS, help="this alone, on a fresh clone; the other rows stay")
+    part.add_argument("--only", choices=WALLS, help="measure only this, on a fresh clone; the other rows stay")
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     told = "--no-walls" if arguments.no_walls else f"--only {arguments.only}" if arguments.only else ""

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from benchmarks.report import Report
 from benchmarks.runs import Runs, share
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.build import BuildSettings
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.training.recipe import EVALUATION_SEEDS
 from service.imaging.weather import remove_weather_noise

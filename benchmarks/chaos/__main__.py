@@ -28,18 +28,18 @@ STEPS = 1000
 def main() -> None:
     """Parse the arguments, do the steps and write the report; exit with 1 if anything was wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--workers", type=int, default=3)
-    parser.add_argument("--stop", action="store_true", help="at the first wrong, lost or differing answer")
-    parser.add_argument("--no-report", action="store_true", help="leave reports/serving.json as it is")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the steps")
+    parser.add_argument("--steps", type=int, default=STEPS, help="number of steps")
+    parser.add_argument("--workers", type=int, default=3, help="worker processes of the service")
+    parser.add_argument("--stop", action="store_true", help="stop at the first wrong, lost or differing answer")
+    parser.add_argument("--no-report", action="store_true", help="do not change reports/serving.json")
     parser.add_argument(
-        "--log", type=Path, default=ROOT / "out" / "chaos.log", help="what is done and what the service logs"
+        "--log", type=Path, default=ROOT / "out" / "chaos.log", help="file for the actions and the log of the service"
     )
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate")
-    parser.add_argument("--map", type=Path, help="another bundle than the paper's city, with --dataset")
-    parser.add_argument("--dataset", type=Path)
-    parser.add_argument("--queries", default=QUERIES)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate", help="folder of datasets and maps")
+    parser.add_argument("--map", type=Path, help="map bundle instead of the paper's city; needs --dataset")
+    parser.add_argument("--dataset", type=Path, help="dataset with the queries for --map")
+    parser.add_argument("--queries", default=QUERIES, help="query set")
     arguments = parser.parse_args()
     site = site_from(arguments)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))

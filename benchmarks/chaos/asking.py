@@ -162,7 +162,7 @@ class Caller:
             at = tuple(pose["position"][axis] for axis in "xyz")
             return _of_answer(answer["map"]["version"], at)
         except (ValueError, KeyError, IndexError, TypeError) as error:
-            return "lost", {"told": f"an answer that is none: {error!r}"}
+            return "lost", {"told": f"not a valid answer: {error!r}"}
 
     def _grpc(self, what: What, key: str) -> tuple[Kind, dict[str, Any]]:
         metadata = (("authorization", f"Bearer {key}"),)
@@ -268,7 +268,7 @@ class Asking:
 
     def _take(self) -> list[Outcome]:
         if self._failed is not None:
-            raise RuntimeError("a thread that asks has failed") from self._failed
+            raise RuntimeError("a thread that sends queries has failed") from self._failed
         with self._lock:
             taken, self._outcomes = self._outcomes, []
         return taken

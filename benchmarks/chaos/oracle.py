@@ -169,9 +169,9 @@ class Oracle:
         strange = [each for each in listed if each not in known]
         newest = max(self.on_disk.values())
         if strange or serving not in listed:
-            return f"it lists {', '.join(sorted(listed))}, and {serving} serves"
+            return f"the list has {', '.join(sorted(listed))}, and {serving} serves"
         if newest.id not in listed:
-            return f"it lists {', '.join(sorted(listed))}, but {newest.id} is on the disk and newer"
+            return f"the list has {', '.join(sorted(listed))}, but {newest.id} is on the disk and newer"
         self.open = sorted((known[each] for each in listed), reverse=True)
         self.serving = known[serving]
         return None

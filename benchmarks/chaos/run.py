@@ -160,7 +160,7 @@ class Chaos:
                     self._step(number, heard)
                     self.findings.steps = number
                     if len(self.findings.wrong) + len(self.findings.disagreements) > before:
-                        self._tell(f"seed {self.findings.seed}, step {number}; what was done last:")
+                        self._tell(f"seed {self.findings.seed}, step {number}; last actions:")
                         for line in self._done:
                             self._tell(f"    {line}")
                         for line in islice(reversed(self._log), 12):
@@ -191,7 +191,7 @@ class Chaos:
             self._oracle.is_unsure = False
         self._done[-1] += f"; {' or '.join(sorted(step.expected.finals))} serves"
         if self._server is not None and self._server.process.poll() is not None:
-            self._wrong(f"the service ended by itself, with {self._server.process.returncode}")
+            self._wrong(f"the service ended unexpectedly, with {self._server.process.returncode}")
             heard()
             return
         self._record(self._done[-1])
@@ -537,7 +537,7 @@ class Chaos:
                 return probes, began
 
     def _not_settled(self, found: list[Outcome], versions: set[str], listed: set[str], expected: Expected) -> None:
-        told = f"{', '.join(sorted(versions)) or 'nothing'} answers, and {' or '.join(sorted(expected.finals))} should"
+        told = f"{', '.join(sorted(versions)) or 'nothing'} answers instead of {' or '.join(sorted(expected.finals))}"
         if len(versions) > 1:
             self._disagree(f"workers do not agree: {told}")
         elif versions - expected.finals:
@@ -559,7 +559,7 @@ class Chaos:
             if each.kind == "refusal":
                 self.findings.refusals[each.told] += 1
                 if each.told == "unauthorized" and each.began_s > settled_s and each.with_key == self._caller.key:
-                    self._disagree(f"a key that holds is refused: {each}")
+                    self._disagree(f"a valid key is refused: {each}")
             elif each.kind == "lost" and not step.excuses(each):
                 self._wrong(str(each))
         for each in answers:
@@ -583,7 +583,7 @@ class Chaos:
     def _ask_with_a_retired_key(self) -> None:
         found = self._caller.ask(self._random.choice(FACES), "maps", key=self._random.choice([*self._retired]))
         if found.kind != "refusal":
-            self._wrong(f"a key that was taken out of the file is not refused: {found}")
+            self._wrong(f"a key that was removed from the file is not refused: {found}")
 
     def _until_keys_hold(self, old: Iterable[str]) -> None:
         """Send requests until every worker accepts the valid keys and refuses the old ones, twice in a row."""
@@ -600,7 +600,7 @@ class Chaos:
             alike = alike + 1 if good else 0
             if not good and time.monotonic() > until:
                 wrong = [str(each) for each, holds in found if holds == (each.kind != "answer")]
-                self._disagree(f"keys of the new file do not hold everywhere: {'; '.join(wrong[:3])}")
+                self._disagree(f"some workers do not accept the keys of the new file: {'; '.join(wrong[:3])}")
                 return
 
     def _learn(self) -> None:
@@ -614,7 +614,9 @@ class Chaos:
         told = self._caller.pair.full.true_m
         at = self._reference["rest", "full"]
         if told is not None and np.linalg.norm(np.subtract(at, told)) > 1.0:
-            raise RuntimeError(f"the known pair is answered with {at}, and was taken at {told}; choose another")
+            raise RuntimeError(
+                f"the answer to the known pair is {at}, but its true position is {told}; choose another pair"
+            )
 
     # The service.
 
@@ -671,7 +673,7 @@ class Chaos:
         except RuntimeError as error:
             if not self._disk.is_full:
                 raise _ServiceError(str(error)) from error
-            self._note("it does not start while the disk is full")
+            self._note("the service does not start while the disk is full")
             self._disk.free(())
             try:
                 self._start()
@@ -711,7 +713,7 @@ class Chaos:
         try:
             self._start()
         except RuntimeError as error:
-            self._wrong(f"it does not start with what lies on the disk: {error}")
+            self._wrong(f"the service does not start with the files on the disk: {error}")
             for name in list(self._shelf.halves):
                 self._shelf.drop_copy(name)
             while self._shelf.damaged:

@@ -116,7 +116,7 @@ class Shelf:
             (part / MANIFEST_FILE).write_bytes(manifest.to_bytes())
             kinds[kind](part)
         except OSError:  # a full disk damages the bundle as well
-            kind = "what a full disk left of it"
+            kind = "incomplete because of a full disk"
         part.rename(self.folder / name)
         self.damaged.append(name)
         return f"{name}: {kind}"

@@ -38,7 +38,7 @@ def axe_rows(report: Report, browser: object, url: str) -> None:
         url: address of the service.
     """
     if not AXE.exists():
-        report.row("console.axe_serious", None, "findings", bar=0, better="lower", why="axe-core is not there: npm ci")
+        report.row("console.axe_serious", None, "findings", bar=0, better="lower", why="axe-core not found: npm ci")
         return
     found: list[str] = []
     for size in (DESKTOP, PHONE):

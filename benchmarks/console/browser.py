@@ -27,11 +27,11 @@ def chromium() -> str | None:
 def why_not() -> str:
     """Return why no browser is available; empty if one is."""
     if chromium() is None:
-        return "there is no chromium: apt-get install chromium"
+        return "chromium not found: apt-get install chromium"
     try:
         import playwright.sync_api  # noqa: F401
     except ImportError:
-        return "there is no playwright: make test-console installs it"
+        return "playwright not found: make test-console installs it"
     return ""
 
 

@@ -79,4 +79,4 @@ def _address(process: "subprocess.Popen[str]") -> str:
     for line in process.stdout or ():
         if found := re.search(r"serving at (http://\S+)", line):
             return found[1]
-    raise RuntimeError(f"the service ended with {process.wait()} and never served")
+    raise RuntimeError(f"the service ended with {process.wait()} before it was ready")

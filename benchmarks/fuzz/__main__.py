@@ -20,8 +20,8 @@ from benchmarks.report import ROOT, Report
 def main() -> None:
     """Parse the arguments, fuzz and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--inputs", type=int, default=1_000_000, help="over all targets")
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "fuzz", help="corpus and crashes")
+    parser.add_argument("--inputs", type=int, default=1_000_000, help="number of inputs over all targets")
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "fuzz", help="folder of corpus and crashes")
     parser.add_argument("--one", nargs=3, metavar=("TARGET", "BUNDLE", "RUNS"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
@@ -71,7 +71,7 @@ def _bundle(folder: Path) -> Path:
 
     spec = spec_from_file_location("tests_conftest", ROOT / "tests" / "conftest.py")
     if spec is None or spec.loader is None:
-        raise RuntimeError("tests/conftest.py is missing: it makes the map that is fuzzed")
+        raise RuntimeError("tests/conftest.py is missing: it creates the map for the fuzzing")
     factory = module_from_spec(spec)
     spec.loader.exec_module(factory)
     write_bundle(folder / "tiny", factory.make_content())

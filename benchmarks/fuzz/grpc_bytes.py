@@ -57,7 +57,7 @@ class GrpcCalls:
         messages = [data[1:]] * (2 if METHODS[number].endswith("Stream") else 1)
         code = _ended(self._calls[number](iter(messages), timeout=_DEADLINE_S))
         if code not in _ANSWERS:
-            raise AssertionError(f"{METHODS[number]} ended in {code}")
+            raise AssertionError(f"{METHODS[number]} ended with {code}")
 
 
 def _ended(call: Iterable[bytes]) -> grpc.StatusCode:

@@ -106,7 +106,7 @@ class Connections:
         protocol.connection_lost(None)
         await _until(lambda: not state.tasks)
         if state.tasks or state.connections:
-            raise AssertionError("its work goes on after the caller has gone")
+            raise AssertionError("the request is still processed after the caller disconnected")
         _require_answers(bytes(wire.written))
 
 

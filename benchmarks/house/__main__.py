@@ -14,7 +14,8 @@ from benchmarks.house.prose import docstrings, pages, prose_of_markdown, reading
 from benchmarks.house.request_path import trace_of_request
 from benchmarks.report import ROOT, Report
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.simulate import simulate
 from model_training.stock import CALIBRATION, ENCODER
@@ -28,7 +29,7 @@ def main() -> None:
         "documents": _document_rows, "docstrings": _docstring_rows, "request": _request_rows, "blocks": _block_rows
     }  # fmt: skip
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.house", description="How readable code and documents are -> reports/house.json",
+        prog="python -m benchmarks.house", description="Measure how readable code and documents are, and write reports/house.json",
         epilog="Example: python -m benchmarks.house --only documents docstrings",
     )  # fmt: skip
     parser.add_argument(

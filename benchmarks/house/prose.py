@@ -66,7 +66,7 @@ def reading_ease(text: str) -> float:
         text: prose whose paragraphs end with a full stop.
 
     Raises:
-        ValueError: the text has no word.
+        ValueError: the text has no words.
     """
     import textstat  # only this report needs it
 

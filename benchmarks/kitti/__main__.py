@@ -26,7 +26,8 @@ from benchmarks.report import ROOT, Report
 from model_training.datasets.dataset import Dataset
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.take import TakeSettings, take
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.odometry.align_poses import usual_poses
 from model_training.stock import ENCODER
 from service.errors import StreetfixError
@@ -46,13 +47,17 @@ def main() -> None:
     """Find the traversals, measure each and write the report."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kitti", description=__doc__)
     parser.add_argument(
-        "--root", type=Path, default=ROOT.parent / "shared" / "data", help="folder above KITTI's drives"
+        "--root", type=Path, default=ROOT.parent / "shared" / "data", help="folder that contains KITTI's drives"
     )
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "kitti", help="where datasets and maps are kept")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="these drives, such as 00 or 2011_09_26_drive_0005")
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "kitti", help="folder of datasets and maps")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", help="drives to measure, such as 00 or 2011_09_26_drive_0005"
+    )
     arguments = parser.parse_args()
     if not arguments.root.is_dir():
-        parser.error(f"--root: there is no folder {arguments.root}; give the one above KITTI's sequences or drives")
+        parser.error(
+            f"--root: folder {arguments.root} not found; give the folder that contains KITTI's sequences or drives"
+        )
     drives = drives_below(arguments.root)
     for line in missing(drives):
         print(f"missing: {line}", flush=True)
@@ -91,7 +96,7 @@ def _mapped(drive: Drive, root: Path, work: Path) -> tuple[Dataset, MapBundle]:
         recording = open_recording(drive.kind, source, OpenSettings(depth="sgbm"))
         trajectory = recording.trajectory()
         if trajectory is None:
-            raise SystemExit(f"{source} has no poses; put poses/{drive.name}.txt beside the sequences")
+            raise SystemExit(f"{source} has no poses; put poses/{drive.name}.txt next to the sequences")
         folder.parent.mkdir(parents=True, exist_ok=True)
         poses, _ = usual_poses(recording, trajectory)
         take(recording, poses, folder, TakeSettings())

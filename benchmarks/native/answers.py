@@ -48,10 +48,10 @@ def told(value: object) -> Iterator[str]:
 def main() -> None:
     """Print one line per answer."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--map", type=Path, required=True)
-    parser.add_argument("--dataset", type=Path, required=True)
-    parser.add_argument("--queries", required=True)
-    parser.add_argument("--count", type=int, required=True)
+    parser.add_argument("--map", type=Path, required=True, help="map bundle")
+    parser.add_argument("--dataset", type=Path, required=True, help="dataset with the queries")
+    parser.add_argument("--queries", required=True, help="query set")
+    parser.add_argument("--count", type=int, required=True, help="number of queries")
     arguments = parser.parse_args()
     bundle = MapBundle.open(arguments.map)
     localizer = Localizer(bundle, Encoder.open(bundle.encoder_bytes(), threads=1))

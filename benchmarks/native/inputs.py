@@ -307,8 +307,8 @@ def rounds(seed: int, count: int) -> None:
 def main() -> None:
     """Parse the arguments and run the rounds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=40, help="inputs for each function")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the inputs")
     arguments = parser.parse_args()
     rounds(arguments.seed, arguments.rounds)
 

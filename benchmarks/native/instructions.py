@@ -79,7 +79,7 @@ def _instructions(library: Path) -> Iterator[capstone.CsInsn]:
                 end = instruction.address + instruction.size
                 yield instruction
             if end - begin != len(code):
-                raise ValueError(f"{library.name}: {section.name} holds no instruction at {end:#x}")
+                raise ValueError(f"{library.name}: {section.name} has no instruction at {end:#x}")
 
 
 def _clones(library: Path) -> list[range]:

@@ -45,10 +45,10 @@ def runtime() -> str:
     """Return the libraries to preload: the runtime of gcc's AddressSanitizer, and that of C++, whose exceptions it intercepts.
 
     Raises:
-        SanitizersMissingError: there is no gcc, or it lacks the sanitizers.
+        SanitizersMissingError: gcc not found, or it lacks the sanitizers.
     """
     if shutil.which("gcc") is None:
-        raise SanitizersMissingError("there is no gcc")
+        raise SanitizersMissingError("gcc not found")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "probe.c"
         source.write_text(_PROBE)

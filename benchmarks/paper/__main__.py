@@ -43,23 +43,27 @@ def kept_results(bench: Bench) -> dict[str, MethodResult]:
 def main() -> None:
     """Parse the arguments, run the methods and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, help="where data and runs are kept: data/paper")
-    parser.add_argument("--out", type=Path, help="folder of the report: reports")
-    parser.add_argument("--frames", type=int, default=Size.frames, help="LiDAR frames")
-    parser.add_argument("--pairs", type=int, default=Size.pairs, help="RGB-D pairs to learn from")
-    parser.add_argument("--test-images", type=int, help="for each split, instead of Table I's 626")
-    parser.add_argument("--budget-minutes", type=float, default=60.0, help="of processor time, for each learned method")
+    parser.add_argument("--work", type=Path, help="folder of data and runs; default: data/paper")
+    parser.add_argument("--out", type=Path, help="folder of the report; default: reports")
+    parser.add_argument("--frames", type=int, default=Size.frames, help="number of LiDAR frames")
+    parser.add_argument("--pairs", type=int, default=Size.pairs, help="number of RGB-D pairs for training")
+    parser.add_argument("--test-images", type=int, help="test images of each split; default: the 626 of Table I")
+    parser.add_argument(
+        "--budget-minutes", type=float, default=60.0, help="processor time for each learned method, minutes"
+    )
     parser.add_argument(
         "--reduced",
         action="store_true",
-        help="a little of everything, in minutes -> out/paper; shows that all runs, no more",
+        help="a small run of everything within minutes, into out/paper; it only shows that everything runs",
     )
-    parser.add_argument("--only", nargs="+", metavar="METHOD", help=f"of: {' '.join((*RUNS, PACE))}")
-    parser.add_argument("--tables", action="store_true", help="run nothing, write the report from what is kept")
-    parser.add_argument("--anew", action="store_true", help="run methods again whose answers are kept; trainings go on")
+    parser.add_argument("--only", nargs="+", metavar="METHOD", help=f"methods to run: {' '.join((*RUNS, PACE))}")
+    parser.add_argument("--tables", action="store_true", help="run nothing; write the report from the stored answers")
+    parser.add_argument(
+        "--anew", action="store_true", help="also run methods whose answers are stored; trainings resume"
+    )
     arguments = parser.parse_args()
     if unknown := set(arguments.only or ()) - {*RUNS, PACE}:
-        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join((*RUNS, PACE))}")
+        parser.error(f"--only: {', '.join(sorted(unknown))}: choose from {', '.join((*RUNS, PACE))}")
     size = Size(arguments.frames, arguments.pairs, arguments.test_images)
     work, out, minutes = ROOT / "data" / "paper", REPORTS, arguments.budget_minutes
     if arguments.reduced:

@@ -59,7 +59,7 @@ class PaperData:
         """Return the wall time of making each part, minutes."""
         frames, dataset = self.work / f"frames-{self.size.frames}", self.dataset.folder
         return {"LiDAR frames": made_minutes(frames), "RGB-D pairs, tests and survey": made_minutes(dataset),
-                "small pictures of the pairs": made_minutes(self.work / f"pairs-{self.size.pairs}")}  # fmt: skip
+                "small images of the pairs": made_minutes(self.work / f"pairs-{self.size.pairs}")}  # fmt: skip
 
     @cached_property
     def frames(self) -> Frames:

@@ -39,7 +39,7 @@ class MethodResult:
     training_s: float | None = 0.0
     images: int = 0
     training_set: int = 0
-    ended: str = "nothing is learnt"
+    ended: str = "no training"
     curve: list[CurvePoint] = field(default_factory=list)
     extra: dict[str, Any] = field(default_factory=dict)
     run: Run = field(default_factory=lambda: this_process(COMMAND))

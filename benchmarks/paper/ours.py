@@ -19,7 +19,8 @@ from benchmarks.paper.kept import SPLITS, MethodResult
 from benchmarks.runs import MAPPING, code_hash
 from model_training.cli.progress import bars
 from model_training.evaluation.predict import predict
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.stock import ENCODER
 from model_training.training.encoder_net import EncoderShape
 from model_training.training.export import export

@@ -1,4 +1,4 @@
-"""``make evaluate-real`` -> reports/real_data.json: recordings that nobody here made, and round trips through their formats."""
+"""``make evaluate-real``: measure recordings of other groups, and round trips through formats -> reports/real_data.json."""
 
 import argparse
 from collections.abc import Callable
@@ -11,8 +11,10 @@ from benchmarks.real.resume import identical_bundles
 from benchmarks.real.ros2 import answers_over_dds
 from benchmarks.real.round_trips import QUERIES, import_rows, round_trip_rows, simulated
 from benchmarks.real.streets import DRIVES, street_rows
+from benchmarks.real.variants import variant_rows
 from benchmarks.report import ROOT, Report
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.stock import ENCODER
 
 BUILDS, FRAMES = 20, 100
@@ -37,20 +39,23 @@ def main() -> None:
     """Parse, measure, write the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the recordings")
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "real")
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "real", help="folder of datasets and maps")
     parts: dict[str, Callable[[Report, argparse.Namespace], None]] = {
         "drive": lambda report, a: drive_rows(report, a.data, a.work),
         "stereo": lambda report, a: stereo_rows(report, a.data, a.work),
         "matcher": lambda report, a: matcher_rows(report, a.data, a.work),
         "streets": lambda report, a: street_rows(report, a.data, a.work, tuple(a.drives)),
+        "variants": lambda report, a: variant_rows(report, a.data, a.work),
         "round-trips": lambda report, a: round_trip_rows(report, a.work),
         "import": lambda report, a: import_rows(report, a.work),
         "loops": lambda report, _: loop_rows(report),
         "resume": lambda report, a: resume_rows(report, a.work),
         "ros2": lambda report, a: ros2_rows(report, a.work),
     }
-    parser.add_argument("--only", nargs="+", choices=list(parts), help="measure these parts and keep the other rows")
-    parser.add_argument("--drives", nargs="+", choices=DRIVES, default=list(DRIVES), help="of the part `streets`")
+    parser.add_argument("--only", nargs="+", choices=list(parts), help="parts to measure; the rows of the others stay")
+    parser.add_argument(
+        "--drives", nargs="+", choices=DRIVES, default=list(DRIVES), help="drives of the part `streets`"
+    )
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
     only = f" --only {' '.join(arguments.only)}" if arguments.only else ""

@@ -15,7 +15,8 @@ from model_training.importing.kitti_object import import_kitti_object
 from model_training.importing.pose_file import read_pose_file
 from model_training.importing.take import TakeSettings, take
 from model_training.importing.trajectory import Trajectory
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.odometry.find import find_trajectory
 from model_training.stock import ENCODER
 from service.geometry.rigid import transform_from

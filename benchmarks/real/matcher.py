@@ -48,22 +48,22 @@ def matcher_rows(report: Report, data: Path, work: Path, recording: str = "kitti
     """Sizes of the errors of a recording and of the simulated pairs, and their ratios."""
     dataset = imported(data, work, recording)
     if dataset is None:
-        report.row(
-            "real.matcher.error_ratio.textured.median", None, "ratio", bar=RATIO, why=f"no recordings at {data.name}"
-        )
+        report.row("real.matcher.error_ratio", None, "ratio", bar=RATIO, why=f"no recordings at {data.name}")
         return
     recorded, simulated = disparity_errors(dataset, QUERIES), simulated_errors(work)
+    ratios: list[float] = []
     for textured, kind in ((True, "textured"), (False, "untextured")):
         real, ours = recorded.sizes(textured=textured), simulated.sizes(textured=textured)
         for name, measure in (("median", np.median), ("percentile_90", lambda sizes: np.percentile(sizes, 90))):
             row = f"real.matcher.{kind}.{name}"
             report.row(f"{row}_px", float(measure(real)), "px", n=len(real))
             report.row(f"{row}_px.simulated", float(measure(ours)), "px", n=len(ours))
-            report.row(
-                f"real.matcher.error_ratio.{kind}.{name}", float(measure(ours) / measure(real)), "ratio", bar=RATIO
-            )
+            ratios.append(float(measure(ours) / measure(real)))
+            report.row(f"real.matcher.error_ratio.{kind}.{name}", ratios[-1], "ratio", bar=RATIO)
         report.row(f"real.matcher.{kind}.unmatched", recorded.unmatched(textured=textured), "share")
         report.row(f"real.matcher.{kind}.unmatched.simulated", simulated.unmatched(textured=textured), "share")
+    worst = max(ratios, key=lambda ratio: abs(np.log(ratio)))
+    report.row("real.matcher.error_ratio", worst, "ratio", bar=RATIO, why="the one of the four that is farthest from 1")
     for name, errors in (("", recorded), (".simulated", simulated)):
         report.row(f"real.matcher.correlation_length{name}", errors.correlation_length_px(), "px")
         for nearest_m, farthest_m in RANGES_M:

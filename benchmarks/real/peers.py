@@ -1,7 +1,7 @@
 """``real.peers.*``: other methods on the same queries and the same map, forced, beside ours forced and ours with the status applied.
 
-Retrieval methods answer the place that is nearest; registration methods answer a pose. A peer whose library is not installed here has a
-row that says so.
+Retrieval methods answer the place that is nearest; registration methods answer a pose. A peer whose library is not installed keeps
+the row of an earlier run. If there is none, its row says so.
 """
 
 import time
@@ -94,7 +94,7 @@ def peer_rows(
             began = time.perf_counter()
             poses = [locate(frame, k) for k, frame in enumerate(frames)]
         except ExtraMissingError as missing:
-            report.row(f"real.peers.{name}.{peer}.within_1_m", None, "share", why=str(missing))
+            report.absent(f"real.peers.{name}.{peer}.within_1_m", "share", str(missing))
             return
         xy = np.array([[np.nan, np.nan] if pose is None else pose[:2, 3] for pose in poses])
         add(peer, xy, time.perf_counter() - began)

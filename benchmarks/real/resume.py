@@ -51,7 +51,7 @@ def identical_bundles(
         out = work / f"killed-{number:02d}"
         _built(dataset, out, options, kill_after_s=float(rng.uniform(0.0, took_s)))
         if out.exists() and not (out / MANIFEST).exists():
-            raise RuntimeError(f"{out} is half a bundle after the kill")
+            raise RuntimeError(f"{out} is an incomplete bundle after the kill")
         if not out.exists():
             _built(dataset, out, options, kill_after_s=None)
         found.append(int(content_of(out) == expected))

@@ -107,12 +107,14 @@ class Robot:
 
         def know() -> bool:
             if process.poll() is not None:
-                raise UnreachableError(f"the bridge ended with {process.returncode}; why it says above")
+                raise UnreachableError(f"the bridge ended with {process.returncode}; see its messages above")
             writers = (self._color, self._depth, self._info)
             return self._met and all(writer.get_matched_subscriptions() for writer in writers)
 
         if not self.wait(know, patience_s):
-            raise UnreachableError(f"no bridge is heard after {patience_s:g} s; does this machine have a loopback?")
+            raise UnreachableError(
+                f"no message from the bridge within {patience_s:g} s; check that this machine has a loopback interface"
+            )
 
     def send(self, frame: Pictures, stamp_ns: int) -> None:
         """One frame as a driver sends it."""

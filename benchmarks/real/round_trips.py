@@ -16,7 +16,8 @@ from model_training.exporting.ros_bag import write_bag
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.pose_file import read_pose_file
 from model_training.importing.take import TakeSettings, take
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.simulate import simulate
 from model_training.stock import ENCODER
@@ -82,7 +83,7 @@ def _there_and_back(original: Dataset, kind: str, work: Path) -> Dataset:
         recording = open_recording("rosbag", there, OpenSettings())
         told = recording.trajectory()
         if told is None:
-            raise RuntimeError(f"the bag of {kind} came back without its poses")
+            raise RuntimeError(f"the bag of {kind} was read back without its poses")
         poses = told
     take(recording, poses, back, TakeSettings())
     return Dataset(back)

@@ -17,7 +17,7 @@ _TIMEOUT_S = 60.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Served:
-    """A service's answers, a row a query.
+    """The answers of a service, one row per query.
 
     Attributes:
         T_map_camera: of the best hypothesis, whatever the status (n, 4, 4); infinite where there is none.
@@ -31,7 +31,7 @@ class Served:
 
 
 def served(bundle: Path, dataset: Dataset, queries: str) -> Served:
-    """Every query of a set, as a user posts it: the files, the intrinsics and the depth format of the dataset."""
+    """Send every query of a set over HTTP: the files, the intrinsics and the depth format of the dataset."""
     poses, localized, confidence = [], [], []
     with serving(bundle, 0) as service, httpx.Client(base_url=service.url, timeout=_TIMEOUT_S) as client:
         for asked in payloads(dataset, queries, map_name=None, refine=True, most=1_000_000):

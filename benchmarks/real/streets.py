@@ -23,7 +23,8 @@ from model_training.evaluation.predict import RANKED, Predictions, predict
 from model_training.evaluation.stages import stages_of
 from model_training.importing.kinds import OpenSettings, open_recording
 from model_training.importing.take import TakeSettings, take
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.odometry.align_poses import usual_poses
 from model_training.stock import ENCODER
 from service.errors import NoDepthError
@@ -56,7 +57,7 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
         _stage_rows(report, street)
         others.append(peer_rows(report, street.name, street.dataset, street.localizer, QUERIES))
         if street.name == "kitti_0013":
-            _sequence_rows(report, street)
+            sequence_rows(report, street.name, street.dataset, street.localizer)
     pooled_rows(report, others)
     accepted = [
         predict(own.localizer, other.dataset, QUERIES).localized
@@ -68,13 +69,22 @@ def street_rows(report: Report, data: Path, work: Path, drives: tuple[str, ...] 
         report.share("real.strangers.accepted", np.concatenate(accepted), bar=_WRONG, better="lower")
 
 
-def answer_rows(report: Report, row: str, found: Predictions) -> None:
-    """Rows of a query set: places as they are answered, answers by their status, and beside them the same answers forced."""
+def answer_rows(report: Report, row: str, found: Predictions, *, bars: bool = True) -> None:
+    """Add rows of a query set: recall, answers by their status, and beside them the same answers forced.
+
+    Args:
+        report: where to.
+        row: name that the rows begin with.
+        found: answers.
+        bars: whether the bars of the drives apply.
+    """
     true_xy, errors = found.T_true[:, :2, 3], position_errors(found)
-    report.share(f"{row}.recall_at_1_5m", recall_at(found.ranked_xy, true_xy, 1), bar=_RECALL_5M)
+    near, far = (_RECALL_5M, _RECALL_10M) if bars else (None, None)
+    report.share(f"{row}.recall_at_1_5m", recall_at(found.ranked_xy, true_xy, 1), bar=near)
     report.share(f"{row}.recall_at_5_5m", recall_at(found.ranked_xy, true_xy, 5))
-    report.share(f"{row}.recall_at_1_10m", recall_at(found.ranked_xy, true_xy, 1, within_m=10.0), bar=_RECALL_10M)
-    status_rows(report, row, errors, found.localized, bars=(_ANSWERED, _WRONG, _MEDIAN_M))
+    report.share(f"{row}.recall_at_1_10m", recall_at(found.ranked_xy, true_xy, 1, within_m=10.0), bar=far)
+    limits = (_ANSWERED, _WRONG, _MEDIAN_M) if bars else (None, None, None)
+    status_rows(report, row, errors, found.localized, bars=limits)
 
 
 def status_rows(
@@ -151,24 +161,32 @@ def _stage_rows(report: Report, street: Street) -> None:
     report.row(f"real.{street.name}.inliers_from_truth", float(np.median(from_truth)), "share", n=len(from_truth))
 
 
-def _sequence_rows(report: Report, street: Street) -> None:
-    """Every five consecutive pairs as one question, where the others stood against the last by the recording's poses."""
-    frames, errors, localized = list(street.dataset.queries(QUERIES)), list[float](), list[bool]()
+def sequence_rows(report: Report, name: str, dataset: Dataset, localizer: Localizer, *, bars: bool = True) -> None:
+    """Add rows of all sequences of five consecutive pairs; each is one query with the recording's relative poses.
+
+    Args:
+        report: where to.
+        name: name of the drive, part of the rows' ids.
+        dataset: the dataset of the drive.
+        localizer: localizer of its map.
+        bars: whether the bar of the drives applies.
+    """
+    frames, errors, localized = list(dataset.queries(QUERIES)), list[float](), list[bool]()
     for last in range(SEQUENCE - 1, len(frames)):
         group = frames[last - SEQUENCE + 1 : last + 1]
         queries, poses = as_query(
-            group, np.random.default_rng(0), grid=street.localizer.bundle.grid, ranked=RANKED, exact=True
+            group, np.random.default_rng(0), grid=localizer.bundle.grid, ranked=RANKED, exact=True
         )
         truth = frames[last].T_map_camera
         try:
-            answer = street.localizer.localize_frames(queries, poses)
+            answer = localizer.localize_frames(queries, poses)
         except NoDepthError:
             errors.append(np.inf)
             localized.append(False)
             continue
         if truth is None:
-            raise ValueError(f"query {last} of {street.name} has no truth")
+            raise ValueError(f"query {last} of {name} has no ground truth")
         errors.append(float(np.hypot(*(answer.T_map_camera_guess[:2, 3] - truth[:2, 3]))))
         localized.append(answer.status == "LOCALIZED")
-    row = f"real.sequence{SEQUENCE}.{street.name}"
-    status_rows(report, row, np.array(errors), np.array(localized, bool), bars=(1.0, None, None))
+    limits = (1.0 if bars else None, None, None)
+    status_rows(report, f"real.sequence{SEQUENCE}.{name}", np.array(errors), np.array(localized, bool), bars=limits)

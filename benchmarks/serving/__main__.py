@@ -47,24 +47,29 @@ def site_from(arguments: argparse.Namespace) -> Site:
 def main() -> None:
     """Parse the arguments, measure and write the report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate")
-    parser.add_argument("--map", type=Path, help="another bundle than the paper's city, with --dataset")
-    parser.add_argument("--dataset", type=Path)
-    parser.add_argument("--queries", default=QUERIES)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each round")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--soak-minutes", type=float, default=JUDGED_MINUTES)
+    parser.add_argument("--work", type=Path, default=ROOT / "data" / "evaluate", help="folder of datasets and maps")
+    parser.add_argument("--map", type=Path, help="map bundle instead of the paper's city; needs --dataset")
+    parser.add_argument("--dataset", type=Path, help="dataset with the queries for --map")
+    parser.add_argument("--queries", default=QUERIES, help="query set")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of each round, seconds")
+    parser.add_argument("--rounds", type=int, default=3, help="rounds of each measurement")
+    parser.add_argument("--soak-minutes", type=float, default=JUDGED_MINUTES, help="length of the soak, minutes")
     parser.add_argument(
         "--soak-rate",
         type=float,
-        help="pairs of pictures a second in the soak, where other work shares the machine; default: 60 %% of what one core answers",
+        help=(
+            "image pairs per second in the soak, if other work shares the machine; default: 60 %% of what one core "
+            "answers"
+        ),
     )
     parser.add_argument(
         "--only",
         nargs="+",
         help="parts: ratios decoding tail overload swap sigterm sizes hostile memory both_cores peers soak native sanitizers",
     )
-    parser.add_argument("--peers", nargs="+", default=PEERS, choices=PEERS, help="who else hosts the pipeline")
+    parser.add_argument(
+        "--peers", nargs="+", default=PEERS, choices=PEERS, help="other servers of the pipeline to measure"
+    )
     arguments = parser.parse_args()
     told = " ".join(sys.argv[1:])
     report = Report("serving", "make bench-serving" + (f' ARGS="{told}"' if told else ""))
@@ -90,7 +95,7 @@ def main() -> None:
         "sanitizers": lambda: sanitizer_rows(report),
     }
     if unknown := set(arguments.only or ()) - set(parts):
-        parser.error(f"--only: {', '.join(sorted(unknown))}: there are {', '.join(parts)}")
+        parser.error(f"--only: {', '.join(sorted(unknown))}: choose from {', '.join(parts)}")
     if set(arguments.only or parts) - WITHOUT_A_MAP:
         site = site_from(arguments)
         counts = MapBundle.open(site.bundle, verify=False).manifest.counts

@@ -69,7 +69,7 @@ def disagreements(first: str, switches: Sequence[Switch], answers: Sequence[Name
     for number in range(len(known) - 2, -1, -1):  # a switch happened before the next one
         known[number] = min(known[number], known[number + 1])
     return [
-        f"asked at {each.asked:.6f}, answered at {each.answered:.6f} from {each.version!r} instead of "
+        f"sent at {each.asked:.6f}, answered at {each.answered:.6f} from {each.version!r} instead of "
         f"{' or '.join(sorted({versions[state] for state in states(each, known)}))}"
         for each in answers
         if each.version not in {versions[state] for state in states(each, known)}

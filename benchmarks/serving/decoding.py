@@ -93,7 +93,7 @@ def _colour_ways(stored: Data, camera: PinholeCamera) -> dict[str, tuple[Data, C
 def _colour(data: bytes) -> np.ndarray:
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise ValueError("a colour image of the dataset is damaged; make the dataset again")
+        raise ValueError("a colour image of the dataset is damaged; create the dataset again")
     return picture
 
 

@@ -57,7 +57,7 @@ def overload_rows(report: Report, site: Site, *, seconds: float, rounds: int, co
     report.row("overload.goodput_over_peak", median(good), "ratio", bar=0.95, n=rounds)
     report.notes["overload"] = f"Goodput over peak of each round: {told}."
     report.row("overload.refusal_p99_ms", median(refused) if refused else None, "ms", bar=50, better="lower", n=rounds,
-               why=f"{failed} not refused but failed" if failed else None)  # fmt: skip
+               why=f"{failed} failed instead of a refusal" if failed else None)  # fmt: skip
     report.row("overload.generator_late_p99_ms", median(found.late_ms["p99"] for found in founds), "ms", n=rounds)
     report.row("overload.health_p99_ms", median(health_ms), "ms", bar=50, better="lower", n=rounds)
 

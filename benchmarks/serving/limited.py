@@ -50,7 +50,10 @@ class Limited:
             self._folder, self._version = folder, version
             self.how = f"control group version {version}"
             return
-        self.how = "a watcher that kills beyond the limit of anonymous memory; no control group could be made here"
+        self.how = (
+            "a watcher that kills the process above the limit of anonymous memory; no control group could be created "
+            "on this machine"
+        )
 
     @property
     def enter(self) -> Callable[[], None] | None:

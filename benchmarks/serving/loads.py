@@ -27,7 +27,7 @@ def load(server: Server | Host, face: str, sent: list[Payload], how: Load) -> tu
         ValueError: gRPC is asked of a peer.
     """
     if face != "rest" and isinstance(server, Host):
-        raise ValueError(f"face: {face!r} is not of a peer; use 'rest'")
+        raise ValueError(f"face: {face!r} is not available for a peer; use 'rest'")
     before: Usage | None = None
     after: Usage | None = None
 

@@ -182,7 +182,7 @@ def _until(stream: IO[str] | None, *patterns: str) -> list[str]:
             found.append(match[1])
             if len(found) == len(patterns):
                 return found
-    raise RuntimeError(f"the service ended before it said {patterns[len(found)]!r}")
+    raise RuntimeError(f"the service ended before it printed {patterns[len(found)]!r}")
 
 
 class Bare:
@@ -250,7 +250,7 @@ def proportional_mib(pid: int) -> float:
     text = (Path("/proc") / str(pid) / "smaps_rollup").read_text()
     found = re.search(r"^Pss:\s+(\d+) kB", text, re.MULTILINE)
     if found is None:
-        raise RuntimeError(f"/proc/{pid}/smaps_rollup says no Pss")
+        raise RuntimeError(f"/proc/{pid}/smaps_rollup has no Pss")
     return int(found[1]) / 1024
 
 

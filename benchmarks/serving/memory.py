@@ -117,7 +117,7 @@ def _attackers(server: Server, good: dict[str, bytes]) -> list[tuple[str, Callab
     ):
         found += OF_OTHERS * [(path.rsplit("/", 1)[-1], _message_to(server.grpc, path, sent))]
     found += SEQUENCES * [
-        ("sequence of large pictures", lambda: _sent(server.url, "/v1/localize/sequence", sequence, chunked=False))
+        ("sequence of large images", lambda: _sent(server.url, "/v1/localize/sequence", sequence, chunked=False))
     ]
     found += [("hostile", _against(kinds[number % len(kinds)], server.url)) for number in range(HOSTILE)]
     return found

@@ -61,7 +61,7 @@ def native_rows(report: Report, work: Path) -> None:
                 raise RuntimeError(done.stderr[-4000:])
             answers.append(done.stdout.splitlines())
         if [len(each) for each in answers] != [QUERIES, QUERIES]:
-            raise RuntimeError(f"{QUERIES} queries were asked, {[len(each) for each in answers]} answered")
+            raise RuntimeError(f"{QUERIES} queries were sent, {[len(each) for each in answers]} answered")
         differ = sum(one != other for one, other in zip(*answers, strict=True))
         report.row("native.answers_differ_gcc_zig", differ, "answers", bar=0, better="lower", n=QUERIES)
 

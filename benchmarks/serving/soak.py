@@ -404,7 +404,7 @@ async def _drive(
     async with traffic.open():
         capacity = None if rate is not None else await _capacity(traffic, stop)
         aimed = rate if rate is not None else LOAD * (capacity or 0.0)
-        print(f"soak: {aimed:.2f} pairs a second for {minutes:g} minutes, process {server.process.pid}", flush=True)
+        print(f"soak: {aimed:.2f} pairs per second for {minutes:g} minutes, process {server.process.pid}", flush=True)
         traffic.tally = tally = Tally()
         samples: list[Sample] = []
         began, first_spans = time.monotonic(), collector.spans
@@ -439,7 +439,7 @@ async def _drive(
                 task.cancel()
             await asyncio.gather(*beside, return_exceptions=True)
         if server.process.poll() is not None:
-            tally.fail("service", f"it ended with {server.process.returncode}")
+            tally.fail("service", f"the service ended with {server.process.returncode}")
         _write(report, samples, tally, aimed=aimed, capacity=capacity)
 
 
@@ -503,7 +503,11 @@ def _line(samples: list[Sample], tally: Tally) -> str:
 def _write(report: Report, samples: list[Sample], tally: Tally, *, aimed: float, capacity: float | None) -> None:
     """Add the rows, the series of samples and its plot from the data so far."""
     lasted = samples[-1].at_s / 60 if samples else 0.0
-    short = None if lasted > JUDGED_MINUTES - 1 else f"of {lasted:.1f} minutes only; the bar is for {JUDGED_MINUTES:g}"
+    short = (
+        None
+        if lasted > JUDGED_MINUTES - 1
+        else f"the run took only {lasted:.1f} minutes; the bar is for {JUDGED_MINUTES:g}"
+    )
     sent = sum(tally.sent.values())
     hours = np.array([each.at_s for each in samples]) / 3600
     series = {

@@ -101,7 +101,7 @@ class Host:
         last = "nothing listens"
         while time.monotonic() < deadline:
             if self.process.poll() is not None:
-                raise PeerError(f"it ended with code {self.process.returncode}: {self._said()}")
+                raise PeerError(f"the server ended with code {self.process.returncode}: {self._said()}")
             try:
                 answered = httpx.post(
                     f"{self.url}/v1/localize", content=first.body, headers={"Content-Type": first.content_type}, timeout=30

@@ -136,7 +136,7 @@ def measured(
         how = replace(opened(3 * seconds, rate), seed=seed)
         summary, shots = load(server, "rest", sent["full"], how)
         if summary.errors or summary.inconsistent:
-            raise PeerError(f"at {rate:.1f} a second: {summary.errors}, {summary.inconsistent} inconsistent answers")
+            raise PeerError(f"at {rate:.1f} per second: {summary.errors}, {summary.inconsistent} inconsistent answers")
         ms = [1e3 * (shot.done_s - shot.due_s) for shot in shots if shot.due_s >= how.warm_up_s]
         found[name].p99_ms.append(float(np.percentile(ms, 99)))
         found[name].asked += len(ms)
@@ -219,6 +219,7 @@ def _without_vote(value: Any) -> Any:
 def _note(rate: float, names: Sequence[str]) -> str:
     versions = ", ".join(f"{TITLES[name]} {REQUIREMENTS[name][0].partition('==')[2]}" for name in names)
     return (
-        f"{versions}; each alone on the core, one worker, one thread in every pool; saturated by {MANY} clients; p99 of full requests, "
-        f"{rate:.1f} a second, {SHARE:.0%} of what saturates the slowest, the same arrivals for all; medians over rounds."
+        f"{versions}; each alone on the core, one worker, one thread in every pool; saturated by {MANY} clients; p99 "
+        f"of full requests, {rate:.1f} per second, {SHARE:.0%} of what saturates the slowest, the same arrivals for "
+        "all; medians over rounds."
     )

@@ -73,7 +73,7 @@ def uv(*arguments: str) -> None:
     try:
         subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
     except FileNotFoundError as error:
-        raise PeerError(f"there is no {command[0]}; `make .venv/.uv` installs it") from error
+        raise PeerError(f"{command[0]} not found; `make .venv/.uv` installs it") from error
     except subprocess.CalledProcessError as error:
         said = " ".join(error.stderr.split())[-300:]
         raise PeerError(f"uv {arguments[0]} failed: {said}") from error

@@ -122,12 +122,15 @@ def test_the_best_is_another_one_for_each_row():
 def test_a_peer_that_never_ran_has_its_rows_with_the_reason_and_is_not_the_best():
     rows = rows_of(
         {"streetfix": figures([60] * 3, [26] * 3, [90.0] * 3), "bentoml": figures([40] * 3, [25] * 3, [120.0] * 3)},
-        {"ray": "it ended with code 1"},
+        {"ray": "the server ended with code 1"},
     )
     own = {name: row for name, row in rows.items() if name.startswith("peers.ray.")}
     assert len(own) == 5
-    assert all(row["value"] is None and row["why"] == "it ended with code 1" for row in own.values())
-    assert rows["peers.p99_under_best"]["why"] == "the best is BentoML; Ray Serve did not run: it ended with code 1"
+    assert all(row["value"] is None and row["why"] == "the server ended with code 1" for row in own.values())
+    assert (
+        rows["peers.p99_under_best"]["why"]
+        == "the best is BentoML; Ray Serve did not run: the server ended with code 1"
+    )
 
 
 def test_what_was_measured_before_a_peer_failed_counts_as_far_as_it_is_whole():
@@ -192,7 +195,7 @@ def loaded(monkeypatch):
 
 def start(name):
     if name == "litserve":
-        raise PeerError("it ended with code 2")
+        raise PeerError("the server ended with code 2")
     return nullcontext(SimpleNamespace(name=name, url="right"))
 
 
@@ -217,7 +220,7 @@ def test_peers_that_do_not_start_err_or_end_are_left_out_with_their_reasons(load
     names = ["streetfix", "litserve", "bentoml", "mlserver", "ray"]
     found, _ = measured(names, start, SENDING, failed, seconds=2, rounds=1)
     assert failed == {
-        "litserve": "it ended with code 2", "bentoml": "retrieval, saturated: {'timeout': 1}, 0 inconsistent answers",
+        "litserve": "the server ended with code 2", "bentoml": "retrieval, saturated: {'timeout': 1}, 0 inconsistent answers",
         "ray": "it is gone",
     }  # fmt: skip
     assert found["mlserver"].p99_ms
@@ -253,7 +256,7 @@ def test_the_whole_tree_of_a_peer_is_stopped():
 
 
 def test_a_peer_that_ends_says_its_last_words():
-    with pytest.raises(PeerError, match=r"it ended with code 3: no such map"):
+    with pytest.raises(PeerError, match=r"the server ended with code 3: no such map"):
         Host([sys.executable, "-c", "import sys; print('no such map'); sys.exit(3)"], SENT, core=None)
 
 

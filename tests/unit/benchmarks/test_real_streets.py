@@ -1,11 +1,17 @@
 """Rows of real drives: the status applied, and forced figures beside."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from benchmarks.real.peers import pooled_rows
 from benchmarks.real.streets import answer_rows, status_rows
+from benchmarks.real.variants import PRIOR_M, EveryScan, grey, prior_at
 from benchmarks.report import Report
+from model_training.datasets.dataset import Dataset
+from service.geometry.camera import PinholeCamera
+from service.retrieval.query import Query
 
 
 def rows_of(report):
@@ -37,6 +43,37 @@ def test_recall_has_both_distances(tmp_path, answers_of):
     rows = rows_of(report)
     assert rows["real.d.recall_at_1_5m"]["value"] == pytest.approx(1 / 3)
     assert rows["real.d.recall_at_1_10m"]["value"] == pytest.approx(2 / 3)
+
+
+def test_figures_of_a_variant_have_no_bar(tmp_path, answers_of):
+    report = Report("x", "x", folder=tmp_path)
+    answer_rows(report, "real.d.grey", answers_of([[0, 0]], [[4, 0]]), bars=False)
+    assert not any("bar" in row for row in report.rows)
+
+
+@pytest.mark.parametrize(("each", "first", "kept"), [(2, 0, [0, 2, 4]), (2, 1, [1, 3]), (3, 2, [2])])
+def test_a_sparse_survey_has_every_nth_scan(each, first, kept, monkeypatch):
+    monkeypatch.setattr(Dataset, "__init__", lambda *_: None)
+    monkeypatch.setattr(Dataset, "survey_poses", lambda _: np.arange(5.0))
+    monkeypatch.setattr(Dataset, "scan", lambda _, number: number)
+    sparse = EveryScan(Path("d"), each, first)
+    assert sparse.survey_poses().tolist() == kept
+    assert [sparse.scan(number) for number in range(len(kept))] == kept
+
+
+def test_a_grey_image_has_three_equal_channels():
+    rgb = np.zeros((2, 2, 3), np.uint8)
+    rgb[..., 1] = 100
+    camera = PinholeCamera(2, 2, 2.0, 2.0, 0.5, 0.5)
+    found = grey(Query(rgb=rgb, depth_m=np.ones((2, 2), np.float32), camera=camera)).rgb
+    assert found.dtype == np.uint8
+    np.testing.assert_array_equal(found, np.full((2, 2, 3), 59))  # 0.587 of green
+
+
+def test_a_prior_is_off_by_its_standard_deviation():
+    rng = np.random.default_rng(0)
+    off = [prior_at(np.eye(4), rng).position_m for _ in range(4000)]
+    np.testing.assert_allclose(np.std(off, axis=0), [PRIOR_M, PRIOR_M], rtol=0.05)
 
 
 def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):

@@ -28,6 +28,18 @@ def test_a_share_is_told_with_its_number_and_wilsons_interval(report):
     assert row["ci95"] == pytest.approx([0.4902, 0.9433], abs=1e-4)
 
 
+def test_what_cannot_be_measured_now_keeps_the_value_of_an_earlier_run(report):
+    report.row("known", 0.5, "share")
+    report.write()
+    again = Report("mine", "make mine again", folder=report.folder)
+    again.keep_others()
+    again.absent("known", "share", "no such package")
+    again.absent("new", "share", "no such package")
+    rows = {row["id"]: row for row in json.loads(again.write().read_text())["rows"]}
+    assert rows["known"]["value"] == 0.5
+    assert (rows["new"]["value"], rows["new"]["why"]) == (None, "no such package")
+
+
 @pytest.mark.parametrize(
     ("right", "bar", "better", "holds"),
     [(8, 0.8, "higher", True), (8, 0.81, "higher", False), (8, 0.8, "lower", True), (8, 0.79, "lower", False)],
@@ -40,7 +52,7 @@ def test_a_shares_bar_holds_where_it_is_met(report, right, bar, better, holds):
 def test_a_share_of_no_query_is_none_and_its_bar_is_missed(report):
     report.share("a", np.zeros(0, bool), bar=0.5)
     row = row_of(report, "a")
-    assert (row["value"], row["holds"], row["why"]) == (None, False, "no query of this kind")
+    assert (row["value"], row["holds"], row["why"]) == (None, False, "no query of this type")
     assert "ci95" not in row
 
 

@@ -62,7 +62,7 @@ def test_without_sanitizers_it_is_said_and_fails_where_checks_must_run(monkeypat
     with pytest.raises(SystemExit) as left:
         sanitizers.main()
     assert left.value.code == code
-    assert capsys.readouterr().err.startswith("NOT CHECKED: the C code did not run under sanitizers: there is no gcc")
+    assert capsys.readouterr().err.startswith("NOT CHECKED: the C code did not run under sanitizers: gcc not found")
 
 
 def test_reports_and_failures_end_the_check(monkeypatch, capsys) -> None:

@@ -1,0 +1,112 @@
+"""``real.kitti_0005.*`` in other conditions: sparser surveys, grey images, a prior, five frames. The drive that may be tuned on."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.real.streets import QUERIES, answer_rows, imported, sequence_rows, status_rows
+from benchmarks.report import Report
+from model_training.datasets.dataset import Dataset, Transforms
+from model_training.evaluation.failures import position_errors
+from model_training.evaluation.predict import Predictions, predict
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
+from model_training.stock import ENCODER
+from service.geometry.rigid import Transform
+from service.localization.localizer import Localizer
+from service.maps.reader import MapBundle
+from service.retrieval.prior import Prior
+from service.retrieval.query import Query
+
+DRIVE = "kitti_0005"
+#: Standard deviation of the prior's error, metres.
+PRIOR_M = 3.0
+#: A scan is taken every so many. The drive has one every 2.7 m.
+SPARSE = (2, 3)
+
+
+class EveryScan(Dataset):
+    """A dataset whose survey has every n-th scan.
+
+    Args:
+        folder: folder of the dataset.
+        each: interval of the scans that stay.
+        first: index of the first scan that stays.
+    """
+
+    def __init__(self, folder: Path, each: int, first: int) -> None:
+        super().__init__(folder)
+        self._each, self._first = each, first
+
+    def survey_poses(self) -> Transforms:
+        """Return T_map_lidar of the scans that stay (n, 4, 4), metres."""
+        return super().survey_poses()[self._first :: self._each]
+
+    def scan(self, number: int) -> NDArray[np.float32]:
+        """Return a scan that stays (n, 4): x, y, z in the LiDAR frame (m) and intensity.
+
+        Args:
+            number: number among the scans that stay.
+        """
+        return super().scan(self._first + number * self._each)
+
+
+def grey(query: Query) -> Query:
+    """Return the query as a grey camera takes it.
+
+    Args:
+        query: query with a colour image.
+    """
+    brightness = cv2.cvtColor(query.rgb, cv2.COLOR_RGB2GRAY)
+    return replace(query, rgb=np.repeat(brightness[..., None], 3, axis=2))
+
+
+def prior_at(T_map_camera: Transform, rng: np.random.Generator) -> Prior:
+    """Return a prior whose error agrees with its standard deviation.
+
+    Args:
+        T_map_camera: true pose of the camera (4, 4).
+        rng: source of the error.
+    """
+    return Prior(position_m=T_map_camera[:2, 3] + rng.normal(0, PRIOR_M, 2), position_std_m=PRIOR_M)
+
+
+def variant_rows(report: Report, data: Path, work: Path) -> None:
+    """Measure the drive in each condition, at default settings.
+
+    Args:
+        report: where to.
+        data: folder of the recordings.
+        work: folder of datasets and maps.
+    """
+    dataset = imported(data, work, DRIVE)
+    if dataset is None:
+        report.row(f"real.{DRIVE}.grey.answered_within_1_m", None, "share", why=f"no recordings at {data.name}")
+        return
+    whole = _localizer(dataset, work / "variant_map")
+    answer_rows(report, f"real.{DRIVE}.grey", predict(whole, dataset, QUERIES, seen_by=grey), bars=False)
+    with_prior = predict(whole, dataset, QUERIES, prior_of=prior_at)
+    status_rows(
+        report, f"real.{DRIVE}.prior_3_m", position_errors(with_prior), with_prior.localized, bars=(None, None, None)
+    )
+    sequence_rows(report, DRIVE, dataset, whole, bars=False)
+    for each in SPARSE:
+        found = []
+        for first in range(each):
+            sparse = EveryScan(dataset.folder, each, first)
+            found.append(predict(_localizer(sparse, work / "variant_map"), sparse, QUERIES))
+        answer_rows(report, f"real.{DRIVE}.one_scan_of_{each}", _joined(found), bars=False)
+
+
+def _localizer(dataset: Dataset, folder: Path) -> Localizer:
+    build_map(dataset, ENCODER, folder, BuildSettings(name="variant"), overwrite=True)
+    return Localizer.open(MapBundle.open(folder))
+
+
+def _joined(found: list[Predictions]) -> Predictions:
+    return Predictions(
+        **{name: np.concatenate([getattr(each, name) for each in found]) for name in Predictions.__dataclass_fields__}
+    )
