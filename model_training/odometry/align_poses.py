@@ -66,7 +66,7 @@ def aligned_with_scans(
         import small_gicp  # noqa: F401
     except ModuleNotFoundError as error:
         raise ExtraMissingError(
-            f"aligning poses needs {error.name}: {how_to_install('odometry')}, or import with --no-align",
+            f"aligning poses needs {error.name}: {how_to_install('mapping')}, or import with --no-align",
             field="align",
         ) from error
     mounted = recording.lidar.T_vehicle_sensor

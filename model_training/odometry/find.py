@@ -62,7 +62,7 @@ def find_trajectory(
             report=lambda done: report("odometry", done, max(done, total)),
         )  # fmt: skip
         if not len(drive.stamps_s):
-            raise DatasetError("no scan can be used, so odometry has nothing to follow", field="scans")
+            raise DatasetError("no scan is usable, so odometry is not possible", field="scans")
         name = "odometry (KISS-ICP)"
         before = Trajectory(drive.stamps_s, drive.T_first_lidar, name).moved_by(T_vehicle_lidar)
         loops = find_loops(drive, report=lambda done, of: report("loops", done, of)) if close_loops else []

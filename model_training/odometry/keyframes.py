@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
-from model_training.mapping.build import fan
+from model_training.mapping.survey import fan
 from model_training.odometry.scan_to_map import PosedScan
 from service.geometry.rigid import Transform
 from service.imaging.pca import Level, level_scan, principal_heading

@@ -118,7 +118,7 @@ class Training:
         folder.mkdir(parents=True, exist_ok=True)
         kept, text = folder / "settings.json", json.dumps(dict(settings), indent=1, sort_keys=True) + "\n"
         if kept.exists() and kept.read_text() != text:
-            raise DatasetError(f"{kept} is of other settings; remove {folder} to train anew", field="settings")
+            raise DatasetError(f"{kept} has other settings; remove {folder} to train again", field="settings")
         kept.write_text(text)
         self.curve = read_curve(folder / CURVE)
         self._spent_before = self.curve[-1].processor_s if self.curve else 0.0
@@ -182,7 +182,7 @@ class Training:
         """
         state = self._load("best.pt")
         if state is None:
-            raise DatasetError(f"{self.folder} holds no best.pt yet; train first", field="folder")
+            raise DatasetError(f"{self.folder} has no best.pt yet; train first", field="folder")
         return state
 
     def _load(self, name: str) -> dict[str, Any] | None:

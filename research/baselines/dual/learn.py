@@ -166,7 +166,7 @@ class Lesson:
         near = frames_near(poses[:, :2], sweeps.places[:, :2])
         usable = np.array([k for k, rows in enumerate(near) if len(rows)], np.int64)
         if not len(usable):
-            raise DatasetError("no pair was taken near a LiDAR frame; are they of one city?", field="pairs")
+            raise DatasetError("no pair is near a LiDAR frame; check that both belong to the same city", field="pairs")
         held = watched(poses[usable, :2], np.random.default_rng([settings.seed, 1]))
         places = thinned(sweeps.places[:, :2], WATCH_SPACING_M[settings.kind])
         return Lesson(pictures, views, poses, sweeps, near, usable[~held], usable[held], places)

@@ -30,7 +30,7 @@ PLANS = {
     "one_space_both": CnnPlan("view", pairs_too=True),
 }
 WHAT = {
-    "as_printed": "LiDAR from above, aligned by PCA, 84 iterations; asked with fused pictures as the camera sees them",
+    "as_printed": "LiDAR from above, aligned by PCA, 84 iterations; queried with fused images as the camera sees them",
     "converged": "the same, trained until it stops gaining",
     "without_pca": "the same without PCA",
     "one_space": "both on the view grid (azimuth x elevation); trained on LiDAR alone",

@@ -74,7 +74,7 @@ class Frames:
             DatasetError: the folder is incomplete.
         """
         if not (folder / FINISHED).exists():
-            raise DatasetError(f"{folder} holds no finished frames; run make paper", field="frames")
+            raise DatasetError(f"{folder} has no complete frames; run make paper", field="frames")
         return Frames(**{name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
                          for name in Frames.__annotations__})  # fmt: skip
 
@@ -171,7 +171,9 @@ def _finished(folder: Path, made_of: dict[str, Any]) -> bool:
     """
     for path in (folder / FINISHED, folder / BEGUN):
         if path.exists() and json.loads(path.read_text()) != made_of:
-            raise DatasetError(f"{path} is of other frames; remove {folder}, or choose another --work", field="work")
+            raise DatasetError(
+                f"{path} belongs to other frames; remove {folder}, or choose another --work", field="work"
+            )
     return (folder / FINISHED).exists()
 
 

@@ -60,7 +60,7 @@ class Pairs:
             DatasetError: the folder is incomplete.
         """
         if not (folder / "pairs.json").exists():
-            raise DatasetError(f"{folder} holds no finished pairs; run make paper", field="pairs")
+            raise DatasetError(f"{folder} has no complete pairs; run make paper", field="pairs")
         camera = PinholeCamera(**json.loads((folder / "pairs.json").read_text()))
         arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
                   for name in Pairs.__annotations__ if name != "camera"}  # fmt: skip
@@ -122,7 +122,7 @@ def _shrunk(frame: QueryFrame, grid: ViewGrid) -> dict[str, NDArray[np.generic]]
     """Shrink one pair: colour is averaged; depth is the nearest pixel's, never an average."""
     T = frame.T_map_camera
     if T is None:
-        raise DatasetError("a query set has no poses.txt, so nothing can be learnt from it", field="queries")
+        raise DatasetError("a query set has no poses.txt, so it cannot be used for training", field="queries")
     rgb, depth_m, camera = frame.rgb(), frame.depth_m(), frame.camera.pinhole()
     level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.5)
     ranges, colour, _ = gather(rgb, depth_m, camera, level.R_level_camera.T, grid)

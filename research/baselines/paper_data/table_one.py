@@ -25,7 +25,7 @@ def in_proportion(total: int) -> tuple[int, ...]:
         ValueError: the total is smaller than the number of classes.
     """
     if total < len(FRAMES_PRINTED):
-        raise ValueError(f"{total} frames cannot be shared out over {len(FRAMES_PRINTED)} classes")
+        raise ValueError(f"{total} frames cannot be distributed over {len(FRAMES_PRINTED)} classes")
     exact = np.array(FRAMES_PRINTED) * (total / sum(FRAMES_PRINTED))
     counts = np.maximum(np.floor(exact).astype(int), 1)
     remainder = np.argsort(-(exact - counts), kind="stable")

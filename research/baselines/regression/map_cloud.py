@@ -86,7 +86,7 @@ def small_gicp_package() -> Any:
     try:
         import small_gicp
     except ModuleNotFoundError as error:
-        raise ExtraMissingError(f"ICP needs small_gicp: {how_to_install('odometry')}", field="small_gicp") from error
+        raise ExtraMissingError(f"ICP needs small_gicp: {how_to_install('mapping')}", field="small_gicp") from error
     return small_gicp
 
 

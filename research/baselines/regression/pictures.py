@@ -97,9 +97,7 @@ def watched_rows(pairs: Pairs) -> NDArray[np.bool_]:
     before = np.cumsum(sizes[order]) - sizes[order]
     kept_back: NDArray[np.bool_] = np.isin(block.reshape(-1), order[before < WATCHED_SHARE * len(pairs)])
     if kept_back.all():
-        raise DatasetError(
-            "the pairs stand too near to each other to keep some back; take more of a drive", field="pairs"
-        )
+        raise DatasetError("the pairs are too close together to hold out some; use a longer drive", field="pairs")
     return kept_back
 
 

@@ -170,7 +170,9 @@ class _Learner:
         """
         batch = self._batch(self._rng.choice(shown, self._settings.batch), self._rng)
         if batch is None:
-            raise DatasetError("no pair's depth meets the map; are both of one city?", field="pairs")
+            raise DatasetError(
+                "the depth of no pair overlaps the map; check that both belong to the same city", field="pairs"
+            )
         return batch
 
     def step(self, batch: _Batch, share_spent: float) -> float:

@@ -15,8 +15,8 @@ from service.geometry.rigid import inverse, rotation_z, transform_from
 
 from .conftest import HallDrive, pose_at
 
-pytest.importorskip("gtsam", reason="needs the extra `odometry`")
-pytest.importorskip("small_gicp", reason="needs the extra `odometry`")
+pytest.importorskip("gtsam", reason="needs the extra `mapping`")
+pytest.importorskip("small_gicp", reason="needs the extra `mapping`")
 
 STAMPS_S = np.arange(0.0, 1.401, 0.05)  # twice as often as the scans
 

@@ -13,7 +13,7 @@ from model_training.odometry.scan_to_map import posed
 from service.errors import DatasetError
 from service.geometry.rigid import inverse, rotation_z, transform_from
 
-pytest.importorskip("gtsam", reason="needs the extra `odometry`")
+pytest.importorskip("gtsam", reason="needs the extra `mapping`")
 pytest.importorskip("kiss_icp", reason="needs the extra `odometry`")
 
 
@@ -67,7 +67,7 @@ def test_loops_are_looked_for_and_none_is_made_up_on_a_short_way(hall_drive):
 
 
 def test_nothing_to_follow_is_an_error(hall_drive):
-    with pytest.raises(DatasetError, match="no scan can be used, so odometry has nothing to follow"):
+    with pytest.raises(DatasetError, match="no scan is usable, so odometry is not possible"):
         find_trajectory(hall_drive(count_of_scans=0), close_loops=False)
 
 
