@@ -1,7 +1,9 @@
 """Places between the scans of a sparse survey: poses on the way, with the points of the scan before and the scan after.
 
 A query between two distant scans resembles neither of them. A place on the way shows the map from nearer by. Its map views are
-rendered from both scans, so they have gaps and wrong visibility where a scan did not see. Decision 0147 has the figures.
+rendered from both scans, so they have gaps and wrong visibility where a scan did not see. At the ends of a traversal the way
+continues straight on for one more distance, because a sparse survey ends up to one distance too early. Decision 0147 has the
+figures.
 """
 
 from dataclasses import dataclass
@@ -75,11 +77,45 @@ def between(one: PlacedScan, other: PlacedScan, largest_m: float) -> list[Viewpo
     return [_viewpoint(one, other, share) for share in _shares(one.T_map_level, other.T_map_level, largest_m)]
 
 
+def beyond(one: PlacedScan, end: PlacedScan, largest_m: float) -> list[Viewpoint]:
+    """Return evenly spread viewpoints behind the last scan of a traversal, as far as that scan is from the scan before it.
+
+    The way goes straight on with the rotation of the last scan. The points are those of both scans.
+
+    Args:
+        one: the last scan but one; the second scan for the beginning of a traversal.
+        end: the last scan; the first scan for the beginning.
+        largest_m: largest distance between two places, metres; 0 puts no place behind the end.
+
+    Returns:
+        The viewpoints, the nearest to ``end`` first; none if there are none between the two scans.
+    """
+    step_m = end.T_map_level[:3, 3] - one.T_map_level[:3, 3]
+    shares = [*_shares(one.T_map_level, end.T_map_level, largest_m), 1.0]
+    if len(shares) == 1:
+        return []
+    positions = [end.T_map_level[:3, 3] + share * step_m for share in shares]
+    return [
+        _rendered((one, end), transform_from(end.T_map_level[:3, :3], position_m), end.scan.level.height_m)
+        for position_m in positions
+    ]
+
+
+def is_one_way(T_one: Transform, T_other: Transform) -> bool:
+    """Return whether two successive scans belong to one traversal.
+
+    Args:
+        T_one: pose of a scan (4, 4).
+        T_other: pose of the next scan (4, 4).
+    """
+    return float(np.linalg.norm(T_other[:3, 3] - T_one[:3, 3])) <= FARTHEST_M
+
+
 def _shares(T_one: Transform, T_other: Transform, largest_m: float) -> Float64[NDArray[np.float64], " n"]:
     """Return the positions of the viewpoints on the way, 0 at the first scan and 1 at the second, without both ends."""
-    apart_m = float(np.linalg.norm(T_other[:3, 3] - T_one[:3, 3]))
-    if largest_m == 0 or apart_m > FARTHEST_M:
+    if largest_m == 0 or not is_one_way(T_one, T_other):
         return np.zeros(0)
+    apart_m = float(np.linalg.norm(T_other[:3, 3] - T_one[:3, 3]))
     parts = max(1, int(np.ceil(apart_m / largest_m)))
     return np.arange(1, parts) / parts
 
@@ -89,7 +125,12 @@ def _viewpoint(one: PlacedScan, other: PlacedScan, share: float) -> Viewpoint:
     R_map_level = Slerp([0.0, 1.0], Rotation.from_matrix(ends[:, :3, :3]))(share).as_matrix()
     T_map_level = transform_from(R_map_level, (1 - share) * ends[0, :3, 3] + share * ends[1, :3, 3])
     height_m = (1 - share) * one.scan.level.height_m + share * other.scan.level.height_m
-    points = np.concatenate([_moved(each, T_map_level) for each in (one, other)])
+    return _rendered((one, other), T_map_level, height_m)
+
+
+def _rendered(scans: tuple[PlacedScan, PlacedScan], T_map_level: Transform, height_m: float) -> Viewpoint:
+    """Return the viewpoint at a pose with the points of two scans."""
+    points = np.concatenate([_moved(each, T_map_level) for each in scans])
     return Viewpoint(T_map_level, height_m, points, principal_heading(points[:, :3], height_m=height_m))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.between import PlacedScan, Viewpoint, at_scan, between
+from model_training.mapping.between import PlacedScan, Viewpoint, at_scan, between, beyond, is_one_way
 from model_training.mapping.cloud import near
 from model_training.mapping.settings import BuildSettings
 from model_training.mapping.survey import fan, fan_views, levelled_scans
@@ -113,8 +113,8 @@ class Drive:
             placed = PlacedScan(scan, scan.T_map_level(self.poses[scan.number]))
             if k in scans:
                 if before is not None:
-                    on_the_way = between(before, placed, self.settings.between_m)
-                    found += [self._encoded(viewpoint, (k - 1, k)) for viewpoint in on_the_way]
+                    added = self._added(before, placed, k)
+                    found += [self._encoded(viewpoint, (k - 1, k)) for viewpoint in added]
                 found.append(self._encoded(at_scan(placed), (k, k)))
                 if k not in apart:
                     points.add(*near(scan.points, placed.T_map_level))
@@ -124,6 +124,16 @@ class Drive:
         return {name: np.stack([each[name] for each in found]) for name in Places.__slots__} | {
             "keys": keys, "moments": moments
         }  # fmt: skip
+
+    def _added(self, before: PlacedScan, placed: PlacedScan, k: int) -> list[Viewpoint]:
+        """Return the viewpoints between the kept scans ``k - 1`` and ``k``, and those beyond them where a traversal ends."""
+        largest_m, T_map_lidar = self.settings.between_m, self.poses[self.kept]
+        found = between(before, placed, largest_m)
+        if k == 1 or not is_one_way(T_map_lidar[k - 2], T_map_lidar[k - 1]):
+            found += beyond(placed, before, largest_m)
+        if k == len(self.kept) - 1 or not is_one_way(T_map_lidar[k], T_map_lidar[k + 1]):
+            found += beyond(before, placed, largest_m)
+        return found
 
     def _encoded(self, viewpoint: Viewpoint, sources: tuple[int, int]) -> Arrays:
         """Return the fields of one place in ``Places``; its descriptors are (headings, D)."""

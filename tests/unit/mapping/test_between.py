@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model_training.mapping.between import FARTHEST_M, PlacedScan, at_scan, between
+from model_training.mapping.between import FARTHEST_M, PlacedScan, at_scan, between, beyond
 from model_training.mapping.survey import LevelledScan
 from service.geometry.rigid import inverse, rotation_z, transform_from, transform_points
 from service.imaging.pca import Level
@@ -59,6 +59,25 @@ def test_no_gap_exceeds_the_largest_distance(apart_m, largest_m):
     x_m = [0.0, *(each.T_map_level[0, 3] for each in between(one, other, largest_m)), apart_m]
     assert np.diff(x_m).max() <= largest_m + 1e-9
     assert np.diff(x_m).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "at_m"), [(3.0, []), (4.0, [2.0, 4.0]), (9.0, [3.0, 6.0, 9.0]), (FARTHEST_M + 0.1, [])]
+)
+def test_the_way_goes_straight_on_for_one_more_distance_at_its_end(apart_m, at_m):
+    one, end = placed(0.0, height_m=1.8), placed(apart_m, yaw_rad=0.2, height_m=1.8)
+    found = beyond(one, end, 3.0)
+    assert [each.T_map_level[0, 3] - apart_m for each in found] == pytest.approx(at_m)
+    for each in found:
+        np.testing.assert_allclose(each.T_map_level[:3, :3], rotation_z(0.2), atol=1e-12)
+        assert each.height_m == 1.8
+        points_map = transform_points(each.T_map_level, each.points[:, :3].astype(np.float64))
+        np.testing.assert_allclose(points_map, np.tile(POINTS_MAP, (2, 1)), atol=1e-5)
+
+
+def test_the_beginning_of_a_way_goes_on_backwards():
+    found = beyond(placed(4.0, height_m=1.7), placed(0.0, height_m=1.7), 3.0)
+    assert [each.T_map_level[0, 3] for each in found] == pytest.approx([-2.0, -4.0])
 
 
 def test_a_place_at_a_scan_is_the_scan():

@@ -171,7 +171,7 @@ def test_another_encoder_is_refused_before_anything_is_written(half_maps, halves
 
 
 def test_what_is_no_bundle_is_refused(half_maps, tmp_path):
-    with pytest.raises(BundleError, match="not a map bundle: manifest.json is missing"):
+    with pytest.raises(BundleError, match=r"not a map bundle: manifest\.json is missing"):
         merge_maps(half_maps[0], tmp_path, tmp_path / "m")
 
 

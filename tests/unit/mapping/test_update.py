@@ -221,7 +221,7 @@ def test_a_name_that_is_taken_is_refused(small_map, small_dataset, tmp_path):
 
 
 def test_what_is_no_bundle_is_refused(small_dataset, tmp_path):
-    with pytest.raises(BundleError, match="not a map bundle: manifest.json is missing"):
+    with pytest.raises(BundleError, match=r"not a map bundle: manifest\.json is missing"):
         update_map(tmp_path, small_dataset, tmp_path / "m", threads=1)
 
 
