@@ -223,6 +223,12 @@ WHY_MISSED: dict[str, Reason] = {
         1.0082593,
         "the median of three rounds is less than 1 % above the best peer's; latencies of single rounds differ by more",
     ),
+    "request.files_before_engine": Reason(
+        7.0,
+        "the request now comes over a socket, so the HTTP protocol's file counts too. It limits what httptools does not: heads, chunk "
+        "sizes, pipelined requests and slow heads. Without a socket the six others were counted. Each of them has one task: host and "
+        "key, route, body, memory and queue, fields, conversion",
+    ),
     "request.files_in_core": Reason(
         52,
         "The count is of files whose functions one request calls, small ones included: 13 decode, level and fuse images, 7 retrieve, 6 "

@@ -1,7 +1,6 @@
 """Record the files of the service that one real request passes through."""
 
-import asyncio
-import sys
+import socket
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,9 +8,11 @@ from types import CodeType, FrameType
 from typing import Any
 
 import httpx
+import uvicorn
 
 from benchmarks.report import ROOT
 from service.http.app import create_app
+from service.http.protocol import BoundedHttp
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
 
@@ -34,7 +35,7 @@ class Trace:
     _asked: bool = False
 
     def profile(self, frame: FrameType, event: str, _: Any) -> None:
-        """Record the file of every call; a callback for ``sys.setprofile``.
+        """Record the file of every call; a callback for ``threading.setprofile``.
 
         Args:
             frame: frame of the event.
@@ -60,7 +61,7 @@ _ENGINE: frozenset[CodeType] = frozenset({Engine.localize.__code__, Engine.local
 
 
 def trace_of_request(bundle: Path, parts: dict[str, tuple[str, bytes, str]]) -> Trace:
-    """Send two requests to a service in this process, one to warm up and one traced.
+    """Send two requests over a socket to a service in this process, one to warm up and one traced.
 
     Args:
         bundle: map to serve.
@@ -70,25 +71,32 @@ def trace_of_request(bundle: Path, parts: dict[str, tuple[str, bytes, str]]) -> 
         RuntimeError: the service did not answer 200.
     """
     trace = Trace()
-    threading.setprofile(trace.profile)  # worker threads start below
-    sys.setprofile(trace.profile)
+    threading.setprofile(trace.profile)  # the threads of the service start below
     try:
         engine = Engine.open(Settings(maps=(bundle,), threads=1))
         try:
-            asyncio.run(_ask_twice(engine, parts, trace))
+            _ask_twice(engine, parts, trace)
         finally:
             engine.close()
     finally:
-        sys.setprofile(None)
         threading.setprofile(None)
     return trace
 
 
-async def _ask_twice(engine: Engine, parts: dict[str, tuple[str, bytes, str]], trace: Trace) -> None:
-    transport = httpx.ASGITransport(create_app(engine))
-    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
-        for trace._is_on in (False, True):
-            answer = await client.post("/v1/localize", files=parts)
-            if answer.status_code != 200:
-                raise RuntimeError(f"POST /v1/localize: {answer.status_code} {answer.text}")
-    trace._is_on = False
+def _ask_twice(engine: Engine, parts: dict[str, tuple[str, bytes, str]], trace: Trace) -> None:
+    # The same server and protocol as `streetfix serve`.
+    config = uvicorn.Config(create_app(engine), http=BoundedHttp, ws="none", lifespan="off", log_config=None, port=0)
+    server = uvicorn.Server(config)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+        thread.start()
+        try:
+            with httpx.Client(base_url=f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=60.0) as client:
+                for trace._is_on in (False, True):
+                    answer = client.post("/v1/localize", files=parts)
+                    if answer.status_code != 200:
+                        raise RuntimeError(f"POST /v1/localize: {answer.status_code} {answer.text}")
+        finally:
+            trace._is_on = False
+            server.should_exit = True
+            thread.join()

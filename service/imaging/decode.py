@@ -32,6 +32,7 @@ __all__ = [
     "decode_rgb",
     "default_scale_m",
     "require_sizes",
+    "stored_size",
 ]
 
 Rgb = UInt8[NDArray[np.uint8], "H W 3"]
@@ -69,15 +70,35 @@ def decode_rgb(
     format_ = format_of(data, field=field)
     if format_ not in _RGB_FORMATS:
         raise UnsupportedFormatError(
-            f"The part `{field}` is {format_}, which is not read as colour; send JPEG, PNG or WebP.", field=field
+            f"The part `{field}` is {format_}, which is not supported for colour; send JPEG, PNG or WebP.", field=field
         )
     header = header_of(data, format_, field=field)
     require_pixels(header.height, header.width, limits, field=field)
     by = _reduction(header.width, camera, finest_rad) if format_ == "JPEG" and camera is not None else 1
     rgb = opencv_decode(data, cv2.IMREAD_COLOR_RGB | _REDUCED[by] | cv2.IMREAD_IGNORE_ORIENTATION, field=field)
     if rgb.shape != (-(-header.height // by), -(-header.width // by), 3):
-        raise damaged(field, f"its pixels are {rgb.shape}, its header says {header.height}x{header.width}")
+        raise damaged(field, f"the decoded shape is {rgb.shape}, but the header states {header.height}x{header.width}")
     return rgb.astype(np.uint8, copy=False)
+
+
+def stored_size(data: bytes, *, field: str = "rgb") -> tuple[int, int]:
+    """Read the size of an encoded image from its header.
+
+    ``decode_rgb`` may decode a JPEG at a fraction of this size.
+
+    Args:
+        data: bytes of a JPEG, PNG, WebP or TIFF.
+        field: part of the request that errors name.
+
+    Returns:
+        Height and width, pixels.
+
+    Raises:
+        DecodeError: the header is damaged, or the file is cut off.
+        UnsupportedFormatError: the format is unknown.
+    """
+    header = header_of(data, format_of(data, field=field), field=field)
+    return header.height, header.width
 
 
 def _reduction(width: int, camera: PinholeCamera, finest_rad: float) -> int:
@@ -142,7 +163,11 @@ def default_scale_m(stored: np.dtype[Any], encoding: DepthEncoding | None) -> fl
 
 
 def require_sizes(
-    rgb: UInt8[NDArray[np.uint8], "H W 3"], depth_m: Float32[NDArray[np.float32], "h w"], camera: PinholeCamera
+    rgb: UInt8[NDArray[np.uint8], "H W 3"],
+    depth_m: Float32[NDArray[np.float32], "h w"],
+    camera: PinholeCamera,
+    *,
+    rgb_size: tuple[int, int] | None = None,
 ) -> None:
     """Refuse images whose aspect ratio is not that of the camera.
 
@@ -152,15 +177,17 @@ def require_sizes(
         rgb: colour image, sRGB.
         depth_m: depth z, metres.
         camera: camera of the request, pixels.
+        rgb_size: height and width of the encoded colour image, pixels, if it may have been decoded at a fraction of its size.
+            None takes those of ``rgb``.
 
     Raises:
         ImageSizeError: an aspect ratio differs from that of the camera by more than 1 %.
     """
-    for field, picture in (("rgb", rgb), ("depth", depth_m)):
-        height, width = picture.shape[:2]
+    sizes = (("rgb", rgb.shape[:2] if rgb_size is None else rgb_size), ("depth", depth_m.shape))
+    for field, (height, width) in sizes:
         if abs(width * camera.height - height * camera.width) > ASPECT_TOLERANCE * height * camera.width:
             raise ImageSizeError(
-                f"The picture `{field}` has {width}x{height} pixels, which is not the camera's {camera.width}x"
-                f"{camera.height} at any scale; send the whole picture, or the intrinsics of the picture sent.",
+                f"The image `{field}` has {width}x{height} pixels, but the camera has {camera.width}x{camera.height}, so the "
+                "aspect ratios differ; send the whole image, or the intrinsics of the image that you sent.",
                 field=field,
             )

@@ -65,7 +65,8 @@ def read_depth_values(data: bytes, *, encoding: DepthEncoding | None, limits: Im
         case "SFD1":
             return read_raw16(data, limits, field=_FIELD)
         case _:
-            raise _unsupported(f"a {format_} picture loses the depth it is given")
+            why = "is lossy" if format_ == "JPEG" else "has only 8 bits per channel"
+            raise _unsupported(f"{format_} {why} and cannot store depth")
 
 
 def opencv_decode(data: bytes, flags: int, *, field: str) -> NDArray[Any]:
@@ -87,9 +88,9 @@ def opencv_decode(data: bytes, flags: int, *, field: str) -> NDArray[Any]:
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise damaged(field, "its pixels are damaged or cut off") from error
+        raise damaged(field, "the pixel data are damaged or cut off") from error
     if picture is None:
-        raise damaged(field, "its pixels are damaged or cut off")
+        raise damaged(field, "the pixel data are damaged or cut off")
     return picture
 
 
@@ -97,8 +98,8 @@ def _png16(data: bytes, limits: ImageLimits) -> Values:
     header = header_of(data, "PNG", field=_FIELD)
     if (header.channels, header.bits) != (1, 16):
         raise _unsupported(
-            f"this PNG has {header.channels} channels of {header.bits} bits, and depth needs 1 of 16 (or, for a depth "
-            'picture of CARLA, encoding "carla")'
+            f"this PNG has {header.channels} channels of {header.bits} bits, but depth needs 1 channel of 16 bits (a depth "
+            'image from CARLA needs encoding "carla")'
         )
     require_pixels(header.height, header.width, limits, field=_FIELD)
     if is_plain_grey16(data):
@@ -109,11 +110,11 @@ def _png16(data: bytes, limits: ImageLimits) -> Values:
 def _carla(data: bytes, format_: str, limits: ImageLimits) -> Values:
     header = header_of(data, "PNG", field=_FIELD) if format_ == "PNG" else None
     if header is None or header.bits != 8 or header.channels not in (3, 4):
-        raise _unsupported('encoding "carla" is a PNG with 3 or 4 channels of 8 bits, and this is none')
+        raise _unsupported('encoding "carla" needs a PNG with 3 or 4 channels of 8 bits')
     require_pixels(header.height, header.width, limits, field=_FIELD)
     bgr = opencv_decode(data, cv2.IMREAD_UNCHANGED, field=_FIELD)
     if bgr.ndim != 3 or bgr.shape[:2] != (header.height, header.width):
-        raise damaged(_FIELD, f"its pixels are {bgr.shape}, its header says {header.height}x{header.width}")
+        raise damaged(_FIELD, f"the decoded shape is {bgr.shape}, but the header states {header.height}x{header.width}")
     b, g, r = (bgr[..., n].astype(np.uint32) for n in range(3))
     value = r + (g << 8) + (b << 16)
     return np.where(value == CARLA_FAR_VALUE, 0, value).astype(np.uint32)
@@ -123,7 +124,7 @@ def _float_tiff(data: bytes, limits: ImageLimits) -> Values:
     header = header_of(data, "TIFF", field=_FIELD)
     if not header.is_float or (header.channels, header.bits) != (1, 32):
         samples = f"{'float' if header.is_float else 'integer'} channels of {header.bits} bits"
-        raise _unsupported(f"this TIFF has {header.channels} {samples}, and depth needs 1 float channel of 32")
+        raise _unsupported(f"this TIFF has {header.channels} {samples}, but depth needs 1 float channel of 32 bits")
     require_pixels(header.height, header.width, limits, field=_FIELD)
     return _of_size(opencv_decode(data, cv2.IMREAD_UNCHANGED, field=_FIELD), header.height, header.width)
 
@@ -137,30 +138,30 @@ def _npy(data: bytes, limits: ImageLimits) -> Values:
             (2, 0): np.lib.format.read_array_header_2_0,
         }.get(version)
         if reader is None:
-            raise _unsupported(f"NPY version {version[0]}.{version[1]} is for structured arrays")
+            raise _unsupported(f"NPY version {version[0]}.{version[1]} (structured arrays) is not supported")
         shape, is_fortran, dtype = reader(stream, max_header_size=_MAX_NPY_HEADER_BYTES)
     except NPY_HEADER_ERRORS as error:
-        raise damaged(_FIELD, "its NPY header is damaged") from error
+        raise damaged(_FIELD, "the NPY header is damaged") from error
     if dtype.hasobject or dtype.str[1:] not in _NPY_DTYPES:
-        raise _unsupported(f"NPY of type {dtype} is not read; save float32 (or float16, float64, uint16)")
+        raise _unsupported(f"the NPY type {dtype} is not supported (use float32, float16, float64 or uint16)")
     if len(shape) != 2 or min(shape) < 1:
-        raise damaged(_FIELD, f"its NPY shape is {shape}, and depth needs (height, width)")
+        raise damaged(_FIELD, f"the NPY shape is {shape}, but depth needs (height, width)")
     require_pixels(shape[0], shape[1], limits, field=_FIELD)
     needed, there = shape[0] * shape[1] * dtype.itemsize, len(data) - stream.tell()
     if there != needed:
-        raise damaged(_FIELD, f"the NPY has {there} bytes of values where its shape {shape} needs {needed}")
+        raise damaged(_FIELD, f"the NPY has {there} bytes of values, but its shape {shape} needs {needed}")
     values = np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape, order="F" if is_fortran else "C")
     return values.astype(dtype.newbyteorder("="), copy=False)
 
 
 def _of_size(values: NDArray[Any], height: int, width: int) -> Values:
     if values.shape != (height, width):
-        raise damaged(_FIELD, f"its pixels are {values.shape}, its header says {height}x{width}")
+        raise damaged(_FIELD, f"the decoded shape is {values.shape}, but the header states {height}x{width}")
     return values
 
 
 def _unsupported(why: str) -> UnsupportedFormatError:
     return UnsupportedFormatError(
-        f"The part `{_FIELD}` is not a depth picture that we read: {why}; send 16-bit PNG, 32-bit float TIFF or NPY.",
+        f"The part `{_FIELD}` is not a supported depth image: {why}; send 16-bit PNG, 32-bit float TIFF or NPY.",
         field=_FIELD,
     )

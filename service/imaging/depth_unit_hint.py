@@ -42,10 +42,10 @@ def unit_hint(depth_m: NDArray[Any]) -> str | None:
     if factor is None:
         return None
     median_m = float(np.median(_measured(depth_m)))
-    unit, scale_m = ("millimetres", "0.001") if factor < 1 else ("metres that were taken for millimetres", "1")
+    unit, scale_m = ("millimetres", "0.001") if factor < 1 else ("metres that were read as millimetres", "1")
     return (
-        f"the median depth is {median_m:.4g} m, which looks like {unit}: send scale_m {scale_m} in depth, "
-        f"or {factor:g} times the scale that was sent; if the depth is a disparity, divide the scale by {factor:g} instead"
+        f"the median depth is {median_m:.4g} m, which looks like {unit}; send depth.scale_m = {scale_m}, "
+        f"or multiply the scale that you sent by {factor:g} (for disparity, divide it by {factor:g})"
     )
 
 

@@ -51,7 +51,9 @@ def depth_from_values(
     """
     _require_positive(scale_m, "depth.scale_m", "metres for each stored unit, e.g. 0.001")
     if max_range_m is not None:
-        _require_positive(max_range_m, "depth.max_range_m", "the sensor's limit in metres, or leave it out")
+        _require_positive(
+            max_range_m, "depth.max_range_m", "the range limit of the sensor in metres, or omit the field"
+        )
     height, width = values.shape
     scaled = camera.scaled_to(width, height)
     with np.errstate(all="ignore"):
@@ -95,5 +97,5 @@ def ray_lengths(camera: PinholeCamera) -> Float64[NDArray[np.float64], "H W"]:
 
 def _require_positive(value: float | None, field: str, meaning: str) -> float:
     if value is None or not np.isfinite(value) or value <= 0:
-        raise RequestError(f"The field `{field}` is {value}; give a positive number: {meaning}.", field=field)
+        raise RequestError(f"The field `{field}` is {value}; send a positive number: {meaning}.", field=field)
     return value

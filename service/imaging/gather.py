@@ -79,7 +79,7 @@ def gather(
     # The compiled code trusts these shapes and reads memory by them.
     rgb, depth_m = np.ascontiguousarray(rgb, np.uint8), np.ascontiguousarray(depth_m, np.float32)
     if rgb.ndim != 3 or rgb.shape[2] != 3 or depth_m.ndim != 2:
-        raise ValueError(f"rgb {rgb.shape} and depth {depth_m.shape} are no pictures")
+        raise ValueError(f"rgb {rgb.shape} must be (H, W, 3), and depth {depth_m.shape} must be (h, w)")
     rays = _sub_rays(grid)
     cells = grid.rows * grid.columns
     R = np.ascontiguousarray(R_camera_view, np.float64).reshape(3, 3)

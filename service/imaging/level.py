@@ -235,7 +235,7 @@ def _fit_ground(
     depth_m, R = np.ascontiguousarray(depth_m, np.float32), np.ascontiguousarray(R, np.float64)
     height, width = depth_m.shape
     if R.shape != (3, 3):
-        raise ValueError(f"R {R.shape} is no rotation")
+        raise ValueError(f"R {R.shape} must be a rotation matrix (3, 3)")
     step = max(1, width // STEP_PIXELS)
     found, points = np.empty(6), np.empty(-(-height // step) * -(-width // step), _POINT)
     _library().streetfix_fit_ground(

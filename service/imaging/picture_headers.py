@@ -85,14 +85,14 @@ def format_of(data: bytes, *, field: str) -> Format:
         UnsupportedFormatError: the format is none of ``Format``.
     """
     if not data:
-        raise DecodeError(f"The part `{field}` is empty (0 bytes); send the picture's bytes in it.", field=field)
+        raise DecodeError(f"The part `{field}` is empty (0 bytes); send the bytes of an image file.", field=field)
     for magic, name in _MAGIC:
         if data.startswith(magic):
             return name
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return "WebP"
     raise UnsupportedFormatError(
-        f"The format of `{field}` is unknown (it begins with {data[:8].hex(' ')}); send colour as JPEG, PNG or WebP, "
+        f"The format of `{field}` is unknown (the first bytes are {data[:8].hex(' ')}); send colour as JPEG, PNG or WebP, "
         "and depth as 16-bit PNG, float TIFF or NPY.",
         field=field,
     )
@@ -113,9 +113,9 @@ def header_of(data: bytes, format_: Format, *, field: str) -> PictureHeader:
     try:
         header = readers[format_](data, field)
     except (struct.error, IndexError) as error:
-        raise damaged(field, f"its {format_} header ends early") from error
+        raise damaged(field, f"the {format_} header is cut off") from error
     if header.width < 1 or header.height < 1:
-        raise damaged(field, f"its {format_} header says {header.width}x{header.height} pixels")
+        raise damaged(field, f"the {format_} header states {header.width}x{header.height} pixels")
     return header
 
 
@@ -132,8 +132,8 @@ def require_bytes(data: bytes, limits: ImageLimits, *, field: str) -> None:
     """
     if len(data) > limits.max_bytes:
         raise TooLargeError(
-            f"The part `{field}` has {len(data)} bytes, more than the limit of {limits.max_bytes}; "
-            "send a smaller or more compressed picture.",
+            f"The part `{field}` has {len(data)} bytes, but the limit is {limits.max_bytes}; "
+            "send a smaller or more compressed image.",
             field=field,
         )
 
@@ -153,8 +153,8 @@ def require_pixels(height: int, width: int, limits: ImageLimits, *, field: str) 
     """
     if height * width > limits.max_pixels:
         raise TooLargeError(
-            f"The picture `{field}` has {width}x{height} pixels, more than the limit of {limits.max_pixels}; "
-            "scale it down.",
+            f"The image `{field}` has {width}x{height} pixels, but the limit is {limits.max_pixels} pixels; "
+            "resize the image.",
             field=field,
         )
     if limits.reserve is not None:
@@ -168,13 +168,13 @@ def damaged(field: str, why: str) -> DecodeError:
         field: part of the request that the error names.
         why: what is wrong, as a clause of the error message.
     """
-    return DecodeError(f"The picture `{field}` cannot be decoded: {why}; send the whole file unchanged.", field=field)
+    return DecodeError(f"The image `{field}` cannot be decoded: {why}; send the whole file unchanged.", field=field)
 
 
 def _png(data: bytes, field: str) -> PictureHeader:
     length, kind, width, height, bits, colour = struct.unpack_from(">I4sIIBB", data, 8)
     if kind != b"IHDR" or length != 13 or colour not in _PNG_CHANNELS:
-        raise damaged(field, "its PNG header is no IHDR chunk")
+        raise damaged(field, "the PNG does not begin with an IHDR chunk")
     _require_png_chunks(data, field)
     return PictureHeader(height, width, _PNG_CHANNELS[colour], bits)
 
@@ -229,13 +229,13 @@ def _webp(data: bytes, field: str) -> PictureHeader:
     if kind == b"VP8L" and data[20] == 0x2F:
         (packed,) = struct.unpack_from("<I", data, 21)
         return PictureHeader((packed >> 14 & 0x3FFF) + 1, (packed & 0x3FFF) + 1, 4, 8)
-    raise damaged(field, "its WebP header is none of VP8, VP8L and VP8X")
+    raise damaged(field, "the WebP header is not VP8, VP8L or VP8X")
 
 
 def _tiff(data: bytes, field: str) -> PictureHeader:
     tags = read_tiff_tags(data)
     if tags is None:
-        raise damaged(field, "its first TIFF directory is incomplete or contradicts itself")
+        raise damaged(field, "the first TIFF directory is incomplete or inconsistent")
     if tags.tile_pixels > tags.width * tags.height + 2**20:
-        raise damaged(field, f"its TIFF tiles have {tags.tile_pixels} pixels, more than the picture")
+        raise damaged(field, f"the TIFF tiles have {tags.tile_pixels} pixels, more than the image")
     return PictureHeader(tags.height, tags.width, tags.channels, tags.bits, tags.sample_format == 3)

@@ -51,7 +51,7 @@ def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[N
             length, kind = struct.unpack_from(">I4s", data, at)
             end = at + 8 + length
             if deflate.crc32(view[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-                raise damaged(field, f"the checksum of its chunk {kind.hex(' ')} does not fit")
+                raise damaged(field, f"the checksum of the chunk {kind.hex(' ')} is wrong")
             if kind == b"IDAT":
                 parts.append(view[at + 8 : end])
             elif kind == b"IEND":
@@ -60,9 +60,9 @@ def read_grey16(data: bytes, height: int, width: int, *, field: str) -> UInt16[N
         # One spare byte reveals an image with more data than its header states.
         raw = deflate.zlib_decompress(parts[0] if len(parts) == 1 else b"".join(parts), needed + 1)
     except (deflate.DeflateError, struct.error) as error:
-        raise damaged(field, "its pixels are damaged, cut off, or far more than its header says") from error
+        raise damaged(field, "the pixel data are damaged, cut off, or longer than the header states") from error
     if len(raw) != needed:
-        raise damaged(field, f"it holds {len(raw)} bytes of pixels where {width}x{height} need {needed}")
+        raise damaged(field, f"the pixel data have {len(raw)} bytes, but {width}x{height} pixels need {needed}")
     out = np.empty((height, width), np.uint16)
     rows = library().streetfix_unfilter((ctypes.c_char * needed).from_buffer(raw), height, width, out.ctypes.data)
     if rows != height:

@@ -11,7 +11,7 @@ from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Rotation, rotation_z
 from service.imaging.brightness import brightness
 from service.imaging.depth_unit_hint import unit_hint
-from service.imaging.fusion import fuse_and_keep
+from service.imaging.fusion import fuse
 from service.imaging.gather import gather
 from service.imaging.level import GivenHeight, HeightOrigin, level_query
 from service.imaging.view_grid import PLANES, Planes, ViewGrid, heights_of
@@ -125,7 +125,7 @@ def query_views(
     seen &= rows_seen[:, None]
     ranges *= seen
     colour *= seen[..., None]
-    fused, intensity = fuse_and_keep(colour, ranges)
+    fused, intensity = fuse(colour, ranges)
     wide = np.concatenate([fused, np.stack([heights_of(ranges, level.height_m, grid), seen])])
     planes = np.empty((len(turns), len(PLANES), grid.rows, grid.columns), np.float32)
     for view, turn in zip(planes, turns, strict=True):
@@ -141,11 +141,11 @@ def query_views(
 
 def _no_depth(depth_m: Float32[NDArray[np.float32], "h w"], grid: ViewGrid) -> NoDepthError:
     if not depth_m.any():
-        why = "no pixel has a depth: check the depth picture, and max_range_m in depth if it was sent"
+        why = "no pixel has a depth: check the depth image, and depth.max_range_m if you sent it"
     else:
-        why = unit_hint(depth_m) or "check scale, kind and the camera's intrinsics"
+        why = unit_hint(depth_m) or "check depth.scale_m, depth.kind and the camera intrinsics"
     return NoDepthError(
-        "the depth picture has no measurement inside the view grid "
+        "the depth image has no measurement inside the view grid "
         f"({grid.min_range_m:g}-{grid.max_range_m:g} m, {grid.elevation_bottom_deg:g} to "
         f"{grid.elevation_top_deg:g} degrees of elevation): {why}",
         field="depth",

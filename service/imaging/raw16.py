@@ -40,14 +40,14 @@ def read_raw16(data: bytes, limits: ImageLimits, *, field: str) -> Values:
         TooLargeError: the image has more pixels than the limits allow.
     """
     if len(data) < _HEADER.size:
-        raise damaged(field, "its raw16 header ends early")
+        raise damaged(field, "the raw16 header is cut off")
     _, width, height = _HEADER.unpack_from(data)
     if width < 1 or height < 1:
-        raise damaged(field, f"its raw16 header says {width}x{height} pixels")
+        raise damaged(field, f"the raw16 header states {width}x{height} pixels")
     require_pixels(height, width, limits, field=field)
     frame, needed = memoryview(data)[_HEADER.size :], 2 * width * height
     unpack = _from_lz4 if frame[:4] == _LZ4_FRAME else _from_zstd
-    raw = unpack(frame, needed, f"where {width}x{height} pixels need {needed}", field)
+    raw = unpack(frame, needed, f"but {width}x{height} pixels need {needed}", field)
     return np.frombuffer(raw, "<u2").reshape(height, width).astype(np.uint16, copy=False)
 
 
@@ -90,14 +90,14 @@ def _from_zstd(frame: memoryview, needed: int, where: str, field: str) -> bytes:
     try:
         stated = zstandard.get_frame_parameters(frame).content_size
         if stated != needed:
-            raise damaged(field, f"its zstd frame states {stated} bytes {where}")
+            raise damaged(field, f"the zstd frame states {stated} bytes, {where}")
         raw = zstandard.ZstdDecompressor(max_window_size=2**27).decompress(
             frame, max_output_size=needed, allow_extra_data=False
         )
     except zstandard.ZstdError as error:
-        raise damaged(field, "its zstd frame is damaged or cut off") from error
+        raise damaged(field, "the zstd frame is damaged or cut off") from error
     if len(raw) != needed:
-        raise damaged(field, f"its zstd frame holds {len(raw)} bytes {where}")
+        raise damaged(field, f"the zstd frame has {len(raw)} bytes, {where}")
     return raw
 
 
@@ -109,7 +109,8 @@ def _from_lz4(frame: memoryview, needed: int, where: str, field: str) -> bytes:
         # One spare byte reveals a frame that is too long.
         raw: bytes = unpacking.decompress(frame, max_length=needed + 1)
     except (RuntimeError, EOFError) as error:
-        raise damaged(field, "its lz4 frame is damaged or cut off") from error
+        raise damaged(field, "the lz4 frame is damaged or cut off") from error
     if len(raw) != needed or not unpacking.eof or unpacking.unused_data:
-        raise damaged(field, f"its lz4 frame holds {'more or less' if len(raw) == needed else len(raw)} bytes {where}")
+        has = "too many or too few" if len(raw) == needed else str(len(raw))
+        raise damaged(field, f"the lz4 frame has {has} bytes, {where}")
     return raw

@@ -36,14 +36,14 @@ def read_ros_depth(data: bytes, limits: ImageLimits, *, field: str) -> Shaped[ND
         TooLargeError: the image has more pixels than the limits allow.
     """
     if len(data) <= _HEADER.size:
-        raise damaged(field, "its compressedDepth header ends early")
+        raise damaged(field, "the compressedDepth header is cut off")
     _, a, b = _HEADER.unpack_from(data)
     body = data[_HEADER.size :]
     values = _png(body, limits, field) if body.startswith(_PNG) else _rvl(body, limits, field)
     if a == 0 and b == 0:
         return values
     if not (np.isfinite(a) and np.isfinite(b)):
-        raise damaged(field, f"its compressedDepth header says depth = {a} / (value - {b})")
+        raise damaged(field, f"the compressedDepth header states depth = {a} / (value - {b}), which is not finite")
     with np.errstate(all="ignore"):
         depth = np.float32(a) / (values.astype(np.float32) - np.float32(b))
     return np.where(values > 0, depth, np.float32(0)).astype(np.float32)
@@ -53,20 +53,20 @@ def _png(body: bytes, limits: ImageLimits, field: str) -> NDArray[np.uint16]:
     header = header_of(body, "PNG", field=field)
     require_pixels(header.height, header.width, limits, field=field)
     if not is_plain_grey16(body):
-        raise damaged(field, "its compressedDepth PNG is not 16-bit grey")
+        raise damaged(field, "the compressedDepth PNG is not 16-bit grey")
     return read_grey16(body, header.height, header.width, field=field)
 
 
 def _rvl(body: bytes, limits: ImageLimits, field: str) -> NDArray[np.uint16]:
     if len(body) < _SIZE.size:
-        raise damaged(field, "its RVL size ends early")
+        raise damaged(field, "the RVL size is cut off")
     width, height = _SIZE.unpack_from(body)
     if width < 1 or height < 1:
-        raise damaged(field, f"its RVL size says {width}x{height} pixels (send compressedDepth with png or rvl)")
+        raise damaged(field, f"the RVL size is {width}x{height} pixels (send compressedDepth with png or rvl)")
     require_pixels(height, width, limits, field=field)
     packed, out = body[_SIZE.size :], np.empty((height, width), np.uint16)
     buffer = (ctypes.c_char * len(packed)).from_buffer_copy(packed) if packed else None
     done = library().streetfix_rvl(buffer, len(packed), out.size, out.ctypes.data)
     if done != out.size:
-        raise damaged(field, f"its RVL data end, or make no sense, after {done} of {out.size} pixels")
+        raise damaged(field, f"the RVL data are cut off or invalid after {done} of {out.size} pixels")
     return out

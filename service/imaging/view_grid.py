@@ -18,6 +18,9 @@ from service.imaging.brightness import brightness
 #: image (``service.imaging.brightness``, standard deviations).
 PLANES = ("range_m", "v1", "v2", "height_m", "observed", "brightness")
 
+#: Largest valid range of the default grid, metres. Images of depth for people end there too.
+MAX_RANGE_M = 40.0
+
 Ranges = Float32[NDArray[np.float32], "rows columns"]
 #: Range (m) and intensity (unit of the sensor) of a LiDAR over 360 degrees.
 Panorama = Float32[NDArray[np.float32], "2 rows around"]
@@ -48,7 +51,7 @@ class ViewGrid:
     elevation_top_deg: float = 15.0
     elevation_bottom_deg: float = -15.0
     min_range_m: float = 0.5
-    max_range_m: float = 40.0
+    max_range_m: float = MAX_RANGE_M
 
     @property
     def elevations_rad(self) -> Float64[NDArray[np.float64], " rows"]:

@@ -1,6 +1,6 @@
 """The answer to a query: its fields, and the check that all numbers are finite."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,10 +22,12 @@ Status = Literal["LOCALIZED", "AMBIGUOUS", "OUT_OF_MAP"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timings:
-    """Duration of each stage, in milliseconds.
+    """Duration of each stage of one request, in milliseconds.
+
+    A frame that a stream has kept counts in the request that brought it.
 
     Attributes:
-        decode_ms: decoding of the images. The caller that decoded them sets this field and adds it to ``total_ms``.
+        decode_ms: decoding of the images, summed over the frames; 0 if the query came decoded.
         fuse_ms: levelling, resampling and fusion to query views, summed over the frames.
         encode_ms: encoding to descriptors, summed over the frames.
         search_ms: search of the map, ranking of the places, clustering and street vote.
@@ -63,6 +65,8 @@ class Answer:
         spread: mean and covariance over all places where the camera may be; None for a LOCALIZED answer.
         reasons: what may be wrong with the query or the map, the likeliest first. Empty for a LOCALIZED answer, and if all
             confidence features lie in the range of the calibration data.
+        extrapolated: confidence features outside the range of the calibration data: name, and signed distance from its mean in
+            standard deviations, the farthest first. The confidence is an extrapolation then.
         frames: number of image pairs in the query.
         evidence: confidence features, in the order of ``service.confidence.features.FEATURES``; None without registration.
         T_map_vehicle_guess: best guess of the vehicle pose; None if the query does not give the camera's pose on the vehicle.
@@ -84,6 +88,7 @@ class Answer:
     candidates: tuple[Candidate, ...] | None
     spread: Spread | None
     reasons: tuple[Reason, ...]
+    extrapolated: tuple[tuple[str, float], ...]
     frames: int
     evidence: Float64[NDArray[np.float64], " F"] | None
     T_map_vehicle_guess: Transform | None
@@ -125,6 +130,9 @@ def _gather(value: object, numbers: list[float]) -> None:
     elif isinstance(value, tuple):
         for each in value:
             _gather(each, numbers)
+    elif isinstance(value, Mapping):
+        for each in value.values():
+            _gather(each, numbers)
     else:
         for name in getattr(value, "__dataclass_fields__", ()):
             _gather(getattr(value, name), numbers)
@@ -137,6 +145,9 @@ def _paths(value: object, path: str) -> Iterator[tuple[str, float | NDArray[np.g
     elif isinstance(value, tuple):
         for number, each in enumerate(value):
             yield from _paths(each, f"{path}.{number}")
+    elif isinstance(value, Mapping):
+        for name, each in value.items():
+            yield from _paths(each, f"{path}.{name}")
     else:
         for name in getattr(value, "__dataclass_fields__", ()):
             yield from _paths(getattr(value, name), f"{path}.{name}".removeprefix("."))

@@ -1,7 +1,5 @@
 """Build the answer from the results of the stages."""
 
-from time import perf_counter
-
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
@@ -16,6 +14,7 @@ from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
 from service.retrieval.retrieve import Retrieved
 from service.scoring.candidates import Candidate, Refined
+from service.timing import StageTimer
 
 #: Largest distance at which a registered pose verifies a place.
 VERIFIED_M = 5.0
@@ -23,7 +22,7 @@ VERIFIED_M = 5.0
 
 def compose(
     bundle: MapBundle, frames: tuple[Frame, ...], retrieved: Retrieved, refined: Refined | None,
-    evidence: Float64[NDArray[np.float64], " F"] | None, outcome: Outcome, *, started: float, found: float,
+    evidence: Float64[NDArray[np.float64], " F"] | None, outcome: Outcome, timer: StageTimer,
 ) -> Answer:  # fmt: skip
     """Build an answer from the results of all stages.
 
@@ -34,13 +33,11 @@ def compose(
         refined: registered candidates; None if nothing was registered.
         evidence: confidence features; None without ``refined``.
         outcome: status, confidence, candidates, spread and reasons.
-        started: time at which the answer began, from ``time.perf_counter`` (s).
-        found: time at which retrieval ended, from ``time.perf_counter`` (s).
+        timer: of the request.
 
     Raises:
         NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
     """
-    done = perf_counter()
     query, views, heaviest = frames[0].query, frames[0].views, retrieved.hypotheses[0]
     T_map_camera = _pose_of(bundle, heaviest, views) if refined is None else refined.best.T_map_camera
     told = max(query.neighbours, query.ranked)
@@ -54,6 +51,7 @@ def compose(
         candidates=outcome.candidates,
         spread=outcome.spread,
         reasons=outcome.reasons,
+        extrapolated=outcome.extrapolated,
         frames=len(frames),
         evidence=evidence,
         T_map_vehicle_guess=None if query.T_vehicle_camera is None else T_map_camera @ inverse(query.T_vehicle_camera),
@@ -62,22 +60,20 @@ def compose(
         measured_share=views.measured_share,
         height_m=views.height_m,
         height_origin=views.height_origin,
-        timings=_timings(frames, started, found, done, registered=refined is not None),
+        timings=_timings(timer, registered=refined is not None),
     )
     require_finite(answer)
     return answer
 
 
-def _timings(frames: tuple[Frame, ...], started: float, found: float, done: float, *, registered: bool) -> Timings:
-    fuse_s, encode_s, search_s = (
-        sum(getattr(frame, name) for frame in frames) for name in ("fuse_s", "encode_s", "search_s")
-    )
+def _timings(timer: StageTimer, *, registered: bool) -> Timings:
     return Timings(
-        fuse_ms=1e3 * fuse_s,
-        encode_ms=1e3 * encode_s,
-        search_ms=1e3 * (search_s + found - started),
-        register_ms=1e3 * (done - found) if registered else 0.0,
-        total_ms=1e3 * (done - started + fuse_s + encode_s + search_s),
+        decode_ms=timer.ms("decode"),
+        fuse_ms=timer.ms("fuse"),
+        encode_ms=timer.ms("encode"),
+        search_ms=timer.ms("search"),
+        register_ms=timer.ms("register") if registered else 0.0,
+        total_ms=timer.total_ms,
     )
 
 

@@ -1,7 +1,6 @@
 """Localize a query in a map: retrieve places as the paper does, register candidates on the map cloud, and decide."""
 
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.query import Query
 from service.retrieval.retrieve import look_up, require_encoder_of, retrieve
+from service.timing import StageTimer
 
 
 class Localizer:
@@ -87,48 +87,53 @@ class Localizer:
             RequestError: the calibration does not support such a low false-accept rate.
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
-        pairs = zip(queries, T_reference_camera, strict=True)
-        return self.answer(tuple(replace(self.look_up(query), T_reference_camera=T) for query, T in pairs))
+        timer, pairs = StageTimer(), zip(queries, T_reference_camera, strict=True)
+        return self.answer(
+            tuple(replace(self.look_up(query, timer), T_reference_camera=T) for query, T in pairs), timer
+        )
 
-    def look_up(self, query: Query) -> Frame:
+    def look_up(self, query: Query, timer: StageTimer | None = None) -> Frame:
         """Encode one image pair and search the map for similar views, without registration.
 
         The returned frame is a reference. Set its ``T_reference_camera`` to use it as another frame of a query.
 
         Args:
             query: one image pair, its camera and its options.
+            timer: of the request; None does not measure.
 
         Raises:
             NoDepthError: the depth image holds no measurement within the view grid.
         """
-        return look_up(self.bundle, self.encoder, query, self.clusters)
+        return look_up(self.bundle, self.encoder, query, self.clusters, timer or StageTimer())
 
-    def answer(self, frames: tuple[Frame, ...]) -> Answer:
+    def answer(self, frames: tuple[Frame, ...], timer: StageTimer | None = None) -> Answer:
         """Answer a query from frames that ``look_up`` returned.
 
         Args:
             frames: image pairs, the reference first, as in ``localize_frames``.
+            timer: of the request, with the stages before. None counts only the stages of this call.
 
         Raises:
             RequestError: the calibration does not support such a low false-accept rate.
             NotFiniteError: a number of the answer is not finite, because of a defect of this program or of the map.
         """
-        started = perf_counter()
+        timer = timer or StageTimer()
         bundle, query = self.bundle, frames[0].query
         cloud = bundle.cloud if query.refine else None
         calibration = None if cloud is None else bundle.calibration
         require_promise(bundle.calibration if query.refine else None, query)
         # 1. Retrieval: the most similar places, clusters of the views, and the paper's K-NN vote over the streets.
-        retrieved = retrieve(bundle, frames[0], self.clusters)
-        found = perf_counter()
-        # 2. Registration: refine candidate poses on the map cloud, and rank them.
-        refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining)
-        # 3. Confidence features of the best candidate and its rivals.
-        evidence = None
-        if refined is not None:
-            places_m = bundle.T_map_place[:, :2, 3]
-            evidence = evidence_of(frames, refined, retrieved.neighbours, retrieved.hypotheses, places_m, bundle.grid)
-        # 4. Decision: status and calibrated confidence; reasons and spread if the answer is not LOCALIZED.
-        outcome = outcome_of(calibration, query, refined, evidence, frames=len(frames), extent=self.extent)
+        with timer.stage("search"):
+            retrieved = retrieve(bundle, frames[0], self.clusters)
+        with timer.stage("register"):
+            # 2. Registration: refine candidate poses on the map cloud, and rank them.
+            refined = None if cloud is None else refine(bundle, cloud, frames, query.prior, self.refining)
+            # 3. Confidence features of the best candidate and its rivals.
+            evidence = None
+            if refined is not None:
+                places_m, grid = bundle.T_map_place[:, :2, 3], bundle.grid
+                evidence = evidence_of(frames, refined, retrieved.neighbours, retrieved.hypotheses, places_m, grid)
+            # 4. Decision: status and calibrated confidence; reasons and spread if the answer is not LOCALIZED.
+            outcome = outcome_of(calibration, query, refined, evidence, frames=len(frames), extent=self.extent)
         # 5. Build the answer, and check that all its numbers are finite.
-        return compose(bundle, frames, retrieved, refined, evidence, outcome, started=started, found=found)
+        return compose(bundle, frames, retrieved, refined, evidence, outcome, timer)

@@ -10,7 +10,7 @@ from service.geometry.rigid import heading_of_camera, transform_from
 from service.maps.reader import MapBundle
 from service.registration.covariance import OF_POINTS, OF_RAYS, covariance_of, disagreement, score_outer_product
 from service.registration.local_search import LocalSearchSettings, search_locally
-from service.registration.points import PointSettings
+from service.registration.points import FOCAL_BASELINE_PX_M, PointSettings
 from service.registration.rays import RaySettings, adjust
 from service.registration.register import RegistrationSettings, register
 from service.registration.surfel_map import SurfelMap
@@ -21,9 +21,8 @@ from service.retrieval.starts import StartSettings, starts_from
 from service.scoring.candidates import Candidate, Refined
 from service.scoring.measured import measure, merged_points
 from service.scoring.photometry import BrightnessScorer, PhotometrySettings
-from service.scoring.rendered_depth import RenderedDepthScorer
-from service.scoring.scorer import LocalScoreWeights, PoseScorer, SupportWeights
 from service.scoring.similarity import similarity_of
+from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +43,7 @@ class RefineSettings:
     """
 
     fewest_points: int = 30
-    focal_baseline_px_m: float = 80.0
+    focal_baseline_px_m: float = FOCAL_BASELINE_PX_M
     support: SupportWeights = field(default_factory=SupportWeights)
     starts: StartSettings = field(default_factory=StartSettings)
     points: PointSettings = field(default_factory=PointSettings)
@@ -108,8 +107,8 @@ def refine(
     # 3. Scores, and other local minima around the best pose.
     sights = SurfelRaycaster(cloud, settings.rays)
     scorer = PoseScorer(
-        bundle, measured, RenderedDepthScorer(cloud, measured), BrightnessScorer(sights, measured, settings.photometry), prior,
-        settings.support, settings.near,
+        measured, scorers_of(bundle, cloud, measured, prior, settings.support),
+        BrightnessScorer(sights, measured, settings.photometry), settings.support, settings.near,
     )  # fmt: skip
     candidates = scorer.with_brightness(scorer.candidates(found))
     independent = float(np.median([frame.independent_noise for frame in frames]))

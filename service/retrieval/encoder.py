@@ -56,12 +56,15 @@ class Encoder:
         outputs = {o.name: list(o.shape) for o in session.get_outputs()}
         if set(inputs) != {"planes", "side"} or "descriptor" not in outputs or len(inputs["planes"]) != 4:
             raise EncoderError(
-                f"the encoder reads {sorted(inputs)} and gives {sorted(outputs)}; wanted: planes, side -> descriptor; "
+                f"the encoder reads {sorted(inputs)} and returns {sorted(outputs)}, but planes, side -> descriptor are expected; "
                 "export it with `streetfix export`"
             )
         planes, self.rows, self.columns = inputs["planes"][1:]
         if planes != len(PLANES):
-            raise EncoderError(f"the encoder wants {planes} planes, a view has {len(PLANES)}: {', '.join(PLANES)}")
+            raise EncoderError(
+                f"the encoder reads {planes} planes, but a view has {len(PLANES)} ({', '.join(PLANES)}); "
+                "export it with `streetfix export`"
+            )
         self.dimension = int(outputs["descriptor"][1])
         #: Cities of the training data, as ``KIND-SEED``; empty if the file does not name them.
         self.trained_on = tuple(session.get_modelmeta().custom_metadata_map.get("trained_on", "").split())
@@ -82,7 +85,7 @@ class Encoder:
         try:
             data = source if isinstance(source, bytes) else source.read_bytes()
         except OSError as error:  # the text of the error names the file
-            raise EncoderError(f"the encoder cannot be read: {error}", field="encoder") from error
+            raise EncoderError(f"the encoder cannot be read ({error}); check the path", field="encoder") from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
@@ -91,7 +94,9 @@ class Encoder:
         try:
             session = onnxruntime.InferenceSession(data, options, providers=[_PROVIDERS[provider]])
         except Exception as error:  # the exceptions of ONNX Runtime have no common base class
-            raise EncoderError(f"the encoder is no ONNX model that runs here: {error}", field="encoder") from error
+            raise EncoderError(
+                f"ONNX Runtime cannot load the encoder ({error}); export it with `streetfix export`", field="encoder"
+            ) from error
         return Encoder(session, hashlib.sha256(data).hexdigest())
 
     def encode(self, planes: Float32[NDArray[np.float32], "B 6 rows columns"], side: Side) -> Descriptors:
@@ -122,7 +127,7 @@ def require_provider(provider: Provider) -> None:
     if _PROVIDERS[provider] not in there:
         known = ", ".join(name for name, full in _PROVIDERS.items() if full in there)
         raise EncoderError(
-            f"provider: ONNX Runtime has no {provider!r} here (it has {known}); install {_PACKAGES[provider]} instead of "
-            "onnxruntime, or choose another",
+            f"provider: ONNX Runtime lacks {provider!r} (available: {known}); install {_PACKAGES[provider]} instead of "
+            "onnxruntime, or choose another provider",
             field="provider",
         )

@@ -24,9 +24,6 @@ class Frame:
         matches: most similar map views, the best first.
         noise: standard deviation of the inverse depth of one pixel, 1/m.
         independent_noise: the same without the correlated error that adjacent pixels share, 1/m.
-        fuse_s: time to compute the views, seconds.
-        encode_s: time to compute the descriptors, seconds.
-        search_s: time to search the map, seconds.
     """
 
     query: Query
@@ -36,9 +33,6 @@ class Frame:
     matches: ViewMatches
     noise: float
     independent_noise: float
-    fuse_s: float = 0.0
-    encode_s: float = 0.0
-    search_s: float = 0.0
 
     @property
     def R_level_camera(self) -> Rotation:

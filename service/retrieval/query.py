@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
-from service.imaging.decode import DepthEncoding, DepthKind, ImageLimits, decode_depth, decode_rgb, require_sizes
+from service.imaging.decode import (
+    DepthEncoding,
+    DepthKind,
+    ImageLimits,
+    decode_depth,
+    decode_rgb,
+    require_sizes,
+    stored_size,
+)
 from service.imaging.gather import finest_rad
 from service.imaging.level import GivenHeight
 from service.imaging.picture_headers import DEFAULT_LIMITS
@@ -99,5 +107,5 @@ def decoded_query(
         depth, camera=camera, encoding=depth_format.encoding, scale_m=depth_format.scale_m, kind=depth_format.kind,
         baseline_m=depth_format.baseline_m, max_range_m=depth_format.max_range_m, limits=limits,
     )  # fmt: skip
-    require_sizes(colour, depth_m, camera)
+    require_sizes(colour, depth_m, camera, rgb_size=stored_size(rgb))
     return Query(rgb=colour, depth_m=depth_m, camera=camera, baseline_m=depth_format.baseline_m)

@@ -1,7 +1,6 @@
 """Retrieval: views and descriptors of an image pair, the most similar places, their clusters and the street vote."""
 
 from dataclasses import dataclass
-from time import perf_counter
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from service.retrieval.frame import Frame
 from service.retrieval.hypotheses import ClusterSettings, Hypothesis, cluster, rerank_with_prior
 from service.retrieval.knn import Neighbour, StreetVote, distinct_places, search_views, vote
 from service.retrieval.query import Query
+from service.timing import StageTimer
 
 #: A query is searched at three turns, 5 degrees apart. The views of a place are 15 degrees apart, so one of the turns is within
 #: 2.5 degrees of a map view.
@@ -39,7 +39,7 @@ class Retrieved:
     vote: StreetVote | None
 
 
-def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: ClusterSettings) -> Frame:
+def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: ClusterSettings, timer: StageTimer) -> Frame:
     """Encode one image pair and search the map for similar views.
 
     Args:
@@ -47,6 +47,7 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
         encoder: encoder of the map.
         query: image pair, camera and options.
         clusters: settings of the clustering; they give the smallest number of views to find.
+        timer: of the request; the stages "fuse", "encode" and "search".
 
     Returns:
         The image pair as a reference frame: its ``T_reference_camera`` is the identity.
@@ -54,23 +55,21 @@ def look_up(bundle: MapBundle, encoder: Encoder, query: Query, clusters: Cluster
     Raises:
         NoDepthError: the depth image holds no measurement within the view grid.
     """
-    started = perf_counter()
-    views = query_views(
-        query.rgb, query.depth_m, query.camera, turns=turns_on(bundle.grid),
-        grid=bundle.grid, rows_seen=bundle.rows_seen, down_camera=query.down_camera, given_height=query.camera_height,
-    )  # fmt: skip
-    fused = perf_counter()
-    descriptors = encoder.encode(views.planes, side="query")
-    encoded = perf_counter()
-    matches = search_views(
-        bundle, descriptors, turns_rad=views.turns_rad, places=places_of(query), fewest=clusters.views
-    )
-    # A query without registration does not need the noise. But a later query of a stream may register this frame (decision 0111).
-    noise = inverse_depth_noise(query.depth_m, focal_baseline_px_m=query.focal_baseline_px_m)
-    return Frame(
-        query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent,
-        fuse_s=fused - started, encode_s=encoded - fused, search_s=perf_counter() - encoded,
-    )  # fmt: skip
+    with timer.stage("fuse"):
+        views = query_views(
+            query.rgb, query.depth_m, query.camera, turns=turns_on(bundle.grid),
+            grid=bundle.grid, rows_seen=bundle.rows_seen, down_camera=query.down_camera, given_height=query.camera_height,
+        )  # fmt: skip
+    with timer.stage("encode"):
+        descriptors = encoder.encode(views.planes, side="query")
+    with timer.stage("search"):
+        matches = search_views(
+            bundle, descriptors, turns_rad=views.turns_rad, places=places_of(query), fewest=clusters.views
+        )
+        # A query without registration does not need the noise. But a later query of a stream may register this frame
+        # (decision 0111).
+        noise = inverse_depth_noise(query.depth_m, focal_baseline_px_m=query.focal_baseline_px_m)
+    return Frame(query, np.eye(4), views, descriptors, matches, noise=noise.total, independent_noise=noise.independent)
 
 
 def retrieve(bundle: MapBundle, frame: Frame, clusters: ClusterSettings) -> Retrieved:
@@ -120,14 +119,14 @@ def require_encoder_of(bundle: MapBundle, encoder: Encoder) -> None:
     expected, size = bundle.manifest.encoder_sha256, bundle.manifest.counts.descriptor_size
     if encoder.sha256 != expected or encoder.dimension != size:
         raise BundleError(
-            f"{bundle.path}: the descriptors ({size} numbers) are of encoder {expected[:12]}, not of "
-            f"{encoder.sha256[:12]} ({encoder.dimension} numbers): use the bundle's own, or build the map again",
+            f"{bundle.path}: the descriptors ({size} numbers) are from encoder {expected[:12]}, not from "
+            f"{encoder.sha256[:12]} ({encoder.dimension} numbers); use the encoder of the bundle, or build the map again",
             field="encoder.onnx",
         )
     grid = (bundle.grid.rows, bundle.grid.columns)
     if (encoder.rows, encoder.columns) != grid:
         raise BundleError(
-            f"{bundle.path}: the encoder reads views of {encoder.rows} x {encoder.columns} cells, the map's have "
-            f"{grid[0]} x {grid[1]}: build the map again with a view grid that its encoder reads",
+            f"{bundle.path}: the encoder reads views of {encoder.rows} x {encoder.columns} cells, but those of the map have "
+            f"{grid[0]} x {grid[1]}; build the map again with a view grid that its encoder reads",
             field="encoder.onnx",
         )

@@ -1,7 +1,7 @@
 """Candidates: registered poses with their scores; which of them exclude each other, and each one's share of the support."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from service.geometry.rigid import Transform
 from service.registration.register import Registered
-from service.scoring.rendered_depth import Agreement
 
 #: Two candidates are rivals beyond this distance or this angle. Adjacent positions on one street are not rivals.
 RIVAL_M, RIVAL_RAD = 3.0, float(np.deg2rad(30.0))
@@ -24,10 +23,7 @@ class Candidate:
         T_map_camera: pose of the reference camera.
         registered: result of the solver. For the best candidate the ray adjustment then moves the pose by centimetres. Its
             scores below come from before this adjustment.
-        similarity: descriptor similarity to the places around the pose, mean over the frames.
-        place_m: distance of these places from the pose in metres, mean over the frames.
-        agreement: agreement with the depth rendered from the map at the pose, mean over the frames.
-        brightness: agreement with the map's brightness, mean over the frames, 0 to 1; None if it was not computed.
+        scores: scores of all scorers and their details, by name. ``brightness`` is missing if it was not computed.
         support: weighted sum of the scores, in nats; only differences between candidates have a meaning.
         covariance: of ``T_map_camera``, if the candidate is right: translation (m), then rotation (rad), in map axes, about the
             camera. None if not computed.
@@ -35,11 +31,8 @@ class Candidate:
 
     T_map_camera: Transform
     registered: Registered
-    similarity: float
-    place_m: float
-    agreement: Agreement
+    scores: Mapping[str, float]
     support: float
-    brightness: float | None = None
     covariance: Float64[NDArray[np.float64], "6 6"] | None = None
 
 
@@ -71,13 +64,11 @@ class Refined:
 
         A covariance takes about 0.5 ms. So only answers that are not LOCALIZED need this method.
         """
-        distinct = {id(each) for each in distinct_candidates(self.candidates)}
-        return tuple(
-            replace(each, covariance=self.covariance_at(each))
-            if id(each) in distinct and each.covariance is None
-            else each
-            for each in self.candidates
-        )
+        found = list(self.candidates)
+        for k in _distinct(self.candidates):
+            if found[k].covariance is None:
+                found[k] = replace(found[k], covariance=self.covariance_at(found[k]))
+        return tuple(found)
 
 
 def is_rival(one: Candidate, other: Candidate) -> bool:
@@ -99,11 +90,16 @@ def distinct_candidates(candidates: tuple[Candidate, ...]) -> tuple[Candidate, .
     Args:
         candidates: registered poses, the best supported first.
     """
-    kept: list[Candidate] = []
-    for candidate in candidates:
-        if all(is_rival(other, candidate) for other in kept):
-            kept.append(candidate)
-    return tuple(kept)
+    return tuple(candidates[k] for k in _distinct(candidates))
+
+
+def _distinct(candidates: tuple[Candidate, ...]) -> list[int]:
+    """Return the indices of ``distinct_candidates``."""
+    kept: list[int] = []
+    for k, candidate in enumerate(candidates):
+        if all(is_rival(candidates[other], candidate) for other in kept):
+            kept.append(k)
+    return kept
 
 
 def behind(distinct: tuple[Candidate, ...], frames: int) -> Float64[NDArray[np.float64], " C"]:

@@ -21,6 +21,7 @@ from service.registration.rays import met_by
 from service.registration.register import Registered
 from service.registration.visibility import SurfelRaycaster
 from service.scoring.measured import MeasuredFrame
+from service.scoring.scorer import Scores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,13 +125,15 @@ def _patches(picture: NDArray[np.float32], size: int) -> NDArray[np.float32]:
 
 
 class BrightnessScorer:
-    """Scorer of a query's images against the brightness of the map.
+    """Scorer by the agreement of a query's images with the brightness of the map.
 
     Args:
         sights: ray casting into the map cloud.
         measured: frames of the query, the reference first.
         settings: of the score.
     """
+
+    name = "brightness"
 
     def __init__(
         self, sights: SurfelRaycaster, measured: tuple[MeasuredFrame, ...], settings: PhotometrySettings
@@ -143,20 +146,25 @@ class BrightnessScorer:
         """Whether the map has brightness."""
         return self._sights.cloud.brightness is not None
 
-    def score(self, pose: Registered) -> float:
+    def score(self, poses: tuple[Registered, ...]) -> Scores:
         """Return the mean squared correlation over all frames, 0 to 1; 0 if the map has no brightness.
 
         Args:
-            pose: registered pose of the reference's level frame.
+            poses: registered poses of the reference's level frame.
         """
         brightness = self._sights.cloud.brightness
         if brightness is None:
-            return 0.0
+            return Scores(np.zeros(len(poses)))
         if self._greys is None:  # many queries need no brightness, so the images are reduced at the first score
             self._greys = [
                 grey_of(each.frame.query.rgb, each.blocks.camera, each.blocks.covered, self._settings)
                 for each in self._measured
             ]
+        return Scores(np.array([self._mean(brightness, self._greys, pose) for pose in poses]))
+
+    def _mean(
+        self, brightness: Float32[NDArray[np.float32], " n"], greys: list[Float32[NDArray[np.float32], "H W"]], pose: Registered
+    ) -> float:  # fmt: skip
         met = met_by(self._sights, [each.picture for each in self._measured], pose)
-        pairs = zip(met, self._greys, strict=True)
+        pairs = zip(met, greys, strict=True)
         return float(np.mean([agreement_of_brightness(brightness, own, grey, self._settings) for own, grey in pairs]))

@@ -16,6 +16,7 @@ from service.registration.kernel import BeamModel, QueryPoints, agree, render
 from service.registration.register import Registered
 from service.registration.surfel_map import TILE_M, SurfelMap
 from service.scoring.measured import MeasuredFrame
+from service.scoring.scorer import Scores
 
 #: Width of the rendered image, px.
 WIDTH = 80
@@ -116,12 +117,14 @@ def agreement(cloud: SurfelMap, seen: ProjectedPoints, candidate: Registered) ->
 
 
 class RenderedDepthScorer:
-    """Scorer of a query's depth against the map.
+    """Scorer by the mean log likelihood of a query's depth, given the rendered map.
 
     Args:
         cloud: surfel map.
         measured: frames of the query, the reference first.
     """
+
+    name = "likelihood"
 
     def __init__(self, cloud: SurfelMap, measured: tuple[MeasuredFrame, ...]) -> None:
         self._cloud, self._measured = cloud, [each for each in measured if len(each.points)]
@@ -129,11 +132,17 @@ class RenderedDepthScorer:
             project_points(each.points, each.frame.query.camera, each.frame.R_level_camera) for each in self._measured
         ]
 
-    def score(self, pose: Registered) -> Agreement:
-        """Return the agreement at a pose: the mean over all frames that have points.
+    def score(self, poses: tuple[Registered, ...]) -> Scores:
+        """Return the likelihood at each pose; details are the shares ``through``, ``front`` and ``unmapped`` of ``Agreement``.
 
         Args:
-            pose: registered pose of the reference's level frame.
+            poses: one or more registered poses of the reference's level frame.
         """
+        found = [self._agreement(pose) for pose in poses]
+        likelihood, *shares = (np.array([getattr(each, name) for each in found]) for name in Agreement.__slots__)
+        return Scores(likelihood, dict(zip(Agreement.__slots__[1:], shares, strict=True)))
+
+    def _agreement(self, pose: Registered) -> Agreement:
+        """Mean over all frames that have points."""
         pairs = zip(self._measured, self._seen, strict=True)
         return Agreement.mean([agreement(self._cloud, seen, each.pose(pose)) for each, seen in pairs])

@@ -5,13 +5,39 @@ from jaxtyping import Float32, Float64
 from numpy.typing import NDArray
 
 from service.maps.reader import MapBundle
+from service.registration.register import Registered
 from service.scoring.measured import MeasuredFrame
+from service.scoring.scorer import Scores
 
 #: Number of the nearest places, and of the views of each with the nearest headings. Their mean is less noisy than the best view.
 PLACES, VIEWS = 8, 2
 #: Standard deviation of the Gaussian weight of a place over its distance. So the density of the survey does not matter (decision 0038).
 WIDTH_M = 2.0
 _PAIRS = 1_000_000  # pairs of pose and place per batch of distances; limits memory
+
+
+class SimilarityScorer:
+    """Scorer by descriptor similarity.
+
+    Args:
+        bundle: the map.
+        measured: frames of the query, the reference first.
+    """
+
+    name = "similarity"
+
+    def __init__(self, bundle: MapBundle, measured: tuple[MeasuredFrame, ...]) -> None:
+        self._bundle, self._measured = bundle, measured
+
+    def score(self, poses: tuple[Registered, ...]) -> Scores:
+        """Return the similarity at each pose; the detail ``place_m`` is the distance of the places around it.
+
+        Args:
+            poses: one or more registered poses of the reference's level frame.
+        """
+        T_map_level = np.stack([pose.T_map_level for pose in poses])
+        similarity, place_m = similarity_of(self._bundle, self._measured, T_map_level)
+        return Scores(similarity, {"place_m": place_m})
 
 
 def similarity_of(

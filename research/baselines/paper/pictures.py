@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from research.baselines.paper.cnn import SIDE
 from research.baselines.paper_data.frames import Frames
 from research.baselines.paper_data.pairs import Pairs
-from service.imaging.fusion import fuse, fuse_planes, picture_of
+from service.imaging.fusion import fuse, picture_of
 from service.imaging.view_grid import ViewGrid
 
 Space = Literal["aligned", "plain", "view"]
@@ -80,7 +80,8 @@ def fused_pictures(pairs: Pairs, rows: Rows, space: Space, *, colour: bool = Tru
     for row in rows:
         rgb = np.asarray(pairs.rgb[row])
         depth_m = pairs.depth_mm[row].astype(np.float32) / 1000
-        found.append(picture_of(fuse(rgb if colour else np.zeros_like(rgb), depth_m), _GRID.max_range_m))
+        planes = fuse(rgb if colour else np.zeros_like(rgb), depth_m).planes
+        found.append(picture_of(planes, _GRID.max_range_m))
     return np.stack(found)
 
 
@@ -95,7 +96,7 @@ def drawn_views(ranges: NDArray[np.floating], colours: NDArray[np.uint8] | None)
     for k, each in enumerate(ranges):
         metres = np.asarray(each, np.float32)
         metres[metres > _GRID.max_range_m] = 0
-        rgb = np.zeros((*metres.shape, 3), np.float32) if colours is None else colours[k].astype(np.float32)
-        small = picture_of(fuse_planes(rgb, metres), _GRID.max_range_m)
+        rgb = np.zeros((*metres.shape, 3), np.uint8) if colours is None else colours[k]
+        small = picture_of(fuse(rgb, metres).planes, _GRID.max_range_m)
         found[k] = cv2.resize(small, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST)
     return found

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.geometry.rigid import rotation_z
-from service.imaging.pca import principal_components
+from service.imaging.pca import principal_components, project
 
 SIZE = 224
 REACH_M = 50.0
@@ -28,7 +28,7 @@ def aligned_heading(points: Points) -> float:
     """
     plan = principal_components(points[:, :2])
     axis = plan.axes[:, 0]
-    along = (np.asarray(points[:, :2], np.float64) - plan.mean) @ axis
+    along = project(points[:, :2], plan)[:, 0]
     if (along**3).sum() < 0:
         axis = -axis
     return float(np.arctan2(axis[1], axis[0]))

@@ -158,7 +158,7 @@ def test_a_map_without_streets_has_no_vote(
 
 
 def test_another_encoder_is_refused(bundle_path: Path, encoder_of: Callable[..., bytes]) -> None:
-    with pytest.raises(BundleError, match="use the bundle's own"):
+    with pytest.raises(BundleError, match="use the encoder of the bundle"):
         Localizer(MapBundle.open(bundle_path), Encoder.open(encoder_of(seed=99)))
 
 
@@ -167,7 +167,7 @@ def test_an_encoder_of_another_view_grid_is_refused(
 ) -> None:
     taller = replace(content.grid, rows=9)
     write_bundle(tmp_path / "m", content_of(grid=taller, rows_seen=np.ones(9, np.bool_)))
-    with pytest.raises(BundleError, match="reads views of 8 x 16 cells, the map's have 9 x 16"):
+    with pytest.raises(BundleError, match="reads views of 8 x 16 cells, but those of the map have 9 x 16"):
         Localizer.open(MapBundle.open(tmp_path / "m"))
 
 
@@ -248,7 +248,7 @@ def calibrated(
 def test_fewer_false_accepts_than_calibration_measured_are_not_promised(calibrated: Localizer, query: Query) -> None:
     assert calibrated.bundle.calibration is not None
     least = calibrated.bundle.calibration.least_false_accept_rate
-    with pytest.raises(RequestError, match=rf"ask for {least:g} or more") as caught:
+    with pytest.raises(RequestError, match=rf"send {least:g} or more") as caught:
         calibrated.localize(replace(query, false_accept_rate=0.5 * least))
     assert caught.value.field == "options.false_accept_rate"
     assert calibrated.localize(replace(query, false_accept_rate=least)).confidence is not None

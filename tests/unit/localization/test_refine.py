@@ -18,8 +18,9 @@ from service.retrieval.starts import StartSettings
 from service.scoring import similarity as similar
 from service.scoring.measured import measure
 from service.scoring.photometry import BrightnessScorer
-from service.scoring.scorer import LocalScoreWeights, SupportWeights
+from service.scoring.scorer import Scores
 from service.scoring.similarity import similarity_of
+from service.scoring.support import LocalScoreWeights, SupportWeights
 
 CAMERA = PinholeCamera(80, 60, 50.0, 50.0, 39.5, 29.5)
 R_LEVEL_CAMERA = rotation_y(np.deg2rad(4.0)) @ R_BODY_OPTICAL
@@ -153,12 +154,16 @@ def test_similarity_is_of_the_places_around_the_pose_not_of_the_view_that_it_sta
 ):
     """The start in the true street came by a match of 0.95, but what stands there is 0.4 similar."""
     found = refined(bundle, cloud, seen_in(depth, matches_at([(0, 0, 1.8)], [0], [0.95])))
-    assert [each.similarity for each in found.candidates] == pytest.approx([0.4] * len(found.candidates), abs=1e-6)
+    assert [each.scores["similarity"] for each in found.candidates] == pytest.approx(
+        [0.4] * len(found.candidates), abs=1e-6
+    )
 
 
 def test_candidates_come_in_the_order_of_their_support(bundle, cloud, depth, both, seen_in):
     found = refined(bundle, cloud, seen_in(depth, both), inliers=2.0, similarity=3.0, likelihood=0.5)
-    sums = [2 * c.registered.inliers + 3 * c.similarity + 0.5 * c.agreement.likelihood for c in found.candidates]
+    sums = [
+        2 * c.registered.inliers + 3 * c.scores["similarity"] + 0.5 * c.scores["likelihood"] for c in found.candidates
+    ]
     support = [candidate.support for candidate in found.candidates]
     assert len(support) > 1
     assert support == pytest.approx(sums)
@@ -197,10 +202,11 @@ def judged(cloud, monkeypatch):
     """The cloud with some brightness, and what brightness is then said to say of each pose that is asked about: its y."""
     asked_y_m = []
 
-    def brightness(scorer, pose):
+    def brightness(scorer, poses):
         assert scorer.is_known
-        asked_y_m.append(pose.camera_m[1])
-        return float(pose.camera_m[1])
+        y_m = [pose.camera_m[1] for pose in poses]
+        asked_y_m.extend(y_m)
+        return Scores(np.array(y_m))
 
     monkeypatch.setattr(BrightnessScorer, "score", brightness)
     return replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32)), asked_y_m
@@ -256,7 +262,10 @@ def test_a_noisy_pictures_best_pose_is_looked_around_and_moves_to_what_shows_the
     """Points say nothing between poses along a bare street; brightness is said to be best 1.4 m ahead of where registration ends."""
     lit = replace(cloud, brightness=np.ones(len(cloud.surfels), np.float32))
     ahead = TRUE[:3, 3] + 1.4 * np.array([np.cos(np.deg2rad(HEADING_DEG)), np.sin(np.deg2rad(HEADING_DEG)), 0])
-    monkeypatch.setattr(BrightnessScorer, "score", lambda _, pose: -float(np.linalg.norm(pose.camera_m - ahead)))
+    monkeypatch.setattr(
+        BrightnessScorer, "score",
+        lambda _, poses: Scores(np.array([-np.linalg.norm(pose.camera_m - ahead) for pose in poses])),
+    )  # fmt: skip
     near = [LocalPose(each, 0.5) for each in _shifted(refined(bundle_like(0.4, 0.9), lit, seen_in(depth, here)))]
     monkeypatch.setattr(refining, "search_locally", lambda *_: near)
     still = RaySettings(fewest=10**6)  # nothing is adjusted
@@ -316,7 +325,7 @@ def test_two_frames_together_are_found_where_the_reference_was_taken(bundle, clo
 def test_what_another_frame_saw_finds_a_reference_that_saw_nothing(bundle, cloud, depth, here, two_frames, seen_in):
     found = refined(bundle, cloud, seen_in(np.zeros_like(depth), here), two_frames[1])
     np.testing.assert_allclose(found.best.T_map_camera, TRUE, atol=0.1)
-    assert found.best.agreement.through < 0.02
+    assert found.best.scores["through"] < 0.02
 
 
 def test_agreement_is_the_mean_of_what_each_frame_sees_from_where_it_stood(bundle, cloud, two_frames, matches_at):
@@ -326,9 +335,9 @@ def test_agreement_is_the_mean_of_what_each_frame_sees_from_where_it_stood(bundl
         there = matches_at([(*T_true[:2, 3], 1.8)], [heading_deg], [0.9])
         own = refined(bundle, cloud, replace(frame, T_reference_camera=np.eye(4), matches=there)).best
         np.testing.assert_allclose(own.T_map_camera, T_true, atol=0.05)
-        alone.append(own.agreement)
-    assert found.agreement.likelihood == pytest.approx(np.mean([each.likelihood for each in alone]), abs=0.1)
-    assert found.agreement.through == pytest.approx(np.mean([each.through for each in alone]), abs=0.02)
+        alone.append(own.scores)
+    for name, off in (("likelihood", 0.1), ("through", 0.02)):
+        assert found.scores[name] == pytest.approx(np.mean([each[name] for each in alone]), abs=off)
 
 
 def test_it_does_not_matter_in_which_level_frame_a_frame_is_told(bundle, cloud, two_frames, matches_at):
@@ -339,14 +348,14 @@ def test_it_does_not_matter_in_which_level_frame_a_frame_is_told(bundle, cloud, 
     one, same = (refined(bundle, cloud, two_frames[0], each) for each in (other, turned))
     np.testing.assert_allclose(same.best.T_map_camera, one.best.T_map_camera, atol=1e-4)
     np.testing.assert_allclose(same.covariance, one.covariance, rtol=1e-2, atol=1e-9)
-    assert same.best.agreement.likelihood == pytest.approx(one.best.agreement.likelihood, abs=0.01)
+    assert same.best.scores["likelihood"] == pytest.approx(one.best.scores["likelihood"], abs=0.01)
 
 
 def test_similarity_is_the_mean_over_frames(bundle, cloud, two_frames):
     """In the true street, whose views are (0.4, 0.917), a frame of (1, 0) is 0.4 similar and one of (0, 1) 0.917."""
     across = replace(two_frames[1], descriptors=np.array([[0.0, 1.0]], np.float32))
     found = refined(bundle, cloud, two_frames[0], across)
-    assert found.best.similarity == pytest.approx((0.4 + np.sqrt(0.84)) / 2, abs=1e-6)
+    assert found.best.scores["similarity"] == pytest.approx((0.4 + np.sqrt(0.84)) / 2, abs=1e-6)
 
 
 def test_how_far_the_places_are_is_the_mean_over_frames(bundle, cloud, two_frames, monkeypatch):
@@ -355,7 +364,7 @@ def test_how_far_the_places_are_is_the_mean_over_frames(bundle, cloud, two_frame
     found = refined(bundle, cloud, *two_frames).best
     stood = [found.T_map_camera @ frame.T_reference_camera for frame in two_frames]
     away = [np.hypot(T[0, 3] - round(T[0, 3]), T[1, 3]) for T in stood]
-    assert found.place_m == pytest.approx(np.mean(away), abs=0.01)  # the rays move it by less
+    assert found.scores["place_m"] == pytest.approx(np.mean(away), abs=0.01)  # the rays move it by less
     assert away[0] > away[1] + 0.1
 
 

@@ -9,7 +9,7 @@ from service.retrieval.encoder import Encoder
 
 def test_a_provider_that_is_not_installed_is_refused_with_what_there_is(encoder_of, monkeypatch):
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
-    with pytest.raises(EncoderError, match=r"no 'cuda' here \(it has cpu\); install onnxruntime-gpu"):
+    with pytest.raises(EncoderError, match=r"lacks 'cuda' \(available: cpu\); install onnxruntime-gpu"):
         Encoder.open(encoder_of(), provider="cuda")
     with pytest.raises(EncoderError, match="install onnxruntime-openvino"):
         Encoder.open(encoder_of(), provider="openvino")

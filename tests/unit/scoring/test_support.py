@@ -1,0 +1,91 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.geometry.rigid import rotation_y, rotation_z
+from service.registration.points import PointSettings
+from service.registration.rays import RaySettings
+from service.registration.visibility import SurfelRaycaster
+from service.retrieval.prior import Prior
+from service.scoring.inliers import InlierScorer
+from service.scoring.measured import measure
+from service.scoring.photometry import BrightnessScorer, PhotometrySettings
+from service.scoring.prior import PriorScorer
+from service.scoring.scorer import Scorer, Scores
+from service.scoring.support import LocalScoreWeights, PoseScorer, SupportWeights, scorers_of
+
+PRIOR = Prior(position_m=np.array([4.0, 0.0]), position_std_m=3.0, heading_rad=0.2)
+
+
+class HeightScorer:
+    """A scorer as a contributor would add one: the height of the camera, and its double as a detail."""
+
+    name = "height"
+
+    def score(self, poses):
+        z_m = np.array([pose.camera_m[2] for pose in poses])
+        return Scores(z_m, {"twice": 2 * z_m})
+
+
+@pytest.fixture
+def poses(candidate):
+    return tuple(
+        replace(candidate(xyz=(x, 0.0, z), heading_deg=heading).registered, inliers=inliers)
+        for x, z, heading, inliers in ((0.0, 1.0, 0.0, 0.9), (4.0, 2.0, 90.0, 0.5), (9.0, 3.0, -10.0, 0.7))
+    )
+
+
+@pytest.fixture
+def measured(frame_with, matches_at):
+    return measure(
+        (frame_with(matches_at([(0, 0, 2)], [0], [0.9])),), PointSettings(), focal_baseline_px_m=80.0, is_rig=False
+    )
+
+
+@pytest.fixture
+def brightness(street_map, measured):
+    return BrightnessScorer(SurfelRaycaster(street_map, RaySettings()), measured, PhotometrySettings())
+
+
+@pytest.fixture
+def candidates_of(measured, brightness, poses):
+    """The candidates of the three poses by scorers and their weights."""
+    return lambda *scorers: PoseScorer(measured, scorers, brightness, SupportWeights(), LocalScoreWeights()).candidates(
+        poses
+    )
+
+
+def test_a_new_scorer_needs_a_line_in_the_list_and_nothing_else(candidates_of, poses):
+    """Ten times 0.9, 0.5 and 0.7 and twice 1, 2 and 3: 11, 9 and 13."""
+    found = candidates_of((InlierScorer(), 10.0), (HeightScorer(), 2.0))
+    assert [each.support for each in found] == pytest.approx([13.0, 11.0, 9.0])
+    assert [each.registered for each in found] == [poses[2], poses[0], poses[1]]
+    assert dict(found[0].scores) == pytest.approx({"inliers": 0.7, "height": 3.0, "twice": 6.0})
+
+
+def test_a_scorer_of_weight_zero_is_told_and_does_not_count(candidates_of):
+    plain = candidates_of((InlierScorer(), 10.0))
+    beside = candidates_of((InlierScorer(), 10.0), (HeightScorer(), 0.0))
+    assert [each.support for each in beside] == [each.support for each in plain]
+    assert [each.scores["height"] for each in beside] == [1.0, 3.0, 2.0]
+
+
+def test_the_prior_scores_the_position_and_heading_of_each_pose_however_it_leans(poses):
+    leaning = replace(poses[0], R_map_level=rotation_z(np.deg2rad(20.0)) @ rotation_y(0.1))
+    xy, heading_rad = np.array([[0.0, 0.0], [4.0, 0.0], [9.0, 0.0], [0.0, 0.0]]), np.deg2rad([0.0, 90.0, -10.0, 20.0])
+    expected = PRIOR.log_weight(xy, heading_rad)
+    np.testing.assert_allclose(PriorScorer(PRIOR).score((*poses, leaning)).values, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("prior", "names"), [(None, ()), (PRIOR, ("prior",))])
+def test_every_scorer_has_the_same_interface_and_a_name_of_its_own(
+    bundle_at, street_map, measured, brightness, prior, names
+):
+    bundle = bundle_at([(0.0, 0.0, 1.8)], [0.0], [(1.0, 0.0)])
+    weights = SupportWeights()
+    listed = scorers_of(bundle, street_map, measured, prior, weights)
+    assert tuple(scorer.name for scorer, _ in listed) == ("inliers", "similarity", "likelihood", *names)
+    assert all(weight == getattr(weights, scorer.name) for scorer, weight in listed)
+    assert all(isinstance(scorer, Scorer) for scorer in (brightness, *(scorer for scorer, _ in listed)))
+    assert brightness.score(()).values.shape == (0,)
