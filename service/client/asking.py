@@ -157,7 +157,7 @@ def several(frames: Sequence[Frame], about: AboutSequence, packing: Packing) -> 
     for number, frame in enumerate(frames):
         if frame.T_reference_camera is not None:
             raise RequestError(
-                f"frames.{number}.T_reference_camera: each pair of a batch stands alone; ask localize_sequence for one pose of all",
+                f"frames.{number}.T_reference_camera: not allowed in a batch; use localize_sequence",
                 field=f"frames.{number}.T_reference_camera",
             )
     said = [_frame(frame, packing, f"frames.{number}.") for number, frame in enumerate(frames)]
@@ -225,7 +225,7 @@ def _depth(frame: Frame, packing: Packing) -> tuple[bytes, float | None]:
 
 def _file(data: bytes, field: str) -> bytes:
     if not data:
-        raise RequestError(f"{field}: the file is empty (0 bytes); give the bytes of an image file", field=field)
+        raise RequestError(f"{field}: the file is empty (0 bytes); pass the bytes of an image file", field=field)
     return data
 
 
@@ -237,7 +237,7 @@ def _of_all(about: About | AboutSequence) -> dict[str, Any]:
     """
     options, prior = about.get("options"), about.get("prior")
     if prior is not None and prior.position is not None and prior.wgs84 is not None:  # gRPC could send only one of them
-        raise RequestError("prior: position and wgs84 say the same thing; send one of them", field="prior")
+        raise RequestError("prior: position and wgs84 exclude each other; send one of them", field="prior")
     return {
         "map": about.get("map"), "prior": prior,
         "T_vehicle_camera": _transform(about.get("T_vehicle_camera"), "T_vehicle_camera"),
@@ -263,7 +263,7 @@ def _height(frame: Frame, where: str) -> dict[str, float]:
     if height_m is None:
         if std_m is not None:
             field = f"{where}camera_height_std_m"
-            raise RequestError(f"{field}: it belongs to camera_height_m, which was not given; give both", field=field)
+            raise RequestError(f"{field}: it needs camera_height_m, which is missing; pass both", field=field)
         return {}
     return {"height_m": height_m} | ({} if std_m is None else {"height_std_m": std_m})
 
@@ -273,7 +273,9 @@ def _vector(vector: Sequence[float] | NDArray[Any] | None, field: str) -> dict[s
         return None
     numbers = np.asarray(vector, np.float64)
     if numbers.shape != (3,):
-        raise RequestError(f"{field}: an array {numbers.shape} is no direction; give three numbers", field=field)
+        raise RequestError(
+            f"{field}: an array of shape {numbers.shape} is not a valid direction; pass three numbers", field=field
+        )
     return dict(zip("xyz", numbers.tolist(), strict=True))
 
 
@@ -289,7 +291,8 @@ def _transform(T: NDArray[Any] | None, field: str) -> dict[str, Any] | None:
     rigid = matrix.shape == (4, 4) and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
     if not rigid or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-4):
         raise RequestError(
-            f"{field}: this array {matrix.shape} is no rigid transform; give a 4 x 4 matrix of rotation and translation (metres)",
+            f"{field}: an array of shape {matrix.shape} is not a valid rigid transform; "
+            "pass a 4 x 4 matrix of rotation and translation (metres)",
             field=field,
         )
     x, y, z, w = quaternion_xyzw_from(matrix[:3, :3]).tolist()
@@ -299,7 +302,7 @@ def _transform(T: NDArray[Any] | None, field: str) -> dict[str, Any] | None:
 
 def _only_known(about: About | AboutSequence, known: type) -> None:
     if unknown := sorted(set(about) - set(known.__annotations__)):
-        raise TypeError(f"unknown argument {unknown[0]!r}; known are {', '.join(known.__annotations__)}")
+        raise TypeError(f"unknown argument {unknown[0]!r}; pass one of {', '.join(known.__annotations__)}")
 
 
 def _checked(make: Callable[[], D]) -> D:

@@ -89,11 +89,13 @@ def encode_rgb(rgb: NDArray[np.uint8], *, quality: int | None = JPEG_QUALITY) ->
     """
     if not isinstance(rgb, np.ndarray) or rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or not rgb.size:
         raise RequestError(
-            f"rgb: {_told(rgb)} is no colour picture; give uint8 (height, width, 3), or the bytes of a file",
+            f"rgb: must be uint8 (H, W, 3), not {_told(rgb)}; pass such an array, or the bytes of an image file",
             field="rgb",
         )
     if quality is not None and not 1 <= quality <= 100:
-        raise RequestError(f"quality: {quality} is no JPEG quality; give 1 to 100, or None for PNG", field="quality")
+        raise RequestError(
+            f"quality: {quality} is not a valid JPEG quality; pass 1 to 100, or None for PNG", field="quality"
+        )
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
@@ -124,12 +126,12 @@ def encode_depth(depth: NDArray[Any], *, scale_m: float | None = None, codec: Co
     """
     if not isinstance(depth, np.ndarray) or depth.ndim != 2 or not depth.size or depth.dtype.str[1:] not in _DTYPES:
         raise RequestError(
-            f"depth: {_told(depth)} is no depth picture; give metres as float32, or uint16, (height, width), or a file's bytes",
+            f"depth: must be a float or uint16 array (H, W), not {_told(depth)}; pass metres as float32, or the bytes of an image file",
             field="depth",
         )
     if scale_m is not None and not (math.isfinite(scale_m) and scale_m > 0):
         raise RequestError(
-            f"depth_scale_m: {scale_m} is no scale; give metres for each unit, such as 0.001", field="depth_scale_m"
+            f"depth_scale_m: {scale_m} is not a valid scale; pass metres per unit, such as 0.001", field="depth_scale_m"
         )
     if depth.dtype.kind == "u":  # of either byte order, as a file may have it
         return EncodedDepth(write_raw16(depth, codec), 0.001 if scale_m is None else scale_m)
@@ -148,7 +150,7 @@ def _in_steps(depth_m: NDArray[Any]) -> tuple[NDArray[np.uint16], float]:
     if (metres > FARTHEST_M).any() and unit_factor(metres) == MILLIMETRE_FACTOR:
         median = float(np.median(metres[np.isfinite(metres) & (metres > 0)]))
         raise RequestError(
-            f"depth: its median is {median:.4g} m, which looks like millimetres: give depth_scale_m=0.001, or divide by 1000",
+            f"depth: the median is {median:.4g} m, which looks like millimetres; pass depth_scale_m=0.001, or divide by 1000",
             field="depth",
         )
     with np.errstate(invalid="ignore"):

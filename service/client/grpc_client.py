@@ -81,10 +81,12 @@ class GrpcClient:
         host, _, port = address.rpartition(":")
         if not (host and port.isdecimal()) or "/" in address:
             raise RequestError(
-                f"address: {address!r} is no gRPC address; give HOST:PORT, as 127.0.0.1:50051", field="address"
+                f"address: {address!r} is not a gRPC address; pass HOST:PORT, such as 127.0.0.1:50051", field="address"
             )
         if not timeout_s > 0:
-            raise RequestError(f"timeout_s: {timeout_s} is no time to wait; give seconds", field="timeout_s")
+            raise RequestError(
+                f"timeout_s: {timeout_s} is not a valid timeout; pass a positive number of seconds", field="timeout_s"
+            )
         self._address, self._timeout_s = address, timeout_s
         self._metadata = () if api_key is None else (("authorization", f"Bearer {api_key}"),)
         self._packing = Packing(quality, depth_codec)
@@ -92,7 +94,9 @@ class GrpcClient:
         self._sleep, self._clock, self._draw = sleep, clock, draw
         self._tls = ClientTls.of(ca, cert, key)
         if self._tls.is_argument and (tls is False or credentials is not None):
-            raise RequestError("ca: it does not go with tls=False, nor with credentials; give one of them", field="ca")
+            raise RequestError(
+                "ca: ca, cert and key exclude tls=False and credentials; pass only one of them", field="ca"
+            )
         if credentials is None and (self._tls.is_wanted if tls is None else tls):
             credentials = grpc.ssl_channel_credentials(*self._tls.pems())
         self._speaks_tls = credentials is not None

@@ -10,10 +10,9 @@ from grpc_status import rpc_status
 
 from service.client.problems import refused
 from service.client.tls import ClientTls, closed_hint, handshake_error
+from service.contract.request_id import REQUEST_ID
 from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, StreetfixError, UnreachableError
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
-
-REQUEST_ID = "x-request-id"
 
 
 @contextmanager
@@ -38,7 +37,7 @@ def errors_of_grpc(address: str, timeout_s: float, tls: ClientTls | None) -> Ite
         raise _of(error, address, timeout_s, tls) from error
     except ValueError as error:
         raise ForeignServiceError(
-            f"{address}: what answers there is of another contract ({error}); check the address", field="url"
+            f"{address}: the server has another contract ({error}); check the address", field="url"
         ) from error
 
 
@@ -64,7 +63,7 @@ def _of(error: grpc.RpcError, address: str, timeout_s: float, tls: ClientTls | N
         return _refused(error, told, info)
     if code == grpc.StatusCode.DEADLINE_EXCEEDED:
         return NoAnswerInTimeError(
-            f"{address}: no answer within {timeout_s:g} s; ask again, or give more timeout_s", field="timeout_s"
+            f"{address}: no answer within {timeout_s:g} s; try again, or raise timeout_s", field="timeout_s"
         )
     if code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
         handshake = None if tls is None else handshake_error(address, said)
@@ -75,9 +74,7 @@ def _of(error: grpc.RpcError, address: str, timeout_s: float, tls: ClientTls | N
             remedy = closed_hint(speaks_tls=tls is not None, shows_certificate=tls is not None and tls.cert is not None)
         return UnreachableError(f"{address}: no service answers ({said}); {remedy}", field="url")
     if code in (grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.UNKNOWN):
-        return ForeignServiceError(
-            f"{address}: what answers there is no Streetfix ({said}); check the address", field="url"
-        )
+        return ForeignServiceError(f"{address}: the server is not Streetfix ({said}); check the address", field="url")
     # Refusals by gRPC itself, such as a message beyond its size limit, and unexpected errors.
     problem = "internal" if code == grpc.StatusCode.INTERNAL else ""
     return refused(code.name, said, problem=problem, status=code.name, request_id=_request_id(error))

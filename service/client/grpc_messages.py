@@ -7,6 +7,7 @@ from service.contract import schema
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 
 _KINDS = {"z": pb.DEPTH_KIND_Z, "range": pb.DEPTH_KIND_RANGE, "disparity": pb.DEPTH_KIND_DISPARITY}
+_CALIBRATION = {pb.CALIBRATION_RANGE_IN_RANGE: "in_range", pb.CALIBRATION_RANGE_EXTRAPOLATED: "extrapolated"}
 _STATUS_PREFIX, _SECTION_PREFIX, _ORIGIN_PREFIX = "LOCALIZATION_STATUS_", "STREET_SECTION_", "CAMERA_HEIGHT_ORIGIN_"
 
 
@@ -87,6 +88,8 @@ def answer_of(message: pb.LocalizeResponse) -> schema.LocalizeAnswer:
                 for each in message.neighbours
             ],
             "camera_height": _height_content(message.camera_height) if message.HasField("camera_height") else None,
+            "calibration": _CALIBRATION.get(message.calibration),
+            "extrapolated": dict(message.extrapolated),
             "map": {"name": message.map.name, "version": message.map.version},
             "timings_ms": {
                 stage: getattr(times, f"{stage}_ms") for stage in ("decode", "fuse", "encode", "search", "register", "total")

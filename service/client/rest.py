@@ -18,6 +18,7 @@ from service.client.asking import Asked
 from service.client.problems import refused
 from service.client.tls import ClientTls, closed_hint, handshake_error, ssl_reason
 from service.contract import schema
+from service.contract.request_id import REQUEST_ID
 from service.errors import ForeignServiceError, NoAnswerInTimeError, RefusedError, RequestError, UnreachableError
 
 A = TypeVar("A")
@@ -135,7 +136,7 @@ def geojson(body: bytes) -> dict[str, Any]:
     """
     found = json.loads(body)
     if not isinstance(found, dict) or found.get("type") != "FeatureCollection":
-        raise ValueError("no FeatureCollection")
+        raise ValueError("not a FeatureCollection")
     return found
 
 
@@ -153,17 +154,17 @@ def settings_for(url: str, *, api_key: str | None, timeout_s: float, tls: Client
         KeysError: a TLS file cannot be used.
     """
     if not (timeout_s > 0 and math.isfinite(timeout_s)):
-        raise RequestError(f"timeout_s: {timeout_s} is no time to wait; give seconds", field="timeout_s")
+        raise RequestError(
+            f"timeout_s: {timeout_s} is not a valid timeout; pass a positive number of seconds", field="timeout_s"
+        )
     try:
         address = httpx.URL(url)
     except (httpx.InvalidURL, TypeError) as error:
-        raise RequestError(f"url: {url!r} is no address ({error}); give http://HOST:PORT", field="url") from error
+        raise RequestError(f"url: {url!r} is not a URL ({error}); pass http://HOST:PORT", field="url") from error
     if address.scheme not in ("http", "https") or not address.host or "%" in address.host:
-        raise RequestError(f"url: {url!r} is no address; give http://HOST:PORT", field="url")
+        raise RequestError(f"url: {url!r} is not a URL; pass http://HOST:PORT", field="url")
     if address.scheme == "http" and tls.is_argument:
-        raise RequestError(
-            f"url: {url!r} is an address without TLS, but ca, cert or key is given; give https://", field="url"
-        )
+        raise RequestError(f"url: {url!r} has no TLS, but ca, cert or key is given; pass https://", field="url")
     return {
         "base_url": url.rstrip("/"), "timeout": timeout_s,
         # Without TLS httpx would still load all public authorities. An empty context saves that time.
@@ -191,7 +192,7 @@ def answer_of(call: Call[A], response: httpx.Response) -> A:
         return call.read(response.content)
     except ValueError as error:  # includes ValidationError and JSONDecodeError
         raise ForeignServiceError(
-            f"{response.url}: what answers there is no Streetfix, or of another contract; check the address", field="url"
+            f"{response.url}: the server is not Streetfix, or has another contract; check the address", field="url"
         ) from error  # fmt: skip
 
 
@@ -215,19 +216,19 @@ def errors_of_httpx(url: str, timeout_s: float, tls: ClientTls) -> Iterator[None
         yield
     except httpx.ConnectTimeout as error:
         raise UnreachableError(
-            f"{url}: no connection within {timeout_s:g} s; is the service there?", field="url"
+            f"{url}: no connection within {timeout_s:g} s; check the address, and that the service runs", field="url"
         ) from error
     except httpx.TimeoutException as error:
         raise NoAnswerInTimeError(
-            f"{url}: no answer within {timeout_s:g} s; ask again, or give more timeout_s", field="timeout_s"
+            f"{url}: no answer within {timeout_s:g} s; try again, or raise timeout_s", field="timeout_s"
         ) from error
     except (httpx.DecodingError, httpx.TooManyRedirects) as error:
         raise ForeignServiceError(
-            f"{url}: what answers there is no Streetfix ({error}); check the address", field="url"
+            f"{url}: the server is not Streetfix ({error}); check the address", field="url"
         ) from error
     except (httpx.UnsupportedProtocol, httpx.LocalProtocolError, httpx.InvalidURL, httpx.CookieConflict) as error:
         raise RequestError(
-            f"{url}: this cannot be sent ({error}); check the address and the key", field="url"
+            f"{url}: the request cannot be sent ({error}); check the address and the key", field="url"
         ) from error
     except (httpx.HTTPError, httpx.StreamError) as error:
         reason = str(error) or type(error).__name__
@@ -249,12 +250,12 @@ def _problem_of(response: httpx.Response) -> RefusedError:
     may_come_back = response.status_code in _COME_BACK
     if not problem.code and not may_come_back:
         raise ForeignServiceError(
-            f"{response.url}: what answers there (status {response.status_code}) is no Streetfix; check the address",
+            f"{response.url}: the server (status {response.status_code}) is not Streetfix; check the address",
             field="url",
         )
     return refused(
         problem.title or response.reason_phrase, problem.detail, problem=problem.code, status=str(response.status_code),
-        field=problem.field or "", request_id=problem.request_id or response.headers.get("X-Request-Id", ""),
+        field=problem.field or "", request_id=problem.request_id or response.headers.get(REQUEST_ID, ""),
         may_come_back=may_come_back, retry_after_s=retry_after_s(response.headers.get("Retry-After")),
     )  # fmt: skip
 
@@ -283,7 +284,7 @@ def _outcome(outcome: _Outcome) -> schema.LocalizeAnswer | RefusedError:
     if outcome.answer is not None:
         return outcome.answer
     if outcome.problem is None:
-        raise ValueError("an outcome that is neither an answer nor a problem")
+        raise ValueError("an outcome has neither an answer nor a problem")
     told = outcome.problem
     return refused(
         told.title, told.detail, problem=told.code, status=str(told.status), field=told.field or "", request_id=told.request_id,

@@ -33,10 +33,12 @@ class RetryPolicy:
             RequestError: a number is out of bounds.
         """
         if self.attempts < 1:
-            raise RequestError(f"attempts: {self.attempts} asks nobody; give 1 or more", field="attempts")
+            raise RequestError(
+                f"attempts: {self.attempts} is not a valid number of attempts; pass 1 or more", field="attempts"
+            )
         for name in ("total_s", "backoff_s", "jitter"):
             if not 0 <= getattr(self, name) < float("inf"):
-                raise RequestError(f"{name}: {getattr(self, name)} is no patience; give 0 or more", field=name)
+                raise RequestError(f"{name}: {getattr(self, name)} is out of bounds; pass 0 or more", field=name)
 
 
 @dataclass(slots=True)

@@ -38,9 +38,7 @@ class TlsFile:
         try:
             return self.path.read_bytes()
         except OSError as error:
-            raise self.unusable(
-                f"it cannot be read ({error.strerror})", "check the path and who may read it"
-            ) from error
+            raise self.unusable(f"cannot be read ({error.strerror})", "check the path and the permissions") from error
 
     def unusable(self, why: str, remedy: str) -> KeysError:
         """Return the error for a file that cannot be used.
@@ -104,7 +102,7 @@ class ClientTls:
         if (shown is None) != (secret is None):
             there, missing = ("cert", "key") if secret is None else ("key", "cert")
             raise RequestError(
-                f"{missing}: a client's certificate and its private key go together, and only {there} is given; give --{missing}, "
+                f"{missing}: a client certificate and its private key belong together, but only {there} is given; pass --{missing}, "
                 f"{missing}= or {KEY if missing == 'key' else CERT} as well", field=missing,
             )  # fmt: skip
         folder = known.get(_CERT_DIR)
@@ -148,8 +146,8 @@ class ClientTls:
                 ) from error
             except (ssl.SSLError, ValueError) as error:
                 raise self.cert.unusable(
-                    f"this is no certificate in PEM with its private key {self.key.path}",
-                    "give the chain with the client's own certificate first, and the key that belongs to it",
+                    f"not a PEM certificate that matches the private key {self.key.path}",
+                    "pass the chain with the client certificate first, and the key that belongs to it",
                 ) from error
         return context
 
@@ -184,12 +182,12 @@ def _authorities(file: TlsFile) -> str:
     Raises:
         KeysError: the file has no certificate or cannot be read.
     """
-    remedy = "give the authority's certificate in PEM, which begins with -----BEGIN CERTIFICATE-----"
+    remedy = "pass the certificate of the authority as PEM, which begins with -----BEGIN CERTIFICATE-----"
     try:
         text = file.read().decode("ascii", errors="ignore")
         ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_verify_locations(cadata=text)
     except (ssl.SSLError, ValueError) as error:
-        raise file.unusable("there is no certificate in it", remedy) from error
+        raise file.unusable("the file has no certificate", remedy) from error
     return text
 
 
@@ -210,17 +208,17 @@ def handshake_error(address: str, reason: str) -> HandshakeError | None:
 #: Parts of messages of OpenSSL (REST) and BoringSSL (gRPC), and the remedy. The first match applies.
 _REMEDIES = (
     (("wrong_version_number", "wrong version number", "record layer failure"),
-     "what listens there does not speak TLS: check the port, or ask without TLS (http://)"),
+     "the server does not use TLS on this port: check the port, or connect without TLS (http://)"),
     (("hostname mismatch", "ip address mismatch", "hostname verification", "is not valid for", "is not in peer certificate"),
-     "its certificate is for another name: ask by a name that is in the certificate, or have this name added to it"),
+     "the certificate is for another name: connect by a name in the certificate, or add this name to the certificate"),
     (("certificate has expired", "not yet valid"),
-     "its certificate is not valid now: renew it, and check the clocks of both machines"),
+     "the certificate is not valid now: renew it, and check the clocks of both machines"),
     (("certificate_verify_failed", "certificate verify failed"),
-     f"no authority that this client trusts has signed its certificate: give the authority's with --ca, ca= or {CA}"),
+     f"no trusted authority has signed the certificate: pass the certificate of its authority with --ca, ca= or {CA}"),
     (("certificate_required", "certificate required", "peer_did_not_return"),
-     f"it asks for a client certificate: give --cert and --key, cert= and key=, or {CERT} and {KEY}"),
+     f"the service requires a client certificate: pass --cert and --key, cert= and key=, or {CERT} and {KEY}"),
     (("alert_unknown_ca", "alert unknown ca", "alert_bad_certificate", "alert bad certificate", "alert_certificate"),
-     "it does not accept the client's certificate: give one that its authority (STREETFIX_TLS_CLIENT_CA) has signed"),
+     "the service does not accept the client certificate: pass one that its authority (STREETFIX_TLS_CLIENT_CA) has signed"),
     (("ssl_error_ssl", "tls handshake", "ssl handshake", "[ssl"), "check the address, and the TLS settings of both sides"),
 )  # fmt: skip
 
@@ -235,10 +233,14 @@ def closed_hint(*, speaks_tls: bool, shows_certificate: bool) -> str:
         shows_certificate: True if the client has a certificate.
     """
     if not speaks_tls:
-        return "if the service speaks TLS, so must the client: https://, or --ca, ca= over gRPC"
+        return "if the service uses TLS, use https://, or --ca, ca= over gRPC"
     if not shows_certificate:
-        return f"if it asks for a client certificate, give --cert and --key, cert= and key=, or {CERT} and {KEY}"
-    return "it may not accept the client's certificate: its authority (STREETFIX_TLS_CLIENT_CA) must have signed it"
+        return (
+            f"if the service requires a client certificate, pass --cert and --key, cert= and key=, or {CERT} and {KEY}"
+        )
+    return (
+        "the service may not accept the client certificate: its authority (STREETFIX_TLS_CLIENT_CA) must have signed it"
+    )
 
 
 def ssl_reason(error: BaseException) -> str | None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 
+from service.confidence.extrapolation import extrapolated
 from service.confidence.features import FEATURES
 from service.confidence.reasons import Reason, reasons_of
 from service.confidence.spread import Extent, Spread, spread_of
@@ -81,6 +82,7 @@ class Outcome:
         candidates: registered poses, the best supported first; None if nothing was registered. If the answer is not LOCALIZED,
             candidates that exclude each other have covariances.
         spread: mean and covariance over all places where the camera may be; None for a LOCALIZED answer.
+        extrapolated: confidence features outside the range of the calibration data, as from ``extrapolation.extrapolated``.
     """
 
     status: Status
@@ -88,6 +90,7 @@ class Outcome:
     reasons: tuple[Reason, ...]
     candidates: tuple[Candidate, ...] | None
     spread: Spread | None
+    extrapolated: tuple[tuple[str, float], ...] = ()
 
 
 def outcome_of(
@@ -112,12 +115,13 @@ def outcome_of(
         T = refined.best.T_map_camera
         prior_nats = query.prior.known_nats(T[:2, 3], heading_of_camera(T))
     decision = decide(calibration, evidence, query.false_accept_rate, prior_nats=prior_nats)
+    outside = extrapolated(calibration, evidence)
     if decision.status == "LOCALIZED":
-        return Outcome(decision.status, decision.confidence, (), candidates, None)
+        return Outcome(decision.status, decision.confidence, (), candidates, None, outside)
     candidates = None if refined is None else refined.with_covariances()
     spread = _spread_over(candidates or (), frames, decision.confidence, extent)
     reasons = reasons_of(calibration, evidence, query.depth_m)
-    return Outcome(decision.status, decision.confidence, reasons, candidates, spread)
+    return Outcome(decision.status, decision.confidence, reasons, candidates, spread, outside)
 
 
 def require_promise(calibration: Calibration | None, query: Query) -> None:
@@ -132,8 +136,8 @@ def require_promise(calibration: Calibration | None, query: Query) -> None:
     """
     if calibration is not None and query.false_accept_rate < calibration.least_false_accept_rate:
         raise RequestError(
-            f"false_accept_rate: {query.false_accept_rate:g} is less than this map's calibration can promise; "
-            f"ask for {calibration.least_false_accept_rate:g} or more",
+            f"options.false_accept_rate: {query.false_accept_rate:g} is below what the calibration of this map supports; "
+            f"send {calibration.least_false_accept_rate:g} or more",
             field="options.false_accept_rate",
         )
 

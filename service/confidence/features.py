@@ -76,7 +76,7 @@ class Evidence:
         """Similarity of the best candidate minus that of the most similar neighbour elsewhere, times the root of the frames."""
         elsewhere = np.array([place.similarity for place in self.neighbours])[self.away_m > OTHER_PLACE_M]
         other = float(elsewhere.max()) if len(elsewhere) else 0.5
-        return float(np.sqrt(len(self.frames))) * (self.best.similarity - other)
+        return float(np.sqrt(len(self.frames))) * (self.best.scores["similarity"] - other)
 
     @property
     def votes(self) -> float:
@@ -134,13 +134,13 @@ TABLE: tuple[Feature, ...] = (
             lambda e: float(e.support_gaps[1:].min(initial=_MOST_MARGIN)), rivalry=True),
     Feature("inliers", "1", "share of the points that lie on the map", 1, lambda e: e.best.registered.inliers),
     Feature("similarity", "1", "descriptor similarity to the places around the pose", 1,
-            lambda e: e.best.similarity, weighted=False),
+            lambda e: e.best.scores["similarity"], weighted=False),
     Feature("similarity_margin", "1", "similarity at the pose minus the best similarity elsewhere", 1,
             lambda e: e.similarity_margin, rivalry=True),
-    Feature("likelihood", "nat", "mean log likelihood of the rendered depth", 1, lambda e: e.best.agreement.likelihood),
-    Feature("through", "1", "share of the points behind the mapped surfaces", -1, lambda e: e.best.agreement.through),
-    Feature("front", "1", "share of the points in front of the mapped surfaces", -1, lambda e: e.best.agreement.front),
-    Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.agreement.unmapped),
+    Feature("likelihood", "nat", "mean log likelihood of the rendered depth", 1, lambda e: e.best.scores["likelihood"]),
+    Feature("through", "1", "share of the points behind the mapped surfaces", -1, lambda e: e.best.scores["through"]),
+    Feature("front", "1", "share of the points in front of the mapped surfaces", -1, lambda e: e.best.scores["front"]),
+    Feature("unmapped", "1", "share of the points where the map shows nothing", -1, lambda e: e.best.scores["unmapped"]),
     Feature("log_sigma", "log m", "larger horizontal standard deviation of the pose", -1,
             lambda e: float(np.log(float(np.sqrt(np.linalg.eigvalsh(e.refined.covariance[:2, :2])[-1]))))),
     Feature("scale", "1 %", "estimated scale error of the depth, unsigned", -1,
@@ -153,7 +153,7 @@ TABLE: tuple[Feature, ...] = (
     Feature("points", "3000", "points of a frame", 1, lambda e: e.refined.points / 3000.0 / len(e.frames)),
     Feature("measured", "1", "share of the view grid with a measurement", 1, lambda e: e.frames[0].views.measured_share),
     Feature("place_m", "m", "distance of the places around the pose, at most 10 m", -1,
-            lambda e: min(e.best.place_m, _MOST_PLACE_M)),
+            lambda e: min(e.best.scores["place_m"], _MOST_PLACE_M)),
     Feature("facings", "log 1", "variety of the directions that walls face", 1, lambda e: e.shape.facings),
     Feature("far", "log m", "median range above the horizon", 0, lambda e: e.shape.far),
     Feature("edges", "1", "share of neighbouring cells on different surfaces", 0, lambda e: e.shape.edges),
@@ -207,6 +207,6 @@ def require_features(calibration: Calibration | None, path: str) -> None:
     """
     if calibration is not None and calibration.features != FEATURES:
         raise BundleError(
-            f"{path}: its features are not this program's: {', '.join(FEATURES)}; build the map again with this release",
+            f"{path}: the confidence features are not those of this release ({', '.join(FEATURES)}); build the map again",
             field="calibration.json",
         )

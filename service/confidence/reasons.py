@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from service.confidence.features import FEATURES
 from service.imaging.depth_unit_hint import unit_hint
 from service.maps.calibration import Calibration
-from service.scoring.scorer import SupportWeights
+from service.scoring.support import SupportWeights
 
 #: A confidence feature is out of range if it is more than this many standard deviations from the mean of the calibration data.
 FAR = 3.0
@@ -41,24 +41,24 @@ class Reason:
 #: Possible causes, the likeliest first: name, confidence features that indicate it, remedy. Features without a weight in the
 #: confidence (``UNWEIGHED``) are left out.
 GROUPS: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    ("intrinsics", ("facings",), "compare fx, fy, cx, cy and the picture's size with the camera's own calibration"),
+    ("intrinsics", ("facings",), "compare fx, fy, cx, cy and the image size with the calibration of the camera"),
     ("depth unit", ("scale",), "check depth.scale_m and depth.kind (metres for each stored unit; z or range)"),
     (
         "field of view or depth range", ("measured", "far"),
-        "the pictures measure another share of the view grid than those that confidence was fitted on; check the range of the depth",
+        "the depth covers another share of the view grid than the calibration data; check the range of the depth",
     ),
-    ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m), and how noisy the depth is"),
+    ("baseline", ("log_noise", "points", "log_sigma"), "check the stereo baseline (depth.baseline_m) and the noise of the depth"),
     (
         "traffic in the map", ("through", "front", "inliers", "unmapped", "likelihood"),
-        "build the map with the traffic vote, and look for what has been built or has moved since the survey",
+        "build the map with the traffic vote, and look for changes since the survey",
     ),
     (
         "calibration", ("margin", "similarity_margin", "votes", "entropy", "pose_spread", "residual", "edges", "place_m"),
-        "the map's confidence was calibrated on queries unlike these: calibrate on queries like them (streetfix calibrate)",
+        "the map was calibrated on other queries; calibrate it on queries like these (streetfix calibrate)",
     ),
 )  # fmt: skip
 _TOO_LITTLE = Reason(
-    "depth", (), "too few pixels have a depth to be registered; check depth.scale_m and that depth belongs to the colour picture"
+    "depth", (), "too few pixels have a depth for registration; check depth.scale_m, and that the depth belongs to the colour image"
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,10 +133,10 @@ def sequence_from(
     for number, (frame, (rgb, depth)) in enumerate(zip(request.frames, pictures, strict=True)):
         where = f"frames.{number}"
         if (frame.T_reference_camera is None) != (number == 0):
-            raise RequestError(
-                f"{where}.T_reference_camera: the first frame is the reference and has none, every other frame needs one",
-                field=f"{where}.T_reference_camera",
-            )
+            why = "missing; send the pose of this camera in the frame of the first camera"
+            if number == 0:
+                why = "the first frame is the reference; omit T_reference_camera here"
+            raise RequestError(f"{where}.T_reference_camera: {why}", field=f"{where}.T_reference_camera")
         alone = schema.LocalizeRequest(
             map=request.map, camera=frame.camera, depth=frame.depth, gravity=frame.gravity, options=request.options,
             T_vehicle_camera=None if number else request.T_vehicle_camera, prior=None if number else request.prior,
@@ -162,15 +162,15 @@ def height_over_base(T_vehicle_camera: NDArray[np.float64] | None) -> GivenHeigh
     """
     if T_vehicle_camera is None:
         raise RequestError(
-            "vehicle_base_on_ground: the height of the camera follows from T_vehicle_camera, which was not sent; send it, or send "
+            "vehicle_base_on_ground: T_vehicle_camera is missing, and the camera height follows from it; send it, or send "
             "camera.height_m instead", field="vehicle_base_on_ground",
         )  # fmt: skip
     height_m = float(T_vehicle_camera[2, 3])
     if not LEAST_HEIGHT_M <= height_m <= MOST_HEIGHT_M:
         raise RequestError(
-            f"T_vehicle_camera.position.z: with vehicle_base_on_ground, the camera would be {height_m:g} m above the ground, and "
-            f"{LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m are read; send T_vehicle_camera of a frame on the ground (z up, "
-            "metres), or send camera.height_m and no vehicle_base_on_ground", field="T_vehicle_camera.position.z",
+            f"T_vehicle_camera.position.z: with vehicle_base_on_ground, the camera would be {height_m:g} m above the ground, "
+            f"outside {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m; send T_vehicle_camera of a frame on the ground (z up, "
+            "metres), or send camera.height_m without vehicle_base_on_ground", field="T_vehicle_camera.position.z",
         )  # fmt: skip
     return GivenHeight(height_m, VEHICLE_HEIGHT_STD_M)
 
@@ -228,6 +228,8 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
         reasons=[_reason(each) for each in answer.reasons],
         neighbours=[_neighbour(each, bundle) for each in answer.neighbours],
         camera_height=schema.CameraHeight(height_m=answer.height_m, origin=answer.height_origin),
+        calibration=_calibration_range(answer),
+        extrapolated=dict(answer.extrapolated),
         map=schema.MapVersion(name=bundle.name, version=bundle.manifest.version),
         timings_ms=schema.TimingsMs(
             decode=times.decode_ms,
@@ -238,6 +240,12 @@ def answer_from(located: Located) -> schema.LocalizeAnswer:
             total=times.total_ms,
         ),
     )
+
+
+def _calibration_range(answer: Answer) -> Literal["in_range", "extrapolated"] | None:
+    if answer.confidence is None or answer.evidence is None:
+        return None
+    return "extrapolated" if answer.extrapolated else "in_range"
 
 
 def geopose_of(T_map_body: NDArray[np.float64], bundle: MapBundle) -> schema.GeoPose | None:
@@ -313,7 +321,7 @@ def map_entry_from(bundle: MapBundle, versions: Sequence[Localizer]) -> schema.M
 def _require_supported(camera: schema.Camera) -> None:
     if any(camera.distortion):
         raise NotYetSupportedError(
-            "camera.distortion: this release reads rectified pictures only; rectify both and send no distortion",
+            "camera.distortion: only rectified images are supported; rectify both images and send no distortion",
             field="camera.distortion",
         )
 
@@ -338,11 +346,9 @@ def _camera(camera: schema.Camera) -> PinholeCamera:
 
 def _prior(prior: schema.Prior) -> Prior:
     if prior.position is not None and prior.wgs84 is not None:
-        raise RequestError("prior: position and wgs84 say the same thing; send one of them", field="prior")
+        raise RequestError("prior: position and wgs84 exclude each other; send one of them", field="prior")
     if prior.position is None and prior.wgs84 is None and prior.heading_deg is None:
-        raise RequestError(
-            "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out", field="prior"
-        )
+        raise RequestError("prior: it is empty; send position, wgs84 or heading_deg, or omit prior", field="prior")
     position = prior.position
     std_m = next((known.std_m for known in (position, prior.wgs84) if known is not None), POSITION_STD_M)
     return Prior(
@@ -363,7 +369,7 @@ def _hypotheses(answer: Answer) -> list[schema.HypothesisOfPose]:
         schema.HypothesisOfPose(
             confirmed=answer.status == "LOCALIZED" and number == 0,
             pose=_pose(each.T_map_camera, heading_of_camera(each.T_map_camera), each.covariance),
-            share=float(share), inliers=each.registered.inliers, similarity=each.similarity,
+            share=float(share), inliers=each.registered.inliers, similarity=each.scores["similarity"],
         )
         for number, (each, share) in enumerate(zip(candidates, shares_of(candidates, answer.frames), strict=True))
     ]  # fmt: skip
@@ -387,7 +393,8 @@ def _direction(vector: schema.Direction, field: str) -> NDArray[np.float64]:
     length = math.hypot(*direction)
     if not 1e-6 < length < 1e9:
         raise RequestError(
-            f"{field}: a vector of length {length:g} has no direction; send the accelerometer's", field=field
+            f"{field}: a vector of length {length:g} has no direction; send the vector of the accelerometer",
+            field=field,
         )
     return direction / length
 
@@ -397,8 +404,8 @@ def _down(gravity: schema.Direction) -> NDArray[np.float64]:
     down = _direction(gravity, "gravity")
     if abs(down[2]) > np.cos(np.deg2rad(20.0)):
         raise RequestError(
-            f"gravity: ({down[0]:.2f}, {down[1]:.2f}, {down[2]:.2f}) says that the camera looks straight up or down; "
-            "send it in the camera frame: x right, y down, z forward", field="gravity",
+            f"gravity: ({down[0]:.2f}, {down[1]:.2f}, {down[2]:.2f}) means that the camera looks straight up or down; "
+            "send gravity in the camera frame: x right, y down, z forward", field="gravity",
         )  # fmt: skip
     return down
 
@@ -418,7 +425,9 @@ def transform_of(transform: schema.RigidTransform, name: str) -> NDArray[np.floa
     length = math.hypot(*quaternion)  # hypot does not overflow for components of 1e200
     if not 1e-6 < length < 1e9:
         field = f"{name}.orientation"
-        raise RequestError(f"{field}: a quaternion of length {length:g} is no rotation; send a unit one", field=field)
+        raise RequestError(
+            f"{field}: a quaternion of length {length:g} is not a valid rotation; send a unit quaternion", field=field
+        )
     return transform_from(rotation_from_quaternion_xyzw(quaternion), np.array([p.x, p.y, p.z]))
 
 

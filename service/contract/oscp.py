@@ -217,12 +217,14 @@ def query_of(request: GeoPoseRequest, map_name: str | None) -> EncodedQuery:
     readings = request.sensorReadings or SensorReadings()
     where = "sensorReadings.cameraReadings"
     colour = _reading(
-        readings, _COLOUR, f"{where}: there is no colour picture (imageFormat RGBA32); send one beside its DEPTH"
+        readings,
+        _COLOUR,
+        f"{where}: the colour image (imageFormat RGBA32) is missing; send it together with the DEPTH image",
     )
     depth = _reading(
         readings, ("DEPTH",),
-        f"{where}: there is no picture of imageFormat DEPTH; this service localizes by colour and depth together: send the depth "
-        "camera's picture (16-bit PNG in mm, or float TIFF in m) as a second reading",
+        f"{where}: the depth image (imageFormat DEPTH) is missing, and this service needs colour and depth; send the image of the "
+        "depth camera (16-bit PNG in mm, or float TIFF in m) as a second reading",
     )  # fmt: skip
     _require_same_view(colour, depth)
     content: dict[str, Any] = {
@@ -260,7 +262,8 @@ def _reading(readings: SensorReadings, formats: tuple[str, ...], missing: str) -
     turned = latest.imageOrientation
     if turned is not None and (turned.mirrored or (turned.rotation or 0) % 360):
         raise NotYetSupportedError(
-            "sensorReadings.cameraReadings.imageOrientation: this release reads upright, unmirrored pictures only; turn them before",
+            "sensorReadings.cameraReadings.imageOrientation: only upright, unmirrored images are supported; "
+            "rotate or mirror the image before you send it",
             field="sensorReadings.cameraReadings.imageOrientation",
         )
     return latest
@@ -273,12 +276,13 @@ def _camera(reading: CameraReading) -> dict[str, Any]:
     model, numbers = (params.model or "").upper(), params.modelParams or []
     if model not in _MODELS or len(numbers) != _MODELS[model][0] + 2 + _MODELS[model][1]:
         raise RequestError(
-            f"{where}: {len(numbers)} numbers of model {model or 'none'}; send COLMAP's parameters of one of {', '.join(_MODELS)}",
+            f"{where}: {len(numbers)} numbers do not fit the model {model or 'none'}; "
+            f"send COLMAP's parameters of one of {', '.join(_MODELS)}",
             field=where,
         )
     if reading.size is None or len(reading.size) != 2:
         raise RequestError(
-            "sensorReadings.cameraReadings.size: width and height are missing",
+            "sensorReadings.cameraReadings.size: width or height is missing; send [width, height]",
             field="sensorReadings.cameraReadings.size",
         )
     focal = _MODELS[model][0]
@@ -306,8 +310,8 @@ def _require_same_view(colour: CameraReading, depth: CameraReading) -> None:
     for focal, size in (("fx", "width"), ("fy", "height"), ("cx", "width"), ("cy", "height")):
         if abs(one[focal] / max(one[size], 1) - other[focal] / max(other[size], 1)) > _SAME_VIEW:
             raise NotYetSupportedError(
-                f"sensorReadings.cameraReadings.depth.params: its {focal} is another than the colour camera's; send depth aligned with "
-                "the colour picture", field="sensorReadings.cameraReadings.depth.params",
+                f"sensorReadings.cameraReadings.depth.params: its {focal} differs from that of the colour camera; send depth that is "
+                "registered to the colour image", field="sensorReadings.cameraReadings.depth.params",
             )  # fmt: skip
 
 
@@ -323,7 +327,7 @@ def _bytes(reading: CameraReading, field: str) -> bytes:
     try:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
-        raise DecodeError(f"{field}: it is no base64; encode the whole picture file", field=field) from error
+        raise DecodeError(f"{field}: not valid base64; encode the whole image file", field=field) from error
 
 
 def _gravity(readings: SensorReadings) -> dict[str, float] | None:

@@ -112,7 +112,9 @@ class Camera(_Strict):
     @classmethod
     def _is_rectified(cls, model: object) -> object:
         if model != "PINHOLE":
-            raise ValueError("only PINHOLE is read; rectify both pictures and send the rectified pictures' intrinsics")
+            raise ValueError(
+                "only PINHOLE is supported; rectify both images and send the intrinsics of the rectified images"
+            )
         return model
 
     @field_validator("fx", "fy")
@@ -122,7 +124,7 @@ class Camera(_Strict):
         if side is not None and not LEAST_FOCAL * side <= focal <= MOST_FOCAL * side:
             seen_deg = 2 * math.degrees(math.atan(0.5 * side / focal))
             raise ValueError(
-                f"{focal:g} px for a side of {side} px would see {seen_deg:.3g} degrees; give it in pixels"
+                f"{focal:g} px for a side of {side} px means a field of view of {seen_deg:.3g} degrees; send the focal length in pixels"
             )
         return focal
 
@@ -132,7 +134,7 @@ class Camera(_Strict):
         width = info.data.get("width")  # None: refused itself
         if width is not None and max(width, height) > MOST_ASPECT * min(width, height):
             raise ValueError(
-                f"a picture of {width} x {height} px is a strip; no side may be more than {MOST_ASPECT} times the other"
+                f"the aspect ratio of {width} x {height} px exceeds {MOST_ASPECT}:1; send the image size of the camera"
             )
         return height
 
@@ -532,6 +534,17 @@ class LocalizeAnswer(BaseModel):
         None,  # an earlier service sends none
         description="height of the camera above the ground, in an answer of any status. In a sequence, that of the first frame",
     )
+    calibration: Literal["in_range", "extrapolated"] | None = Field(
+        None,  # an earlier service sends none
+        description="in_range: calibration data like this query support the confidence. extrapolated: at least one confidence "
+        "feature lies outside the range of the calibration data, so the confidence may be wrong. Null if confidence is null, or "
+        "if nothing was registered",
+    )
+    extrapolated: dict[str, FiniteFloat] = Field(
+        default_factory=dict,  # an earlier service sends none
+        description="the confidence features outside that range: name, and distance from the mean of the calibration data in "
+        "standard deviations. Empty unless calibration is extrapolated",
+    )
     map: MapVersion
     timings_ms: TimingsMs
 
@@ -540,13 +553,17 @@ class LocalizeAnswer(BaseModel):
         """Refuse an inconsistent answer, whether it is created or parsed."""
         localized = self.status == "LOCALIZED"
         if localized != (self.pose is not None) or localized != (self.spread is None):
-            raise ValueError("a LOCALIZED answer has a pose and no spread, every other one a spread and no pose")
+            raise ValueError("A LOCALIZED answer needs a pose and no spread. Other answers need a spread and no pose.")
         if not localized and (self.vehicle_pose, self.geopose, self.street) != (None, None, None):
-            raise ValueError("an answer that is not LOCALIZED has no vehicle_pose, geopose or street")
+            raise ValueError("Only a LOCALIZED answer may have vehicle_pose, geopose or street.")
         if localized and self.reasons:
-            raise ValueError("a LOCALIZED answer has no reasons for not being LOCALIZED")
+            raise ValueError("A LOCALIZED answer must have no reasons.")
+        if (self.calibration == "extrapolated") != bool(self.extrapolated):
+            raise ValueError("extrapolated lists features if calibration is extrapolated, and only then.")
         if any(each.confirmed != (localized and number == 0) for number, each in enumerate(self.hypotheses)):
-            raise ValueError("only the first hypothesis of a LOCALIZED answer is confirmed")
+            raise ValueError(
+                "A LOCALIZED answer confirms its first hypothesis and no other. Other answers confirm none."
+            )
         return self
 
     def require_pose(self) -> Pose:
@@ -570,14 +587,14 @@ class LocalizeAnswer(BaseModel):
             raise self._not_localized()
         if self.vehicle_pose is None:
             raise RequestError(
-                "vehicle_pose: the request did not say where the camera sits; send T_vehicle_camera", field="T_vehicle_camera"
+                "vehicle_pose: missing, because the request had no T_vehicle_camera; send T_vehicle_camera", field="T_vehicle_camera"
             )  # fmt: skip
         return self.vehicle_pose
 
     def _not_localized(self) -> NotLocalizedError:
         return NotLocalizedError(
-            f"the answer is {self.status} (confidence {self.confidence or 0:.3f}), so it has no pose; look at its hypotheses, which "
-            "are not confirmed, send a prior or more frames, or look another way", answer=self,
+            f"the answer is {self.status} (confidence {self.confidence or 0:.3f}), so it has no pose; send a prior or more frames, "
+            "or turn the camera (the hypotheses of the answer are not confirmed)", answer=self,
         )  # fmt: skip
 
 

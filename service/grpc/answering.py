@@ -1,7 +1,5 @@
 """End every call in the same way: request id, status, one count in the metrics and one line in the log."""
 
-import re
-import uuid
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
@@ -9,6 +7,7 @@ from time import perf_counter
 
 import grpc
 
+from service.contract.request_id import REQUEST_ID, request_id_of
 from service.errors import StreetfixError
 from service.grpc.call import Call
 from service.grpc.memory import held_by_call
@@ -16,9 +15,6 @@ from service.grpc.status import fail, refuse
 from service.runtime.engine import Engine
 from service.runtime.logs import log_request
 from service.runtime.tracing import NO_SPAN
-
-REQUEST_ID = "x-request-id"
-_ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 @contextmanager
@@ -34,8 +30,7 @@ def answering(
         lives_long: the call is a stream, whose duration is not measured.
     """
     metadata = {name: value for name, value in context.invocation_metadata() if isinstance(value, str)}
-    given = metadata.get(REQUEST_ID, "")
-    request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
+    request_id = request_id_of(metadata.get(REQUEST_ID, ""))
     began, code = perf_counter(), "OK"
     span = NO_SPAN if engine.tracing is None else engine.tracing.begin("grpc", metadata.get("traceparent"))
     try:
@@ -52,7 +47,7 @@ def answering(
         raise
     except CancelledError:  # also a disconnected client; gRPC would treat this error as a defect and log a traceback
         code = "CANCELLED"
-        context.abort(grpc.StatusCode.CANCELLED, "the caller has gone")
+        context.abort(grpc.StatusCode.CANCELLED, "the client has disconnected")
     except Exception as error:
         code = "INTERNAL"
         fail(context, error, request_id)

@@ -102,7 +102,7 @@ class Call:
         except TimeoutError as error:
             future.cancel()
             raise DeadlineError(
-                f"no answer within {self._allowed_s:.3g} s; allow more time, or try again later"
+                f"no answer within {self._allowed_s:.3g} s; raise the deadline of the call, or try again later"
             ) from error
 
     def _forget(self, future: Future[T]) -> None:

@@ -34,6 +34,6 @@ class Health(health_pb2_grpc.HealthServicer):  # type: ignore[misc]  # untyped
             context: of the call.
         """
         if request.service not in self._services:
-            context.abort(grpc.StatusCode.NOT_FOUND, "there is no such service here")
+            context.abort(grpc.StatusCode.NOT_FOUND, "service not found")
         kinds = health_pb2.HealthCheckResponse
         return kinds(status=kinds.SERVING if self._engine.is_ready else kinds.NOT_SERVING)

@@ -59,7 +59,7 @@ class MessageMemory:
         Raises:
             BusyError: more calls read than the memory allows.
         """
-        with _taken(self._reading, "more calls send messages than there is memory for; try again in a second"):
+        with _taken(self._reading, "the memory for incoming messages is full; try again in a second"):
             yield
 
     @contextmanager
@@ -84,7 +84,7 @@ class MessageMemory:
             BusyError: another call reads.
         """
         places = self._other_streams if streams else self._other_calls
-        with _taken(places, "more calls send messages than may; try again in a second", wait_s=OTHERS_TURN_S):
+        with _taken(places, "too many calls send messages at once; try again in a second", wait_s=OTHERS_TURN_S):
             yield
 
     @contextmanager
@@ -94,7 +94,7 @@ class MessageMemory:
         Raises:
             BusyError: the maximum number of streams is open, or the memory for requests is taken.
         """
-        busy = f"all {self.streams} streams are taken; close one, or send sequences instead"
+        busy = f"all {self.streams} streams are in use; close one, or send sequences instead"
         with _taken(self._streams, busy, wait_s=0.0), self.hold() as hold:
             hold.grow(self._most_bytes)
             yield

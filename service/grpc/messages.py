@@ -29,6 +29,9 @@ _STATUS = {
     "LOCALIZED": pb.LOCALIZATION_STATUS_LOCALIZED, "AMBIGUOUS": pb.LOCALIZATION_STATUS_AMBIGUOUS,
     "OUT_OF_MAP": pb.LOCALIZATION_STATUS_OUT_OF_MAP,
 }  # fmt: skip
+_CALIBRATION = {
+    None: None, "in_range": pb.CALIBRATION_RANGE_IN_RANGE, "extrapolated": pb.CALIBRATION_RANGE_EXTRAPOLATED,
+}  # fmt: skip
 _ORIGINS = {
     "given": pb.CAMERA_HEIGHT_ORIGIN_GIVEN, "estimated": pb.CAMERA_HEIGHT_ORIGIN_ESTIMATED,
     "assumed": pb.CAMERA_HEIGHT_ORIGIN_ASSUMED,
@@ -189,6 +192,8 @@ def answer_message(answer: schema.LocalizeAnswer) -> pb.LocalizeResponse:
         ],
         spread=None if answer.spread is None else _spread(answer.spread),
         reasons=[pb.Reason(check=each.check, evidence=each.evidence, remedy=each.remedy) for each in answer.reasons],
+        calibration=_CALIBRATION[answer.calibration],
+        extrapolated=answer.extrapolated,
     )  # fmt: skip
     return message
 

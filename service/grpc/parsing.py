@@ -35,9 +35,9 @@ def parsed(raw: bytes, descriptor: Descriptor) -> Message:
         return _parse(raw, descriptor)
     except DecodeError as error:
         field = _field_at_fault(raw, descriptor)
-        where = f"{field}: its bytes are" if field else "the bytes are"
+        where = f"{field}: " if field else ""
         raise RequestError(
-            f"{where} not what the proto describes (text must be UTF-8); use the proto in this service's repository",
+            f"{where}the bytes do not match the proto (text must be UTF-8); use the proto in this service's repository",
             field=field,
         ) from error
 
@@ -55,7 +55,7 @@ def require_few_fields(raw: bytes, *, most: int = MOST_FIELDS) -> None:
     for count, _ in enumerate(_fields(raw), 1):
         if count > most:
             raise RequestError(
-                f"the message has more than {most} fields at its top; send fewer requests or frames at once"
+                f"the message has more than {most} top-level fields; send fewer requests or frames at once"
             )
 
 
@@ -146,4 +146,4 @@ def _varint_of(value: int) -> bytes:
 
 
 def _no_message() -> RequestError:
-    return RequestError("the bytes are no protobuf message; use the proto in this service's repository")
+    return RequestError("the bytes are not a protobuf message; use the proto in this service's repository")

@@ -179,7 +179,7 @@ class ReadingInterceptor(_Interceptor):
             self._end(error, method, context)
         # gRPC gives no reason if the call was cancelled meanwhile or if its message exceeded the limit.
         if raw is None:
-            self._end(RequestError("the call ended before its message had come; send exactly one"), method, context)
+            self._end(RequestError("the call ended without a message; send exactly one message"), method, context)
         return raw
 
     def _parsed(self, raw: bytes, message: Descriptor, method: str, context: grpc.ServicerContext) -> Message:
@@ -192,4 +192,4 @@ class ReadingInterceptor(_Interceptor):
     def _end(self, error: Exception, method: str, context: grpc.ServicerContext) -> NoReturn:
         with self._answering(method, context):
             raise error
-        raise AssertionError("a call went on after its end")
+        raise AssertionError("the call continued after its end")

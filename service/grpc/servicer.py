@@ -63,7 +63,8 @@ class Servicer(LocalizationServiceServicer):
         with self._answering("LocalizeBatch", context) as call:
             if not 1 <= len(request.requests) <= MOST_FRAMES:
                 raise RequestError(
-                    f"requests: there are {len(request.requests)}; send 1 to {MOST_FRAMES}", field="requests"
+                    f"requests: the batch has {len(request.requests)} requests; send 1 to {MOST_FRAMES}",
+                    field="requests",
                 )
             self._engine.metrics.batched(len(request.requests))
             begun = [self._begin(call, each) for each in request.requests]

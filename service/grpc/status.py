@@ -79,7 +79,8 @@ def fail(context: grpc.ServicerContext, error: Exception, request_id: str) -> No
     _log.error("request_failed request_id=%s", request_id, exc_info=error)
     error.__traceback__ = None  # it would keep the request in memory
     context.abort(
-        grpc.StatusCode.INTERNAL, f"the service failed on this request; tell its operator the request id {request_id}"
+        grpc.StatusCode.INTERNAL,
+        f"the service failed on this request; report the request id {request_id} to its operator",
     )
     raise AssertionError("abort returned")
 

@@ -21,7 +21,7 @@ from service.registration.points import PointSettings
 from service.registration.register import RegistrationSettings
 from service.retrieval.hypotheses import ClusterSettings
 from service.retrieval.starts import StartSettings
-from service.scoring.scorer import SupportWeights
+from service.scoring.support import SupportWeights
 
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -61,7 +61,7 @@ def flat(answer: dict[str, Any]) -> dict[str, Any]:
         if isinstance(value, list):
             return [plain(each) for each in value]
         if isinstance(value, str):
-            for prefix in ("LOCALIZATION_STATUS_", "STREET_SECTION_", "CAMERA_HEIGHT_ORIGIN_"):
+            for prefix in ("LOCALIZATION_STATUS_", "STREET_SECTION_", "CAMERA_HEIGHT_ORIGIN_", "CALIBRATION_RANGE_"):
                 value = value.removeprefix(prefix)
             return value.lower()
         return float(value) if isinstance(value, int) else value

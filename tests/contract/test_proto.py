@@ -15,7 +15,7 @@ def fields_of(message: str) -> set[str]:
     text = (PROTO / "streetfix" / "v1" / "localization.proto").read_text()
     body = re.search(rf"^message {message} {{(.*?)^}}", text, flags=re.MULTILINE | re.DOTALL)
     assert body is not None
-    return set(re.findall(r"^ +(?:optional |repeated )?\w+ (\w+) = \d+;", body[1], flags=re.MULTILINE))
+    return set(re.findall(r"^ +(?:optional |repeated )?(?:\w+|map<[^>]+>) (\w+) = \d+;", body[1], flags=re.MULTILINE))
 
 
 def test_the_proto_is_lint_clean(tmp_path: Path) -> None:

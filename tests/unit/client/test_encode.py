@@ -49,7 +49,7 @@ def test_a_slice_of_another_picture_is_sent_as_it_looks() -> None:
     "picture", [RGB[..., 0], RGB.astype(np.float32), RGB[:0], np.zeros((4, 4, 4), np.uint8), [[1]], None]
 )
 def test_what_is_no_colour_picture_is_named(picture: Any) -> None:
-    with pytest.raises(RequestError, match=r"rgb: .* is no colour picture; give uint8") as caught:
+    with pytest.raises(RequestError, match=r"rgb: must be uint8 \(H, W, 3\), not .*; pass such an array") as caught:
         encode_rgb(picture)
     assert caught.value.field == "rgb"
 
@@ -101,14 +101,16 @@ def test_no_measurement_is_off_by_more_than_half_a_step(depth: Any) -> None:
     "depth", [RGB, np.zeros((2, 2), np.int32), np.zeros((0, 2), np.float32), np.zeros(4, np.float32), 3.0]
 )
 def test_what_is_no_depth_picture_is_named(depth: Any) -> None:
-    with pytest.raises(RequestError, match=r"depth: .* is no depth picture; give metres") as caught:
+    with pytest.raises(
+        RequestError, match=r"depth: must be a float or uint16 array \(H, W\), not .*; pass metres"
+    ) as caught:
         encode_depth(depth)
     assert caught.value.field == "depth"
 
 
 @pytest.mark.parametrize("scale_m", [0.0, -1.0, float("nan"), float("inf")])
 def test_what_is_no_scale_is_refused(scale_m: float) -> None:
-    with pytest.raises(RequestError, match=r"depth_scale_m: .* is no scale"):
+    with pytest.raises(RequestError, match=r"depth_scale_m: .* is not a valid scale"):
         encode_depth(np.ones((2, 2), np.float32), scale_m=scale_m)
 
 
@@ -117,7 +119,7 @@ def test_millimetres_given_as_metres_are_refused_with_the_scale() -> None:
     with pytest.raises(RequestError) as caught:
         encode_depth(millimetres)
     assert caught.value.message == (
-        "depth: its median is 5000 m, which looks like millimetres: give depth_scale_m=0.001, or divide by 1000"
+        "depth: the median is 5000 m, which looks like millimetres; pass depth_scale_m=0.001, or divide by 1000"
     )
     assert caught.value.field == "depth"
     np.testing.assert_allclose(read(millimetres[:, :3], scale_m=0.001), [[4.0, 5.0, 9.0]])

@@ -127,6 +127,8 @@ def test_a_request_is_what_the_service_reads_off_it(client: GrpcClient, told: To
         {"geopose": {"position": {"lat": 52.5, "lon": 13.4, "h": 70.0}, "quaternion": {"x": 0, "y": 0, "z": 0, "w": 1}}},
         {"vehicle_pose": POSE},
         {"camera_height": {"height_m": 0.3, "origin": "given"}},
+        {"calibration": "in_range"},
+        {"calibration": "extrapolated", "extrapolated": {"front": 5.25, "points": -4.5}},
         {"status": "AMBIGUOUS", "camera_height": {"height_m": 1.5, "origin": "assumed"}},
         {"hypotheses": [{"confirmed": True, "pose": POSE, "share": 1, "inliers": 0.5, "similarity": 0.25}]},
         {"neighbours": [{"place": 3, "distance": 0.5, "similarity": 0.5, "street": None, "position": ORIGIN, "heading_deg": 0.0}]},
@@ -267,7 +269,7 @@ def test_an_answer_of_another_contract_is_told_so(client: GrpcClient, told: Told
 
 @pytest.mark.parametrize("address", ["", "localhost", "http://x:1", ":1", "x:y"])
 def test_an_address_that_is_none_is_refused(address: str) -> None:
-    with pytest.raises(RequestError, match="give HOST:PORT"):
+    with pytest.raises(RequestError, match="pass HOST:PORT"):
         GrpcClient(address)
 
 

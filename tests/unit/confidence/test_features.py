@@ -14,7 +14,6 @@ from service.maps.calibration import read_calibration
 from service.retrieval.hypotheses import Hypothesis
 from service.retrieval.knn import Neighbour
 from service.scoring.candidates import Refined
-from service.scoring.rendered_depth import Agreement
 
 
 def refined(*candidates, covariance=None, points=1500, disagreement=1.0):
@@ -59,16 +58,16 @@ def weighed(candidate, frame):
      ("measured", 0.75), ("place_m", 1.5)],
 )  # fmt: skip
 def test_what_is_known_of_the_best_candidate_is_told_as_it_is(candidate, weighed, name, expected):
-    other = replace(
-        candidate(-1.0, xyz=(50, 0, 1.5)), similarity=0.1, place_m=7.0, agreement=Agreement(-9.0, 0.9, 0.9, 0.9)
-    )
+    worse = {"similarity": 0.1, "place_m": 7.0, "likelihood": -9.0, "through": 0.9, "front": 0.9, "unmapped": 0.9}
+    other = replace(candidate(-1.0, xyz=(50, 0, 1.5)), scores=worse)
     assert weighed(candidates=(candidate(), other))[name] == expected
 
 
 @pytest.mark.parametrize(("place_m", "expected"), [(0.0, 0.0), (9.9, 9.9), (10.1, 10.0), (1e4, 10.0)])
 def test_places_further_than_ten_metres_are_told_as_ten(candidate, weighed, place_m, expected):
     """Calibration has seen no survey so sparse."""
-    assert weighed(candidates=(replace(candidate(), place_m=place_m),))["place_m"] == expected
+    best = candidate()
+    assert weighed(candidates=(replace(best, scores={**best.scores, "place_m": place_m}),))["place_m"] == expected
 
 
 @pytest.mark.parametrize(
@@ -230,7 +229,9 @@ def test_the_spread_is_that_of_the_five_most_similar_places(weighed, x_m, expect
 def test_a_calibration_of_other_features_is_refused(calibration_json, features):
     document = calibration_json(features=list(features))
     calibration = read_calibration(json.dumps(document).encode(), path="x")
-    with pytest.raises(BundleError, match=r"^maps/town: its features are not this program's: margin, inliers") as error:
+    with pytest.raises(
+        BundleError, match=r"^maps/town: the confidence features are not those of this release \(margin, inliers"
+    ) as error:
         require_features(calibration, "maps/town")
     assert error.value.field == "calibration.json"
     require_features(read_calibration(json.dumps(calibration_json()).encode(), path="x"), "maps/town")

@@ -3,7 +3,7 @@ import pytest
 
 from service.confidence.features import FEATURES, UNWEIGHED
 from service.confidence.reasons import FAR, GROUPS, reasons_of, support_of
-from service.scoring.scorer import SupportWeights
+from service.scoring.support import SupportWeights
 
 
 @pytest.fixture
@@ -72,6 +72,6 @@ def test_a_depth_in_another_unit_is_the_first_reason_and_is_told_once(calibratio
     depth_m = np.full((4, 4), 5000, np.float32)
     unit, intrinsics = reasons_of(calibration, evidence, depth_m)
     assert (unit.check, unit.evidence, intrinsics.check) == ("depth unit", (), "intrinsics")
-    assert "looks like millimetres: send scale_m 0.001" in unit.remedy
+    assert "looks like millimetres; send depth.scale_m = 0.001" in unit.remedy
     assert told(reasons_of(calibration, None, depth_m)) == [("depth unit", ()), ("depth", ())]
     assert reasons_of(calibration, evidence, depth_m / np.float32(1000)) == reasons_of(calibration, evidence)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from service.confidence.spread import Spread
 from service.contract import convert, schema
@@ -19,7 +20,6 @@ from service.retrieval.prior import Prior
 from service.retrieval.query import Query
 from service.runtime.engine import Located
 from service.scoring.candidates import Candidate
-from service.scoring.rendered_depth import Agreement
 
 BOTH = {"position": {"x": 1, "y": 2}, "wgs84": {"latitude_deg": 0, "longitude_deg": 0}}
 
@@ -56,7 +56,9 @@ def test_a_transform_beyond_any_robot_is_refused(parts_of, far):
     ("field", "focal", "degrees"), [("fx", 0.5, 178), ("fy", 0.95, 175), ("fy", 0.05, 180), ("fx", 1.27, 175)]
 )
 def test_a_focal_length_that_is_not_in_pixels_is_refused(camera_document, field, focal, degrees):
-    with pytest.raises(RequestError, match=f"would see {degrees} degrees; give it in pixels") as caught:
+    with pytest.raises(
+        RequestError, match=f"field of view of {degrees} degrees; send the focal length in pixels"
+    ) as caught:
         parsed(json.dumps({"camera": camera_document | {field: focal}}).encode(), LocalizeRequest)
     assert caught.value.field == f"camera.{field}"
 
@@ -116,13 +118,13 @@ def test_degrees_on_the_earth_wait_for_the_map(prior_of):
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        (BOTH, "prior: position and wgs84 say the same thing; send one of them"),
-        (BOTH | {"heading_deg": 0}, "prior: position and wgs84 say the same thing; send one of them"),
-        ({}, "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out"),
-        ({"heading_std_deg": 3}, "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out"),
+        (BOTH, "prior: position and wgs84 exclude each other; send one of them"),
+        (BOTH | {"heading_deg": 0}, "prior: position and wgs84 exclude each other; send one of them"),
+        ({}, "prior: it is empty; send position, wgs84 or heading_deg, or omit prior"),
+        ({"heading_std_deg": 3}, "prior: it is empty; send position, wgs84 or heading_deg, or omit prior"),
         (
             {"position": None, "heading_deg": None},
-            "prior: it says nothing; send position, wgs84 or heading_deg, or leave it out",
+            "prior: it is empty; send position, wgs84 or heading_deg, or omit prior",
         ),
     ],
 )
@@ -146,9 +148,7 @@ def localized(bundle_path, pictures):
 def candidate(support, *, xyz, heading_deg=0.0):
     R, at = rotation_z(np.deg2rad(heading_deg)), np.array(xyz, np.float64)
     registered = Registered(R, at, 1.0, 0.0, 0.7, np.eye(8), 0)
-    return Candidate(
-        transform_from(R @ R_BODY_OPTICAL, at), registered, 0.8, 1.5, Agreement(-1.5, 0.0, 0.0, 0.0), support
-    )
+    return Candidate(transform_from(R @ R_BODY_OPTICAL, at), registered, {"similarity": 0.8}, support)
 
 
 def hypotheses_of(localized, *candidates, frames=1):
@@ -269,7 +269,7 @@ def test_a_vehicle_frame_on_the_ground_tells_the_height_of_its_camera(parts_of, 
         ({}, "vehicle_base_on_ground", "send it, or send camera.height_m instead"),
         ({"T_vehicle_camera": at_height(0.0)}, "T_vehicle_camera.position.z", "send T_vehicle_camera of a frame on the ground"),
         ({"T_vehicle_camera": at_height(-1.2)}, "T_vehicle_camera.position.z", "would be -1.2 m above the ground"),
-        ({"T_vehicle_camera": at_height(30.5)}, "T_vehicle_camera.position.z", "0.05 to 30 m are read"),
+        ({"T_vehicle_camera": at_height(30.5)}, "T_vehicle_camera.position.z", "outside 0.05 to 30 m"),
     ],
 )  # fmt: skip
 def test_a_vehicle_frame_that_tells_no_height_is_refused(parts_of, changed, field, remedy):
@@ -329,6 +329,30 @@ def test_an_answer_of_any_status_tells_the_height_and_its_origin(localized):
     )
     refused = answer_from(replace(localized, answer=answer))
     assert (refused.pose, refused.camera_height) == (None, schema.CameraHeight(height_m=0.3, origin="given"))
+
+
+@pytest.mark.parametrize(
+    ("confidence", "evidence", "outside", "said"),
+    [
+        (0.9, np.zeros(3), (), "in_range"),
+        (0.9, np.zeros(3), (("front", 5.0),), "extrapolated"),
+        (None, np.zeros(3), (), None),  # a map without calibration
+        (0.0, None, (), None),  # too few points to register
+    ],
+)
+def test_an_answer_says_whether_its_confidence_is_extrapolated(localized, confidence, evidence, outside, said):
+    answer = replace(localized.answer, confidence=confidence, evidence=evidence, extrapolated=outside)
+    found = answer_from(replace(localized, answer=answer))
+    assert (found.calibration, found.extrapolated) == (said, dict(outside))
+
+
+@pytest.mark.parametrize(
+    ("said", "outside"), [("in_range", {"front": 5.0}), ("extrapolated", {}), (None, {"front": 5.0})]
+)
+def test_features_stand_with_an_extrapolated_confidence_and_with_no_other(localized, said, outside):
+    content = answer_from(localized).model_dump(by_alias=True) | {"calibration": said, "extrapolated": outside}
+    with pytest.raises(ValidationError, match="only then"):
+        schema.LocalizeAnswer.model_validate(content)
 
 
 def spread_of(localized):

@@ -25,6 +25,12 @@ class DepthEncoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     DEPTH_ENCODING_CARLA: _ClassVar[DepthEncoding]
     DEPTH_ENCODING_COMPRESSED_DEPTH: _ClassVar[DepthEncoding]
 
+class CalibrationRange(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CALIBRATION_RANGE_UNSPECIFIED: _ClassVar[CalibrationRange]
+    CALIBRATION_RANGE_IN_RANGE: _ClassVar[CalibrationRange]
+    CALIBRATION_RANGE_EXTRAPOLATED: _ClassVar[CalibrationRange]
+
 class CameraHeightOrigin(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     CAMERA_HEIGHT_ORIGIN_UNSPECIFIED: _ClassVar[CameraHeightOrigin]
@@ -53,6 +59,9 @@ DEPTH_KIND_DISPARITY: DepthKind
 DEPTH_ENCODING_UNSPECIFIED: DepthEncoding
 DEPTH_ENCODING_CARLA: DepthEncoding
 DEPTH_ENCODING_COMPRESSED_DEPTH: DepthEncoding
+CALIBRATION_RANGE_UNSPECIFIED: CalibrationRange
+CALIBRATION_RANGE_IN_RANGE: CalibrationRange
+CALIBRATION_RANGE_EXTRAPOLATED: CalibrationRange
 CAMERA_HEIGHT_ORIGIN_UNSPECIFIED: CameraHeightOrigin
 CAMERA_HEIGHT_ORIGIN_GIVEN: CameraHeightOrigin
 CAMERA_HEIGHT_ORIGIN_ESTIMATED: CameraHeightOrigin
@@ -316,7 +325,14 @@ class Options(_message.Message):
     def __init__(self, neighbours: _Optional[int] = ..., refine: _Optional[bool] = ..., false_accept_rate: _Optional[float] = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
-    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height")
+    __slots__ = ("status", "confidence", "street", "pose", "vehicle_pose", "geopose", "neighbours", "map", "timings", "hypotheses", "spread", "reasons", "camera_height", "calibration", "extrapolated")
+    class ExtrapolatedEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
     STATUS_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     STREET_FIELD_NUMBER: _ClassVar[int]
@@ -330,6 +346,8 @@ class LocalizeResponse(_message.Message):
     SPREAD_FIELD_NUMBER: _ClassVar[int]
     REASONS_FIELD_NUMBER: _ClassVar[int]
     CAMERA_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    EXTRAPOLATED_FIELD_NUMBER: _ClassVar[int]
     status: LocalizationStatus
     confidence: float
     street: Street
@@ -343,7 +361,9 @@ class LocalizeResponse(_message.Message):
     spread: Spread
     reasons: _containers.RepeatedCompositeFieldContainer[Reason]
     camera_height: CameraHeight
-    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ...) -> None: ...
+    calibration: CalibrationRange
+    extrapolated: _containers.ScalarMap[str, float]
+    def __init__(self, status: _Optional[_Union[LocalizationStatus, str]] = ..., confidence: _Optional[float] = ..., street: _Optional[_Union[Street, _Mapping]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., vehicle_pose: _Optional[_Union[Pose, _Mapping]] = ..., geopose: _Optional[_Union[GeoPose, _Mapping]] = ..., neighbours: _Optional[_Iterable[_Union[Neighbour, _Mapping]]] = ..., map: _Optional[_Union[MapVersion, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., spread: _Optional[_Union[Spread, _Mapping]] = ..., reasons: _Optional[_Iterable[_Union[Reason, _Mapping]]] = ..., camera_height: _Optional[_Union[CameraHeight, _Mapping]] = ..., calibration: _Optional[_Union[CalibrationRange, str]] = ..., extrapolated: _Optional[_Mapping[str, float]] = ...) -> None: ...
 
 class CameraHeight(_message.Message):
     __slots__ = ("height_m", "origin")
