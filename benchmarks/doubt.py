@@ -20,9 +20,9 @@ from model_training.simulation.hard import HARD
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
+from service.maps.calibration import RIGHT_M
 from service.retrieval.query import Query
 
-RIGHT_M = 1.0
 #: Cities whose maps are built again without every second street.
 PARTIAL = (0, 1, 2)
 #: Shares of accepted out-of-map queries at which the curves are given.

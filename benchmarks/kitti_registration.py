@@ -28,7 +28,7 @@ STARTS, AWAY_M, TURN_DEG = 20, 2.0, 10.0
 GICP_CELL_M, GICP_REACH_M = 0.2, 40.0
 #: Radii of correspondence, one after the other; this order suits GICP best.
 GICP_RADII_M = (2.0, 0.5)
-FOCAL_BASELINE_PX_M = 721.5 * 0.54
+KITTI_FOCAL_BASELINE_PX_M = 721.5 * 0.54
 BARS = {"median_m": (0.08, "lower"), "p95_m": (0.15, "lower"), "within_1_m": (1.0, "higher")}
 
 
@@ -77,21 +77,21 @@ def registration_errors(cloud: SurfelMap, dataset: Dataset) -> tuple[NDArray[np.
         cloud: map surfaces.
         dataset: frames with ground truth.
     """
-    refining = settings_for_rig(RefineSettings(), FOCAL_BASELINE_PX_M)
+    refining = settings_for_rig(RefineSettings(), KITTI_FOCAL_BASELINE_PX_M)
     found, prepared_s, aligned_s = list[float](), list[float](), list[float]()
     for frame, truth in _with_truth(dataset):
         depth_m, camera = frame.depth_m(), frame.camera.pinhole()
         level = level_camera(depth_m, camera, down_camera=None, nominal_height_m=1.65)
         began = time.process_time()
-        noise = inverse_depth_noise(depth_m, focal_baseline_px_m=FOCAL_BASELINE_PX_M).total
+        noise = inverse_depth_noise(depth_m, focal_baseline_px_m=KITTI_FOCAL_BASELINE_PX_M).total
         blocks = blocks_of(depth_m, camera, refining.points, noise=noise)
         points = points_from(
-            blocks, level.R_level_camera, level.height_m, refining.points, noise=noise, focal_baseline_px_m=FOCAL_BASELINE_PX_M
+            blocks, level.R_level_camera, level.height_m, refining.points, noise=noise, focal_baseline_px_m=KITTI_FOCAL_BASELINE_PX_M
         )  # fmt: skip
         T_level_camera = transform_from(level.R_level_camera, np.zeros(3))
         movable = movable_of(blocks, level.R_level_camera, level.height_m, refining.points)
         picture = picture_of(
-            blocks, T_level_camera, noise=noise, focal_baseline_px_m=FOCAL_BASELINE_PX_M, movable=movable
+            blocks, T_level_camera, noise=noise, focal_baseline_px_m=KITTI_FOCAL_BASELINE_PX_M, movable=movable
         )
         prepared_s.append(time.process_time() - began)
         rng = np.random.default_rng([140, frame.number])

@@ -64,7 +64,7 @@ def main() -> None:
         OUT / "map.png",
     )
     answers, _, _ = _streetfix(DEMO, work).partition(
-        "serve this map again"
+        "Serve the map again"
     )  # the text after this mark names folders of this machine
     draw_terminal("make demo", answers, OUT / "demo.png")
 
@@ -87,7 +87,7 @@ def draw_street(dataset: Dataset, path: Path, *, width: int = 330) -> None:
     """
     frame = list(dataset.queries("drive1_precise"))[_FRAME]
     rgb, depth_m = frame.rgb(), frame.depth_m()
-    fused = cv2.cvtColor(picture_of(fuse(rgb, depth_m), ViewGrid().max_range_m), cv2.COLOR_RGB2BGR)
+    fused = cv2.cvtColor(picture_of(fuse(rgb, depth_m).planes, ViewGrid().max_range_m), cv2.COLOR_RGB2BGR)
     size = (width, round(rgb.shape[0] * width / rgb.shape[1]))
     parts = [cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), size, interpolation=cv2.INTER_AREA), depth_bgr(depth_m, width=width),
              cv2.resize(fused, size, interpolation=cv2.INTER_AREA)]  # fmt: skip

@@ -1,43 +1,43 @@
 """The exceptions of Streetfix. The lowest layer: it imports nothing of ours.
 
-StreetfixError                     code            kind
-├── RequestError                   request         invalid      a field of the request is missing or makes no sense
-│   ├── DecodeError                undecodable     invalid      a part is not the picture it says it is
-│   ├── ImageSizeError             image-size      invalid      a picture's size does not fit the camera
-│   ├── NoDepthError               no-depth        invalid      the depth picture holds no usable measurement
-│   └── NotYetSupportedError       not-yet         invalid      a field of the contract that this release cannot use
-├── UnsupportedFormatError         format          unsupported  a format that we do not read
-├── TooLargeError                  too-large       too_large    a part is beyond a limit
-├── UnknownMapError                unknown-map     not_found    no map of that name is mounted
-├── UnknownSampleError              unknown-sample  not_found    no sample pair of that name lies beside the maps
-├── NoPoseError                    no-pose         not_found    no sure pose, asked for in a format that has no word for doubt
-├── NotLocalizedError              not-localized   not_found    a pose is wanted of an answer that is not LOCALIZED
-├── NotGeoreferencedError          no-georeference invalid      a place on the Earth is asked of a map that has none
-├── UnauthorizedError              unauthorized    unauthorized no API key, or not one of the service's
-├── ForbiddenError                 forbidden       forbidden    the caller may ask, but not change what the service does
-├── ForbiddenHostError             forbidden-host  forbidden    the request names a host that is not this service
-├── ForbiddenOriginError           forbidden-origin forbidden   a web page of another origin sent the request
-├── BusyError                      busy            busy         the queue, or the memory for requests, is full
-├── NotReadyError                  not-ready       not_ready    no map is mounted, or the service is leaving
-├── DeadlineError                  deadline        deadline     a request took longer than the service allows
-├── BundleError                    bundle          not_ready    a map bundle is missing, damaged or of another version
-├── DatasetError                   dataset         invalid      a dataset folder is incomplete or contradicts itself
-├── EncoderError                   encoder         not_ready    an encoder file is missing or is not an encoder of ours
-├── UnreachableError               unreachable     not_ready    a service does not answer
-│   ├── NoAnswerInTimeError        no-answer       not_ready    a service was asked, and the caller's time ended
-│   ├── ForeignServiceError        foreign         not_ready    what answers speaks another language
-│   └── HandshakeError             handshake       not_ready    a service and its client do not agree on TLS
-├── RefusedError                   refused         invalid      a service refused a request (seen by its client)
-│   └── UnavailableError           unavailable     not_ready    it refused for now, and still did when patience ended
-├── AddressError                   address         not_ready    the service cannot listen where it was told to
-├── KeysError                      keys            not_ready    the file of API keys, or a certificate, cannot be used
-├── ExtraMissingError              extra-missing   unsupported  a command or a class needs packages of an extra
-└── UnsupportedPlatformError       platform        unsupported  the service does not run on this operating system or processor
+StreetfixError                     code             kind
+├── RequestError                   request          invalid      a field of the request is missing or invalid
+│   ├── DecodeError                undecodable      invalid      a part cannot be decoded as an image
+│   ├── ImageSizeError             image-size       invalid      the image size does not match the camera intrinsics
+│   ├── NoDepthError               no-depth         invalid      the depth image has no usable measurement
+│   └── NotYetSupportedError       not-yet          invalid      this release does not support the field
+├── UnsupportedFormatError         format           unsupported  the format is not supported
+├── TooLargeError                  too-large        too_large    a part exceeds a limit
+├── UnknownMapError                unknown-map      not_found    no mounted map matches the request
+├── UnknownSampleError             unknown-sample   not_found    the sample pair was not found
+├── NoPoseError                    no-pose          not_found    not LOCALIZED, and GeoPose cannot express uncertainty
+├── NotLocalizedError              not-localized    not_found    the answer is not LOCALIZED, so it has no pose
+├── NotGeoreferencedError          no-georeference  invalid      the map is not georeferenced
+├── UnauthorizedError              unauthorized     unauthorized the API key is missing or unknown
+├── ForbiddenError                 forbidden        forbidden    the caller has no operator rights
+├── ForbiddenHostError             forbidden-host   forbidden    the Host header does not name this service
+├── ForbiddenOriginError           forbidden-origin forbidden    a web page of another origin sent the request
+├── BusyError                      busy             busy         the queue or the memory for requests is full
+├── NotReadyError                  not-ready        not_ready    no map is mounted, or the service is stopping
+├── DeadlineError                  deadline         deadline     a request took longer than the service allows
+├── BundleError                    bundle           not_ready    a map bundle is missing, damaged or of another version
+├── DatasetError                   dataset          invalid      a dataset folder is incomplete or inconsistent
+├── EncoderError                   encoder          not_ready    an encoder file is missing or is not a Streetfix encoder
+├── UnreachableError               unreachable      not_ready    the service does not answer
+│   ├── NoAnswerInTimeError        no-answer        not_ready    the client timed out before the answer arrived
+│   ├── ForeignServiceError        foreign          not_ready    the program at the address is not a compatible Streetfix service
+│   └── HandshakeError             handshake        not_ready    the TLS handshake failed
+├── RefusedError                   refused          invalid      the service refused a request (raised by the client)
+│   └── UnavailableError           unavailable      not_ready    the service still refused after the last retry
+├── AddressError                   address          not_ready    the service cannot listen on the given address
+├── KeysError                      keys             not_ready    the file of API keys, or a certificate, cannot be used
+├── ExtraMissingError              extra-missing    unsupported  a command or a class needs packages of an extra
+└── UnsupportedPlatformError       platform         unsupported  the service does not run on this operating system or processor
 
-No number of HTTP or gRPC stands here: each face has one table over ``kind``.
+This module defines no status code of HTTP or gRPC. Each interface has one table that maps ``kind`` to its status codes.
 
-``NotFiniteError`` stands outside the tree: the service is at fault, not the request. Both faces answer such errors with 500 or INTERNAL
-and the request id, and log the story.
+``NotFiniteError`` is outside the tree, because the service is at fault and not the request. Both interfaces answer such errors with
+500 or INTERNAL and the request id, and log the traceback.
 """
 
 from typing import Any, ClassVar, Literal
@@ -48,11 +48,11 @@ Kind = Literal[
 
 
 class StreetfixError(Exception):
-    """The root: what happened, the offending value, what to do.
+    """Root of all errors. The first line of each subclass's docstring is the title of its problem.
 
     Args:
-        message: for people, in three parts: what, the value, the remedy.
-        field: dotted path of the request's or file's field at fault, e.g. ``camera.fx``; empty if none is.
+        message: readable text in three parts: what happened, the wrong value, and the remedy.
+        field: dotted path of the invalid field of the request or file, e.g. ``camera.fx``. Empty if there is none.
     """
 
     code: ClassVar[str] = "error"
@@ -65,75 +65,75 @@ class StreetfixError(Exception):
 
 
 class RequestError(StreetfixError):
-    """A field of the request is missing or makes no sense."""
+    """A field of the request is missing or invalid."""
 
     code = "request"
 
 
 class DecodeError(RequestError):
-    """A part is not the picture it says it is."""
+    """A part cannot be decoded as an image."""
 
     code = "undecodable"
 
 
 class ImageSizeError(RequestError):
-    """A picture's size or aspect does not fit the camera's intrinsics."""
+    """The image size does not match the camera intrinsics."""
 
     code = "image-size"
 
 
 class NoDepthError(RequestError):
-    """The depth picture holds no usable measurement."""
+    """The depth image has no usable measurement."""
 
     code = "no-depth"
 
 
 class NotYetSupportedError(RequestError):
-    """A field of the contract that this release cannot use; ignoring it would be a silent lie."""
+    """This release does not support the field."""
 
     code = "not-yet"
 
 
 class UnsupportedFormatError(StreetfixError):
-    """A format that we do not read."""
+    """The format is not supported."""
 
     code = "format"
     kind = "unsupported"
 
 
 class TooLargeError(StreetfixError):
-    """A part is beyond a limit of bytes, pixels or parts."""
+    """The request exceeds a limit of bytes, pixels or parts."""
 
     code = "too-large"
     kind = "too_large"
 
 
 class UnknownMapError(StreetfixError):
-    """No map of that name is mounted."""
+    """No mounted map matches the request."""
 
     code = "unknown-map"
     kind = "not_found"
 
 
 class UnknownSampleError(StreetfixError):
-    """No sample pair of that name lies beside the maps."""
+    """The sample pair was not found."""
 
     code = "unknown-sample"
     kind = "not_found"
 
 
 class NoPoseError(StreetfixError):
-    """The pictures do not say where they were taken, and the format that was asked for has no word for doubt."""
+    """The answer is not LOCALIZED, and GeoPose cannot express uncertainty."""
 
     code = "no-pose"
     kind = "not_found"
 
 
 class NotLocalizedError(StreetfixError):
-    """A pose is wanted of an answer that is not LOCALIZED, so that it has none.
+    """The answer is not LOCALIZED, so it has no pose.
 
     Args:
-        message: for people.
+        message: readable text.
         answer: the whole answer, a ``service.contract.schema.LocalizeAnswer``; its hypotheses are not confirmed.
     """
 
@@ -146,34 +146,34 @@ class NotLocalizedError(StreetfixError):
 
 
 class NotGeoreferencedError(StreetfixError):
-    """A place on the Earth is asked of a map that has none."""
+    """The map is not georeferenced."""
 
     code = "no-georeference"
 
 
 class UnauthorizedError(StreetfixError):
-    """The service asks for an API key, and got none or not one of its own."""
+    """The API key is missing or unknown."""
 
     code = "unauthorized"
     kind = "unauthorized"
 
 
 class ForbiddenError(StreetfixError):
-    """The caller may ask, but not change what the service does."""
+    """The caller has no operator rights."""
 
     code = "forbidden"
     kind = "forbidden"
 
 
 class ForbiddenHostError(StreetfixError):
-    """The request's `Host` is not a name of this service, as when a web page's name was made to point here."""
+    """The Host header does not name this service."""
 
     code = "forbidden-host"
     kind = "forbidden"
 
 
 class ForbiddenOriginError(StreetfixError):
-    """A web page of another origin sent a request that changes something or costs work."""
+    """A web page of another origin sent the request."""
 
     code = "forbidden-origin"
     kind = "forbidden"
@@ -187,74 +187,74 @@ class BusyError(StreetfixError):
 
 
 class NotReadyError(StreetfixError):
-    """No map is mounted, or the service is leaving."""
+    """No map is mounted, or the service is stopping."""
 
     code = "not-ready"
     kind = "not_ready"
 
 
 class DeadlineError(StreetfixError):
-    """A request took longer than the service allows."""
+    """The request took longer than the service allows."""
 
     code = "deadline"
     kind = "deadline"
 
 
 class BundleError(StreetfixError):
-    """A map bundle is missing, damaged, or of a version that this program does not read."""
+    """A map bundle is missing, damaged, or of a version that this release does not support."""
 
     code = "bundle"
     kind = "not_ready"
 
 
 class DatasetError(StreetfixError):
-    """A dataset folder is incomplete or contradicts itself."""
+    """A dataset folder is incomplete or inconsistent."""
 
     code = "dataset"
 
 
 class EncoderError(StreetfixError):
-    """An encoder file is missing, or is not an encoder of ours."""
+    """An encoder file is missing or is not a Streetfix encoder."""
 
     code = "encoder"
     kind = "not_ready"
 
 
 class UnreachableError(StreetfixError):
-    """A service does not answer."""
+    """The service does not answer."""
 
     code = "unreachable"
     kind = "not_ready"
 
 
 class NoAnswerInTimeError(UnreachableError):
-    """A service was asked, and the time that its caller gave it ended before the answer came."""
+    """The client timed out before the answer arrived."""
 
     code = "no-answer"
 
 
 class ForeignServiceError(UnreachableError):
-    """What answers at an address is no Streetfix, or one of another contract."""
+    """The program at this address is not a compatible Streetfix service."""
 
     code = "foreign"
 
 
 class HandshakeError(UnreachableError):
-    """A service and its client do not agree on TLS: an unknown authority, another name, a missing client certificate."""
+    """The TLS handshake failed: an unknown authority, another host name, or a missing client certificate."""
 
     code = "handshake"
 
 
 class RefusedError(StreetfixError):
-    """A service refused a request; the message carries the problem it answered with.
+    """The service refused the request. The message has the problem that the service reported.
 
     Args:
-        message: for people.
-        field: dotted path of the request's field at fault.
-        problem: code of the service's problem, as ``image-size`` (docs/problems.md); empty where it named none.
-        detail: what the service said.
-        status: as the face spelled it, ``422`` or ``INVALID_ARGUMENT``.
-        request_id: by which the service's operator finds it in the log.
+        message: readable text.
+        field: dotted path of the invalid field of the request.
+        problem: code of the problem, such as ``image-size`` (docs/problems.md). Empty if the service named none.
+        detail: detail of the problem.
+        status: status code of the interface, such as ``422`` or ``INVALID_ARGUMENT``.
+        request_id: id of the request in the log of the service.
     """
 
     code = "refused"
@@ -277,10 +277,10 @@ class RefusedError(StreetfixError):
 
 
 class UnavailableError(RefusedError):
-    """A service refused for now, as when its queue is full, and still did when its client's patience ended.
+    """The service still refused after the last retry.
 
     Attributes:
-        retry_after_s: when to come back, by the service's last advice; None where it gave none.
+        retry_after_s: wait that the service advised last, seconds. None without advice.
     """
 
     code = "unavailable"
@@ -290,7 +290,7 @@ class UnavailableError(RefusedError):
 
 
 class AddressError(StreetfixError):
-    """The service cannot listen on the address it was given."""
+    """The service cannot listen on the given address."""
 
     code = "address"
     kind = "not_ready"
@@ -304,10 +304,10 @@ class KeysError(StreetfixError):
 
 
 class NotFiniteError(ArithmeticError):
-    """A number of an answer is not finite; no such number may leave the core.
+    """A number of an answer is not finite, so the answer must not be sent.
 
     Args:
-        path: of the number in the answer.
+        path: path of the number in the answer.
     """
 
     def __init__(self, path: str) -> None:
@@ -316,10 +316,10 @@ class NotFiniteError(ArithmeticError):
 
 
 def how_to_install(extra: str | None) -> str:
-    """The remedy for a missing extra. Streetfix is not on PyPI, so pip needs a clone.
+    """Return the remedy for a missing extra. Streetfix is not on PyPI, so pip needs a clone.
 
     Args:
-        extra: of ``pyproject.toml``; None for the package without extras.
+        extra: extra of ``pyproject.toml``; None for the package without extras.
     """
     return (
         f'in a clone of Streetfix run pip install ".[{extra}]"'
@@ -336,15 +336,15 @@ class ExtraMissingError(StreetfixError):
 
 
 def extra_missing(needed_by: str, extra: str | None, error: ModuleNotFoundError) -> ExtraMissingError:
-    """The error for a package that is not installed.
+    """Return the error for a package that is not installed.
 
     Args:
         needed_by: command, class or argument that needs the package.
         extra: extra of ``pyproject.toml`` that brings the package; None if the package without extras does.
-        error: of the import.
+        error: error of the import.
 
     Raises:
-        ModuleNotFoundError: the missing module is one of ours, so no extra brings it.
+        ModuleNotFoundError: the missing module belongs to Streetfix, so no extra provides it.
     """
     package = (error.name or "").partition(".")[0]
     if package in ("", "service", "streetfix"):

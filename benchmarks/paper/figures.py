@@ -128,7 +128,7 @@ def _fused(dataset: Dataset) -> Figure:
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.1))
     axes[0].imshow(rgb)
     axes[1].imshow(_shown_depth(depth), cmap="viridis_r", vmax=MAX_DEPTH_M)
-    axes[2].imshow(picture_of(fuse(rgb, depth), MAX_DEPTH_M))
+    axes[2].imshow(picture_of(fuse(rgb, depth).planes, MAX_DEPTH_M))
     for each in axes:
         each.axis("off")
     return figure

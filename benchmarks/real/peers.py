@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.evaluation.failures import position_errors
-from model_training.evaluation.measures import RIGHT_M
 from model_training.evaluation.predict import predict
 from model_training.evaluation.raw_range import SETTINGS, raw_best_views
 from research.baselines.cloud_registration import (
@@ -27,6 +26,7 @@ from research.baselines.scan_context import ContextSettings, context_of, context
 from service.errors import ExtraMissingError
 from service.geometry.rigid import Transform
 from service.localization.localizer import Localizer
+from service.maps.calibration import RIGHT_M
 
 NEAR_PLACE_M = 5.0
 Locate = Callable[[QueryFrame, int], Transform | None]

@@ -17,7 +17,7 @@ from benchmarks.real.peers import peer_rows, pooled_rows
 from benchmarks.report import Report
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.failures import position_errors
-from model_training.evaluation.measures import RIGHT_M, recall_at
+from model_training.evaluation.measures import recall_at
 from model_training.evaluation.odometry import as_query
 from model_training.evaluation.predict import RANKED, Predictions, predict
 from model_training.evaluation.stages import stages_of
@@ -29,6 +29,7 @@ from model_training.odometry.align_poses import usual_poses
 from model_training.stock import ENCODER
 from service.errors import NoDepthError
 from service.localization.localizer import Localizer
+from service.maps.calibration import RIGHT_M
 from service.maps.reader import MapBundle
 
 DRIVES = ("kitti_0005", "kitti_0013")

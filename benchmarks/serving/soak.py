@@ -32,7 +32,7 @@ from benchmarks.serving.machines import Held, Server, held
 from benchmarks.serving.ratios import MANY, Site
 from model_training.datasets.dataset import Dataset
 from model_training.loadtest.payloads import Payload
-from service.geometry.rigid import inverse, quaternion_xyzw_from
+from service.geometry.rigid import SAME_M, inverse, quaternion_xyzw_from
 from service.grpc.generated.streetfix.v1 import localization_pb2 as pb
 from service.grpc.generated.streetfix.v1.localization_pb2_grpc import LocalizationServiceStub
 
@@ -42,7 +42,6 @@ LOAD = 0.6
 _CAPACITY_S, _SAMPLE_S, _SCRAPE_S, _TELL_S, _WRITE_S, _TIMEOUT_S = 20.0, 10.0, 15.0, 60.0, 600.0, 30.0
 _FRAMES = 3  # frames of a sequence, and requests of a batch
 _STREAM_FRAMES = 60
-_SAME_M = 1e-6
 #: Weight of each kind of request, and the number of image pairs that it contains.
 _MIX = {"rest": (38, 1), "grpc": (26, 1), "stream": (18, 1), "sequence": (3, _FRAMES), "batch": (3, _FRAMES),
         "refused": (6, 0), "listing": (6, 0)}  # fmt: skip
@@ -88,7 +87,7 @@ class Tally:
         """
         if position is not None:
             first = self.positions.setdefault(what, position)
-            self.differ += bool(np.abs(np.subtract(first, position)).max() > _SAME_M)
+            self.differ += bool(np.abs(np.subtract(first, position)).max() > SAME_M)
 
 
 @dataclass(frozen=True, slots=True)

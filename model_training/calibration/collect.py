@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from model_training.calibration.fit import RIGHT_M, Asked
+from model_training.calibration.fit import Asked
 from model_training.calibration.plans import BOTH, SEQUENCE
 from model_training.calibration.rigs import Rig
 from model_training.calibration.strangers import KINDS, strangers
@@ -17,6 +17,7 @@ from service.confidence.features import FEATURES
 from service.errors import NoDepthError
 from service.geometry.camera import PinholeCamera
 from service.localization.localizer import Localizer
+from service.maps.calibration import RIGHT_M
 from service.retrieval.query import Query
 
 #: Progress callback: stage, finished steps, all steps.

@@ -9,8 +9,6 @@ from service.confidence.features import FEATURES, RIVALRY, UNWEIGHED
 from service.errors import DatasetError
 from service.maps.calibration import Calibration, Logistic, Threshold, expanded, probability, terms
 
-#: Largest distance of a right answer, metres on the ground.
-RIGHT_M = 1.0
 #: False-accept rates with a threshold.
 RATES = (0.001, 0.002, 0.003, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1)
 #: Strength of the ridge penalty, in queries. It had the smallest loss when each city was predicted from the others (decision 0084).
@@ -67,7 +65,8 @@ def fit(asked: Asked, *, measured_on: dict[str, str | float], ridge: float = RID
     used = asked.registered()
     if used.known.all() or not used.known.any() or used.right.all() or not used.right.any():
         raise DatasetError(
-            "calibration needs right and wrong answers, and queries in the map and outside it; ask more queries", field="queries"
+            "calibration needs right and wrong answers, and queries in the map and outside it; send "
+            "more queries", field="queries"
         )  # fmt: skip
     weight = np.where(used.known, 0.5 / used.known.mean(), 0.5 / (~used.known).mean())
     mean, spread = used.evidence.mean(axis=0), used.evidence.std(axis=0) + 1e-9

@@ -22,7 +22,8 @@ from model_training.calibration.strangers import KINDS
 from model_training.datasets.dataset import Dataset
 from model_training.datasets.files import read_arrays
 from model_training.datasets.without_streets import WithoutStreets
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.simulate import simulate
 from service.localization.localizer import Localizer
 from service.maps.calibration import Calibration
@@ -148,7 +149,7 @@ def _kept(work: Path, encoder: Path, city: Dataset, ask: Callable[[], list[Asked
         with kept.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return Asked(*(arrays[name] for name in Asked.__dataclass_fields__))
 
-    return read_arrays(kept, read, remedy="remove it, and its queries are asked anew")
+    return read_arrays(kept, read, remedy="remove it, and the command sends its queries again")
 
 
 def _ask(work: Path, encoder: Path, cities: list[Dataset], index: int, report: Report) -> list[Asked]:

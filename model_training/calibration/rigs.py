@@ -8,10 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from service.registration.points import FOCAL_BASELINE_PX_M
 from service.retrieval.query import Query
-
-#: Focal length times baseline of the simulated depth presets (``DepthModel``), pixels times metres.
-FOCAL_BASELINE_PX_M = 80.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +34,7 @@ class Rig:
     def __post_init__(self) -> None:
         """Refuse an empty window, and one that exceeds the image."""
         if not (0 < self.width <= 1 and 0 < self.height <= 1):
-            raise ValueError(
-                f"rig {self.name}: a window of {self.width:g} x {self.height:g} of the picture does not exist"
-            )
+            raise ValueError(f"rig {self.name}: a window of {self.width:g} x {self.height:g} of the image is not valid")
 
     def seen(self, query: Query) -> Query:
         """Return the query as this rig would take it: cropped images, and the principal point moved accordingly.

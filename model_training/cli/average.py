@@ -28,7 +28,7 @@ def command(
     """
     folders = sorted(folder for folder in packs.glob("*-city-1*") if folder.is_dir())
     if not folders:
-        raise DatasetError(f"--packs: {packs} holds no training cities; streetfix train makes them", field="packs")
+        raise DatasetError(f"--packs: {packs} has no training cities; streetfix train creates them", field="packs")
     with bars() as report:
         average(first, second, folders, run, share=share, report=lambda done: report("statistics", done, BATCHES))
     Console().print(f"averaged: {run}; next: streetfix export {run} --out encoder.onnx")

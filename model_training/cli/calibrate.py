@@ -14,13 +14,14 @@ from service.errors import DatasetError
 
 def command(
     encoder: Annotated[
-        Path, typer.Option(help="ONNX file of `streetfix export`. The default is the stock encoder.")
+        Path, typer.Option(help="ONNX file of `streetfix export`.  [default: the stock encoder]", show_default=False)
     ] = ENCODER,
     out: Annotated[
-        Path, typer.Option(help="Calibration file to write, JSON. The default is beside the stock encoder.")
+        Path,
+        typer.Option(help="Calibration file to write, JSON.  [default: beside the stock encoder]", show_default=False),
     ] = CALIBRATION,
     work: Annotated[Path, typer.Option(help="Folder that keeps cities, maps and answers.")] = Path("data/calibration"),
-    anew: Annotated[bool, typer.Option(help="Ask all queries again, even if their answers are kept.")] = False,
+    anew: Annotated[bool, typer.Option(help="Send all queries again, even if their answers are stored.")] = False,
 ) -> None:
     """Fit the confidence of an encoder on calibration cities.
 
@@ -32,7 +33,7 @@ def command(
       streetfix build-map data/site --encoder runs/mine/encoder.onnx --calibration runs/mine/calibration.json --out maps/site
     """
     if not out.parent.is_dir():  # said before the work, not after it
-        raise DatasetError(f"--out: there is no folder {out.parent}; make it first", field="out")
+        raise DatasetError(f"--out: folder {out.parent} not found; create it first", field="out")
     console = Console(highlight=False)
     with bars() as report:
         calibration, checks = calibrate(work, encoder, anew=anew, report=report)

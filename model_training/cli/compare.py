@@ -32,7 +32,7 @@ def command(
 ) -> None:
     """Compare two runs over the same queries.
 
-    The command reports paired differences with intervals. It also reports which queries changed sides.
+    The command reports paired differences with intervals. It also lists the queries whose outcome changed.
 
     \b
     Example:
@@ -82,18 +82,18 @@ def _errors(found: Comparison) -> str:
 
 
 def _dataset(run: SavedRun, given: Path | None, console: Console) -> Dataset | None:
-    """The pictures, where they still lie; a folder that was named must be one."""
+    """Open the dataset with the images if it exists; a folder that the user named must be a dataset."""
     if given is not None:
         return Dataset(given)
     try:
         return Dataset(Path(run.settings.dataset.path))
     except DatasetError as error:
-        console.print(f"the page has no pictures: {error.message}", highlight=False)
+        console.print(f"the page has no images: {error.message}", highlight=False)
         return None
 
 
 def _plan(runs: tuple[SavedRun, ...], console: Console) -> Plan | None:
-    """The map of either run, where it still lies."""
+    """Open the map of one of the runs if it exists."""
     for run in runs:
         try:
             return Plan.of(MapBundle.open(Path(run.settings.map.path), verify=False))

@@ -34,7 +34,7 @@ def command(
       streetfix import rosbag small_mcap --out data/again
     """
     if to not in FORMATS:
-        raise DatasetError(f"to: {to!r} is not known; there is: {', '.join(FORMATS)}", field="to")
+        raise DatasetError(f"to: {to!r} is not valid; choose one of: {', '.join(FORMATS)}", field="to")
     opened = Dataset(dataset)
     sets = opened.query_sets(with_truth=True)
     chosen = (sets[0] if sets else None) if queries == "auto" else (queries or None)
@@ -48,4 +48,4 @@ def command(
 
             kind = cast(BagFormat, to)
             count = write_bag(opened, chosen, out, kind=kind, report=lambda done, of: report("moments", done, of))
-    Console().print(f"{out}: {count} moments, pictures of: {chosen or 'no query set'}", soft_wrap=True)
+    Console().print(f"{out}: {count} moments, images of: {chosen or 'no query set'}", soft_wrap=True)

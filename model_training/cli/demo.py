@@ -23,7 +23,9 @@ def command(
     real: Annotated[
         Path | None, typer.Option(help="Folder of stereo frames in KITTI's object layout. They replace the city.")
     ] = None,
-    encoder: Annotated[Path, typer.Option(help="ONNX file of an encoder. The default is the stock encoder.")] = ENCODER,
+    encoder: Annotated[
+        Path, typer.Option(help="ONNX file of an encoder.  [default: the stock encoder]", show_default=False)
+    ] = ENCODER,
     streets: Annotated[str, typer.Option(help="Streets of the paper's city to map.")] = "1,5,7",
     queries: Annotated[int, typer.Option(help="Queries to send.", min=1)] = 12,
     depth: Annotated[str, typer.Option(help="Depth camera: ideal, precise or stereo.")] = "precise",
@@ -65,5 +67,5 @@ def _show(demo: DemoMap, samples: Path, url: str, console: Console, began: float
     outcomes = [ask(question, url) for question in demo.questions]
     print_answers(outcomes, console, places=demo.place_names)
     minutes, seconds = divmod(round(time.monotonic() - began), 60)
-    console.print(f"all of it took {minutes} min {seconds} s; map and pictures: {demo.folder}\n", soft_wrap=True)
+    console.print(f"Total time {minutes} min {seconds} s; results: {demo.folder}\n", soft_wrap=True)
     print_next(outcomes, demo.bundle, samples, url, console, goes_on=goes_on)

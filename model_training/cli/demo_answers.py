@@ -1,4 +1,4 @@
-"""Ask a service the demo's questions, and show what it answers beside the truth."""
+"""Send the questions of the demo to a service, and show the answers with the ground truth."""
 
 import math
 import os
@@ -15,17 +15,21 @@ from rich.console import Console
 from rich.table import Table
 
 from model_training.cli.demo_map import Question
-from model_training.evaluation.measures import RIGHT_M
-from service.cli.localize import localize
+from service.cli.send import localize
 from service.errors import RefusedError
 from service.geometry.rigid import heading_of_camera, wrap_angle
+from service.maps.calibration import RIGHT_M
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """A question and its answer of the REST contract, or why there is none; ``elapsed_s`` over HTTP.
+    """A question and its answer. An answer that is not LOCALIZED has no street and no pose, so it is neither right nor wrong.
 
-    An answer that is not LOCALIZED has neither street nor pose, so it is neither right nor wrong.
+    Attributes:
+        question: the image pair and its ground truth.
+        answer: as in the REST contract; None if the service refused the query.
+        problem: why the service refused the query; else empty.
+        elapsed_s: time of the request over HTTP, seconds.
     """
 
     question: Question
@@ -35,7 +39,7 @@ class Outcome:
 
     @property
     def right(self) -> bool | None:
-        """Whether the street, or where places are single frames the first place, is the true one; None: not known, or no pose."""
+        """Whether the street is the true one (of single frames: the first place); None if unknown or without a pose."""
         if self.question.place is None and self.question.street is None:
             return None
         if self.answer is None:
@@ -49,12 +53,12 @@ class Outcome:
 
     @property
     def error_m(self) -> float | None:
-        """Horizontal distance of the answered position from the true one; None without a pose, or in another one of single places."""
+        """Horizontal distance from the true position, metres; None without a pose, or if another single frame was found."""
         return None if self.answer is None else self._off_m(self.answer["pose"])
 
     @property
     def forced_error_m(self) -> float | None:
-        """The same of the best guess, whatever the status; None where nothing was registered either."""
+        """Like ``error_m``, but of the best hypothesis, whatever the status; None if nothing was registered."""
         if self.answer is None:
             return None
         guesses = self.answer["hypotheses"]
@@ -73,7 +77,7 @@ class Outcome:
 
     @property
     def heading_error_deg(self) -> float | None:
-        """Angle between the answered heading and the true one; None where ``error_m`` is."""
+        """Angle between the answered and the true heading, degrees; None if ``error_m`` is None."""
         T = self.question.T_map_camera
         if T is None or self.answer is None or self.answer["pose"] is None or self._is_elsewhere:
             return None
@@ -81,15 +85,19 @@ class Outcome:
 
     @property
     def _is_elsewhere(self) -> bool:
-        """Single places have no distance that would mean anything."""
+        """Whether another single frame was found. Distances between single frames have no meaning."""
         return self.question.place is not None and not self.right
 
 
 def ask(question: Question, url: str) -> Outcome:
-    """Post a pair of pictures, as ``streetfix localize`` does.
+    """Send an image pair, as ``streetfix localize`` does.
+
+    Args:
+        question: the image pair.
+        url: address of the service.
 
     Raises:
-        UnreachableError: nothing answers any more.
+        UnreachableError: the service does not answer.
     """
     began = time.perf_counter()
     answer, problem = None, ""
@@ -101,12 +109,12 @@ def ask(question: Question, url: str) -> Outcome:
 
 
 def print_answers(outcomes: list[Outcome], console: Console, *, places: tuple[str, ...] = ()) -> None:
-    """Print a table, an answer a row, and a line that sums up.
+    """Print a table with one row per answer, and a summary.
 
     Args:
         outcomes: one or more.
-        console: where to.
-        places: names of the map's places where each is a single frame; then places are compared, not streets.
+        console: destination.
+        places: names of the map's places if each is a single frame; then the table compares places, not streets.
     """
     console.print(_places_table(outcomes, places) if places else _streets_table(outcomes))
     console.print(_summary(outcomes, "first places" if places else "streets"))
@@ -118,28 +126,28 @@ def print_next(
     """Print the user's next commands.
 
     Args:
-        outcomes: one or more; the command asks the first one that was right.
+        outcomes: one or more; the command sends the first query whose answer was right.
         bundle: the map.
-        samples: folder of the sample pairs, which the console shows.
+        samples: folder of the sample pairs, which the browser console shows.
         url: address of the service.
-        console: where to.
-        goes_on: the service keeps running.
+        console: destination.
+        goes_on: whether the service keeps running.
     """
     sample = next((outcome.question for outcome in outcomes if outcome.right), outcomes[0].question)
     files = ["--rgb", str(sample.rgb), "--depth", str(sample.depth), "--camera", str(sample.camera)]
     if not goes_on:
-        console.print("serve this map again, and ask it:", style="bold")
+        console.print("Serve the map again and send a query:", style="bold")
         console.print(f"  {_shell('serve', str(bundle), '--samples', str(samples))}", soft_wrap=True)
         console.print(f"  {_shell('localize', *files)}", soft_wrap=True)
         return
-    console.print("ask yourself, in another terminal:", style="bold")
+    console.print("Send a query from another terminal:", style="bold")
     console.print(f"  {_shell('localize', '--url', url, *files)}\n", soft_wrap=True)
-    console.print(f"or in a browser: {url}/console/\n", soft_wrap=True)
-    console.print(f"serving at {url} (what it can do: {url}/openapi.json; stop: Ctrl-C)", soft_wrap=True)
+    console.print(f"Or use the console in a browser: {url}/console/\n", soft_wrap=True)
+    console.print(f"serving at {url} (API: {url}/docs). Stop with Ctrl-C.", soft_wrap=True)
 
 
 def _streets_table(outcomes: list[Outcome]) -> Table:
-    table = Table(title="Where was it? Street, (x, y) in metres, heading", title_justify="left", show_lines=True)
+    table = Table(title="Street, (x, y) in metres, heading", title_justify="left", show_lines=True)
     for heading in ("query", "answer", "truth", "street"):
         table.add_column(heading)
     table.add_column("error", justify="right")
@@ -154,7 +162,7 @@ def _streets_table(outcomes: list[Outcome]) -> Table:
 
 
 def _places_table(outcomes: list[Outcome], places: tuple[str, ...]) -> Table:
-    table = Table(title="Which place is it?", title_justify="left")
+    table = Table(title="Places", title_justify="left")
     for heading in ("frame", "first place", "similarity", "own place first", "status"):
         table.add_column(heading)
     table.add_column("error", justify="right")
@@ -207,7 +215,7 @@ def _summary(outcomes: list[Outcome], what: str) -> str:
     verdicts = [outcome.right for outcome in outcomes if outcome.right is not None]
     parts = [f"{sum(verdicts)} of {len(verdicts)} {what} right"]
     accepted = sum(outcome.is_accepted for outcome in outcomes)
-    parts.append(f"{accepted} of {len(outcomes)} answers accepted (LOCALIZED), the others have no pose")
+    parts.append(f"{accepted} of {len(outcomes)} answers accepted (LOCALIZED); the others have no pose")
     errors = sorted(error for outcome in outcomes if (error := outcome.error_m) is not None)
     forced = sorted(error for outcome in outcomes if (error := outcome.forced_error_m) is not None)
     for name, each in (("accepted answers", errors), ("forced, whatever the status", forced)):
@@ -216,12 +224,12 @@ def _summary(outcomes: list[Outcome], what: str) -> str:
             parts.append(
                 f"{name}: position off by {median(each):.2f} m (median), {each[-1]:.2f} m (largest); {wrong} of {len(each)} over 1 m"
             )
-    parts.append(f"{1e3 * median(outcome.elapsed_s for outcome in outcomes):.0f} ms a query over HTTP (median)")
+    parts.append(f"{1e3 * median(outcome.elapsed_s for outcome in outcomes):.0f} ms per query over HTTP (median)")
     return "\n".join(parts)
 
 
 def _shell(*arguments: str) -> str:
-    """A command line that works where the user is, whether the virtual environment is active or not."""
+    """Return a command line that works in the current folder, with and without an active virtual environment."""
     script = Path(sys.executable).with_name("streetfix")
     found = shutil.which("streetfix")
     is_on_path = (found is not None and Path(found) == script) or not script.exists()

@@ -1,4 +1,4 @@
-"""The demo's map and questions: of a part of the paper's city, or of recorded frames. Made once, then used again."""
+"""Make the map and the questions of the demo, from a part of the paper's city or from recorded frames. Later runs reuse them."""
 
 import json
 from collections.abc import Iterator
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from model_training.cli.progress import Report
 from model_training.datasets.dataset import Dataset, QueryFrame
 from model_training.importing.kitti_object import import_kitti_object
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from model_training.simulation.plan import QueryPlan, SimulationPlan
 from model_training.simulation.simulate import simulate
 from service.errors import BundleError, DatasetError, EncoderError
@@ -23,10 +24,16 @@ from service.maps.writer import sha256_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """A pair of pictures with the truth, which stays here; ``name`` is for people.
+    """An image pair with its ground truth, which is not sent.
 
-    ``T_map_camera`` is None where nobody knows it; ``street`` is the id and the name of the street at that place;
-    ``place`` is the number of the one place that the picture shows, where places are single frames.
+    Attributes:
+        name: name of the query in tables.
+        rgb: file of the colour image.
+        depth: file of the depth image.
+        camera: JSON file with the other parts of the request, as for ``streetfix localize --camera``.
+        T_map_camera: true pose of the camera, translation in metres (4, 4); None if it is unknown.
+        street: id and name of the street at the true position; None if there is none.
+        place: index of the true place, if places are single frames; else None.
     """
 
     name: str
@@ -40,7 +47,14 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class DemoMap:
-    """A map and the questions for it; ``place_names`` where places are single frames, else empty."""
+    """A map and the questions for it.
+
+    Attributes:
+        folder: folder of all files of the demo.
+        bundle: the map bundle.
+        questions: image pairs with ground truth.
+        place_names: names of the map's places if places are single frames; else empty.
+    """
 
     folder: Path
     bundle: Path
@@ -50,7 +64,14 @@ class DemoMap:
 
 @dataclass(frozen=True, slots=True)
 class CityDemo:
-    """Which part of the paper's city, and how it is asked."""
+    """Plan of a demo in the paper's city.
+
+    Attributes:
+        streets: names of the streets to map.
+        queries: number of queries.
+        depth: depth camera: ideal, precise or stereo.
+        seed: seed of the city and its traversals.
+    """
 
     streets: tuple[str, ...]
     queries: int
@@ -59,11 +80,17 @@ class CityDemo:
 
 
 def city_demo(plan: CityDemo, folder: Path, encoder: Path, report: Report) -> DemoMap:
-    """Simulate streets and another drive through them, and build their map.
+    """Simulate streets and another traversal of them, and build their map.
+
+    Args:
+        plan: streets, queries and seed.
+        folder: folder of all files of the demo.
+        encoder: ONNX file.
+        report: callback for progress.
 
     Raises:
-        DatasetError: there is no such street or depth, or ``folder`` holds the demo of another plan.
-        EncoderError: there is no encoder.
+        DatasetError: a street or the depth is unknown, or ``folder`` holds the demo of another plan.
+        EncoderError: the encoder is missing.
     """
     _require_encoder(encoder)
     drive = QueryPlan(name="drive1", traversal=1, count=plan.queries, depths=(plan.depth,))
@@ -78,11 +105,17 @@ def city_demo(plan: CityDemo, folder: Path, encoder: Path, report: Report) -> De
 
 
 def recorded_demo(source: Path, folder: Path, encoder: Path, report: Report) -> DemoMap:
-    """Import stereo frames, each its own place, with depth by semi-global matching, and build their map.
+    """Import stereo frames and build their map. Each frame is a place of its own; depth comes from semi-global matching.
+
+    Args:
+        source: folder of stereo frames in KITTI's object layout.
+        folder: folder of all files of the demo.
+        encoder: ONNX file.
+        report: callback for progress.
 
     Raises:
         DatasetError: the frames are missing or damaged, or ``folder`` holds the demo of another source.
-        EncoderError: there is no encoder.
+        EncoderError: the encoder is missing.
     """
     _require_encoder(encoder)
     new = _is_new(folder / "dataset", source)
@@ -98,17 +131,19 @@ def recorded_demo(source: Path, folder: Path, encoder: Path, report: Report) -> 
 def _require_encoder(encoder: Path) -> None:
     if not encoder.is_file():
         raise EncoderError(
-            f"{encoder}: no such encoder; name one with --encoder, or run: make encoder", field="encoder"
+            f"{encoder}: file not found; give an encoder with --encoder, or run: make encoder", field="encoder"
         )
 
 
 def _is_new(dataset: Path, source: Path) -> bool:
-    """Whether frames are still to be imported; the source is noted beside the dataset."""
+    """Return whether frames must be imported. A file next to the dataset stores their source."""
     note = dataset.with_name("source.txt")
     text = f"{source.resolve()}\n"
     if (dataset / "dataset.json").exists():
         if not note.exists() or note.read_text() != text:
-            raise DatasetError(f"{dataset} was imported from elsewhere; choose another --out or remove it", field="out")
+            raise DatasetError(
+                f"{dataset} was imported from another source; choose another --out, or remove it", field="out"
+            )
         return False
     dataset.parent.mkdir(parents=True, exist_ok=True)
     note.write_text(text)
@@ -118,10 +153,10 @@ def _is_new(dataset: Path, source: Path) -> bool:
 def _build(
     dataset: Dataset, encoder: Path, bundle: Path, name: str, report: Report, *, made_from: dict[str, Any], new: bool
 ) -> None:
-    """Build the map, unless it is there and made of the same, by the same encoder, in the same way.
+    """Build the map, unless it exists with the same data, encoder and settings.
 
-    What a map was made from is noted beside it when it is whole: a run that ends between the dataset and its map must
-    not leave the map of another plan to the next one.
+    A file next to the complete map stores these. So a run that ends between the dataset and its map does not leave the map
+    of another plan to the next run.
     """
     settings, note = BuildSettings(name=name), bundle.with_name("map.made_from.json")
     calibration = None if settings.calibration is None else sha256_of(settings.calibration)
@@ -166,7 +201,7 @@ def _question(
 
 
 def _camera_file(folder: Path, frame: QueryFrame) -> Path:
-    """The request's parts that a camera decides, as ``streetfix localize --camera`` takes them."""
+    """Write the file for ``streetfix localize --camera``: the parts of the request that depend on the camera."""
     path = folder / f"{frame.camera.name}.json"
     path.write_text(json.dumps(frame.request(), indent=1) + "\n")
     return path

@@ -1,4 +1,4 @@
-"""The demo's questions as sample pairs for the browser console."""
+"""Write the questions of the demo as sample pairs for the browser console."""
 
 import json
 import math
@@ -12,9 +12,9 @@ from service.geometry.rigid import heading_of_camera
 
 
 def write_samples(questions: Sequence[Question], folder: Path, *, map_name: str) -> Path:
-    """Write pictures, request and truth of each question into a folder of its own, and return the folder of all.
+    """Write images, request and ground truth of each question into its own folder, and return the folder of all.
 
-    The folder is written anew each time and gets its name when it is complete. A service that starts meanwhile sees the old
+    The folder is written again each time and gets its name when it is complete. A service that starts meanwhile sees the old
     samples or the new ones.
 
     Args:
@@ -50,7 +50,7 @@ def _write_sample(question: Question, folder: Path, map_name: str) -> None:
 
 
 def _link(source: Path, target: Path) -> None:
-    """A second name for the file, which costs nothing; a copy where the file system has no such thing."""
+    """Make a hard link to the file, or a copy if the file system has no hard links."""
     try:
         os.link(source, target)
     except OSError:

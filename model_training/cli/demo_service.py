@@ -1,4 +1,4 @@
-"""``streetfix serve`` as a child process, for as long as a block lasts."""
+"""Run ``streetfix serve`` as a child process inside a context."""
 
 import re
 import signal
@@ -22,24 +22,29 @@ _READY_S, _POLL_S, _END_S = 60.0, 0.05, 15.0
 
 @dataclass(frozen=True, slots=True)
 class RunningService:
-    """A service that is ready, and where it listens."""
+    """A service that is ready.
+
+    Attributes:
+        url: its address.
+        process: its process.
+    """
 
     url: str
     process: "subprocess.Popen[str]"
 
     def wait(self) -> NoReturn:
-        """Stay until the user has enough, which is a KeyboardInterrupt.
+        """Wait until the user presses Ctrl-C (KeyboardInterrupt).
 
         Raises:
-            UnreachableError: the service ended by itself.
+            UnreachableError: the service ended unexpectedly.
         """
         status = self.process.wait()
-        raise UnreachableError(f"{self.url}: the service ended by itself (status {status}); why it says above")
+        raise UnreachableError(f"{self.url}: the service ended unexpectedly (status {status}); see its messages above")
 
 
 @contextmanager
 def serving(bundle: Path, port: int, samples: Path | None = None) -> Iterator[RunningService]:
-    """Serve a map on loopback, and end the service with the block, whatever ends it: Ctrl-C, a kill, a closed terminal.
+    """Serve a map on loopback inside the context. The service ends with it, also after Ctrl-C, a kill or a closed terminal.
 
     Args:
         bundle: the map.
@@ -81,7 +86,7 @@ def _address(process: "subprocess.Popen[str]") -> str:
     for line in _lines(process.stdout):
         if found := re.search(r"serving at (http://\S+)", line):
             return found[1]
-    raise UnreachableError(f"the service did not start (status {process.wait()}); why it says above")
+    raise UnreachableError(f"the service did not start (status {process.wait()}); see its messages above")
 
 
 def _lines(stream: IO[str] | None) -> Iterator[str]:
@@ -98,7 +103,9 @@ def _wait_until_ready(process: "subprocess.Popen[str]", url: str) -> None:
             except httpx.TransportError:
                 pass  # it listens before it answers
             time.sleep(_POLL_S)
-    raise UnreachableError(f"{url}/readyz: it ended, or is not ready after {_READY_S:.0f} s; why it says above")
+    raise UnreachableError(
+        f"{url}/readyz: the service ended, or is not ready after {_READY_S:.0f} s; see its messages above"
+    )
 
 
 def _end(process: "subprocess.Popen[str]") -> None:

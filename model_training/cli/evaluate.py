@@ -74,7 +74,7 @@ def command(
         bool,
         typer.Option(
             "--stages",
-            help="Name the stage of the answer that loses each query. The command then asks each query twice.",
+            help="Name the stage of the answer that loses each query. The command then sends each query twice.",
         ),
     ] = False,
     refine: Annotated[
@@ -100,7 +100,7 @@ def command(
     names = queries or data.query_sets(with_truth=True)
     if trajectory is not None and len(names) != 1:
         raise DatasetError(
-            f"trajectory: one query set is wanted, not {len(names)}: name it by --queries", field="queries"
+            f"trajectory: expected one query set, not {len(names)}; choose it with --queries", field="queries"
         )
     for file in (json_file, trajectory):
         if file is not None:
@@ -144,9 +144,9 @@ def _add_raw(
     places: dict[str, NDArray[np.int64]],
     predictions: dict[str, Predictions],
 ) -> None:
-    """Add the raw range image's R@1 over all queries and of each set, each at its own best setting, which is named.
+    """Add R@1 of the raw range image over all queries and of each set, each at its best setting, and the setting's name.
 
-    ``places`` holds each query's first place by every setting, the sets one after the other; -1 for none.
+    ``places`` has the first place of each query by setting, all sets in order; -1 for none.
     """
     truth = np.concatenate([p.T_true[:, :2, 3] for p in predictions.values()])
     xy = bundle.T_map_place[:, :2, 3]
@@ -166,7 +166,7 @@ def _raw_figures(right: dict[str, NDArray[np.bool_]], queries: slice) -> dict[st
 
 
 def _say_why(bundle: MapBundle, data: Dataset, predictions: dict[str, Predictions]) -> None:
-    """Where nearly nothing was accepted, or the focal length is suspicious, say what to check, the likeliest cause first."""
+    """Print what to check if few answers were accepted or the focal length is suspicious, the likeliest cause first."""
     console = Console(soft_wrap=True, highlight=False)
     for name, answers in predictions.items():
         if bundle.calibration is None:
@@ -181,7 +181,8 @@ def _say_why(bundle: MapBundle, data: Dataset, predictions: dict[str, Prediction
             console.print(f"  {number}. {cause}")
         if not found:
             console.print(
-                "  all evidence lies in the range that calibration saw: these places are probably not in the map"
+                "  All confidence features are in the range of the calibration data. The place may be outside the map "
+                "or a perceptual alias."
             )
 
 

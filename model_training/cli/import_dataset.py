@@ -124,12 +124,12 @@ def command(
       streetfix import kitti-object KITTI --depth sgbm --out data/kitti
     """
     if depth and depth not in DEPTHS:
-        raise DatasetError(f"depth: {depth!r} is none of: {', '.join(DEPTHS)}", field="depth")
+        raise DatasetError(f"depth: {depth!r} is not valid; choose one of: {', '.join(DEPTHS)}", field="depth")
     if kind == SINGLE_FRAMES:
         _single_frames(source, out, depth or "sgbm")
         return
     if sync not in ("interpolate", "nearest"):
-        raise DatasetError(f"sync: {sync!r} is neither 'interpolate' nor 'nearest'", field="sync")
+        raise DatasetError(f"sync: {sync!r} is not valid; choose interpolate or nearest", field="sync")
     settings = TakeSettings(
         queries=queries if pictures else "", depth="lidar" if depth == "lidar" else "recorded", sync=cast(Sync, sync),
         tolerance_s=tolerance, deskew=deskew, hold_out=hold_out, hold_out_first=hold_out_first,
@@ -141,7 +141,9 @@ def command(
         vertical_correction=vertical_correction,
     )  # fmt: skip
     if odometry and poses is not None:
-        raise DatasetError("poses: --odometry finds them; give one of the two", field="poses")
+        raise DatasetError(
+            "poses: --odometry finds the poses, so --poses has no effect; give one of the two", field="poses"
+        )
     if odometry and align:
         raise DatasetError("align: --odometry finds poses from the scans alone; give one of the two", field="align")
     recording = open_recording(kind, source, told)
@@ -178,7 +180,7 @@ def _trajectory(recording: Recording, source: Path, poses: Path | None) -> Traje
     trajectory = read_pose_file(poses) if poses is not None else recording.trajectory()
     if trajectory is None:
         raise DatasetError(
-            f"{source}: the recording has no poses; name a TUM file with --poses, or find them with --odometry",
+            f"{source}: the recording has no poses; give a TUM file with --poses, or find them with --odometry",
             field="poses",
         )
     return trajectory
@@ -187,14 +189,14 @@ def _trajectory(recording: Recording, source: Path, poses: Path | None) -> Traje
 def _by_odometry(
     recording: Recording, close_loops: bool, lidar_height: float, report: Report
 ) -> tuple[Trajectory, str]:
-    """The trajectory and a line for people."""
+    """Return the trajectory and a line that describes it."""
     from model_training.odometry.find import find_trajectory
 
     found = find_trajectory(recording, close_loops=close_loops, expected_height_m=lidar_height, report=report)
     before, after = found.disagreement_m
     line = "poses by odometry, "
     line += (
-        f"{found.loops} loops closed: off by {before:.2f} m there before, {after:.2f} m after"
+        f"{found.loops} loops closed: error at the loops {before:.2f} m before, {after:.2f} m after"
         if found.loops
         else "no loop found"
     )
@@ -203,7 +205,7 @@ def _by_odometry(
 
 def _single_frames(source: Path, out: Path, depth: str) -> None:
     if depth not in ("stored", "sgbm"):
-        raise DatasetError(f"depth: {depth!r} is neither 'stored' nor 'sgbm'", field="depth")
+        raise DatasetError(f"depth: {depth!r} is not valid; choose stored or sgbm", field="depth")
     with bars() as report:
         summary = import_kitti_object(
             source,
@@ -214,18 +216,18 @@ def _single_frames(source: Path, out: Path, depth: str) -> None:
     console = Console()
     console.print(f"{out}: {summary.places} places, query sets: frames {summary.frames}, elsewhere {summary.elsewhere}")
     if summary.skipped:
-        console.print(f"left out, since they have no depth: {', '.join(summary.skipped)}")
+        console.print(f"left out because they have no depth: {', '.join(summary.skipped)}")
 
 
 def _tell(console: Console, out: Path, summary: TakeSummary) -> None:
     held = f" ({summary.held_out} held out)" if summary.held_out else ""
-    console.print(f"{out}: {summary.scans} scans{held}, {summary.pictures} picture pairs", soft_wrap=True)
-    told = f"the vehicle's motion was taken out of {summary.deskewed} of {summary.scans + summary.held_out} scans"
+    console.print(f"{out}: {summary.scans} scans{held}, {summary.pictures} image pairs", soft_wrap=True)
+    told = f"corrected for the vehicle's motion: {summary.deskewed} of {summary.scans + summary.held_out} scans"
     console.print(
-        told + ("" if summary.deskewed else ", since their points have no times or --no-deskew was given"),
+        told + ("" if summary.deskewed else ", because their points have no times or --no-deskew was given"),
         soft_wrap=True,
     )
     if summary.points_without_numbers:
-        console.print(f"left out: {summary.points_without_numbers} points that are no numbers")
+        console.print(f"left out: {summary.points_without_numbers} points that are not finite")
     for line in summary.dropped:
         console.print(f"left out: {line}", soft_wrap=True)

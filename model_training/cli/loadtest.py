@@ -32,7 +32,7 @@ def command(
         str | None, typer.Option(help="Address HOST:PORT. The requests then go over gRPC.", show_default=False)
     ] = None,
     queries: Annotated[str | None, typer.Option(help="Query set.  [default: the first with ground truth]")] = None,
-    map_name: Annotated[str | None, typer.Option("--map", help="Map to ask, if the service has several.")] = None,
+    map_name: Annotated[str | None, typer.Option("--map", help="Name of the map, if the service has several.")] = None,
     rate: Annotated[
         list[float] | None,
         typer.Option(
@@ -50,7 +50,7 @@ def command(
         int, typer.Option(help="Largest number of different queries. The command sends them in turn.", min=1)
     ] = 50,
     refine: Annotated[
-        bool, typer.Option("--refine/--no-refine", help="Ask for full answers. --no-refine asks for retrieval alone.")
+        bool, typer.Option("--refine/--no-refine", help="Request full answers. --no-refine requests retrieval alone.")
     ] = True,
     cheap_depth: Annotated[
         bool, typer.Option("--cheap-depth", help="Send depth as raw16+lz4, the cheapest format to decode.")
@@ -105,7 +105,7 @@ def command(
 
         draw(found, plot)
     if not any(each.answers for each in found):
-        raise UnreachableError(f"{grpc or url}: not one request was answered: {found[-1].errors}")
+        raise UnreachableError(f"{grpc or url}: no request was answered: {found[-1].errors}")
 
 
 def _tls_of(
@@ -118,14 +118,14 @@ def _tls_of(
     tls: bool | None,
     api_key: str | None,
 ) -> ClientTls | None:
-    """What to speak; None: no TLS. A handshake that fails is told before the load, not as so many failed requests.
+    """Return the TLS settings; None without TLS. Try the handshake once, so that a failure is one error before the load.
 
     Raises:
-        RequestError: TLS is described for an address without it.
-        HandshakeError: it fails.
+        RequestError: TLS options are given for an address without TLS.
+        HandshakeError: the handshake fails.
     """
     if address is None and tls is not None:
-        raise RequestError("--tls: it is for --grpc; over REST the address says it, as https://HOST:PORT", field="tls")
+        raise RequestError("--tls: only for --grpc; for REST use an address such as https://HOST:PORT", field="tls")
     spoken = ClientTls.of(ca, cert, key)
     if address is None:
         with Client(url, api_key=api_key, ca=ca, cert=cert, key=key) as client:
@@ -161,7 +161,7 @@ async def _run(target: Target, sent: list[Payload], load: Load, pid: int | None,
 
 
 def table_of(found: list[Summary]) -> Table:
-    """For people."""
+    """Return the table to print."""
     watched = any(each.cpu_ms_per_answer is not None for each in found)
     table = Table(title="load", caption="right: LOCALIZED answers within 1 m of the truth")
     for name in (
@@ -188,7 +188,7 @@ def table_of(found: list[Summary]) -> Table:
         table.caption = f"{table.caption}; {wrong} answers differ from another answer to the same request"
     if (late_ms := max(each.late_ms.get("p99", 0.0) for each in found)) > LATE_MS:
         table.caption = (
-            f"{table.caption}; this generator was itself late to send (p99 {late_ms:.0f} ms, in all latencies): "
-            "give it a core of its own, or less to send"
+            f"{table.caption}; the load generator sent requests late (p99 {late_ms:.0f} ms, included in all "
+            "latencies): give it its own core, or reduce the load"
         )
     return table

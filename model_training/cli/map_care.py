@@ -1,4 +1,4 @@
-"""``streetfix map``: look after bundles."""
+"""``streetfix map``: maintain map bundles."""
 
 import json
 from pathlib import Path
@@ -61,7 +61,7 @@ def verify(bundle: _Bundle) -> None:
         typer.echo(line)
     if damaged:
         raise typer.Exit(1)
-    typer.echo(f"{bundle}: whole")
+    typer.echo(f"{bundle}: no defects")
 
 
 @app.command()
@@ -164,9 +164,10 @@ def _info_lines(found: dict[str, Any]) -> list[str]:
     return [
         f"map {found['name']}, version {found['version']}, made {found['made_at']}, {found['size_bytes'] / 1e6:.1f} MB",
         f"places:      {counts['places']}, {found['spacing_m']:g} m apart, x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m",
-        f"views:       {counts['views']}, {found['headings']} a place, descriptors of {counts['descriptor_size']}",
-        f"cloud:       {counts['cloud_points']} points" + (", sums kept" if found["keeps_sums"] else ", no sums kept"),
-        f"streets:     {len(found['streets'])}, {counts['streets']} classes, {found['places_in_no_street']} places in none",
+        f"views:       {counts['views']}, {found['headings']} per place, descriptors of {counts['descriptor_size']}",
+        f"cloud:       {counts['cloud_points']} points"
+        + (", voxel sums stored" if found["keeps_sums"] else ", no voxel sums stored"),
+        f"streets:     {len(found['streets'])}, {counts['streets']} classes, {found['places_in_no_street']} places in no street",
         f"encoder:     {found['encoder']['sha256'][:16]}",
         f"confidence:  {'calibrated' if found['calibrated'] else 'not calibrated'}{checked}",
         "on earth:    "

@@ -1,4 +1,4 @@
-"""Progress of long commands, on stderr: bars on a terminal, else a line a minute and a line a stage."""
+"""Report the progress of long commands on stderr: bars on a terminal, else lines per minute and per stage."""
 
 import sys
 import threading
@@ -19,18 +19,29 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-#: Between two lines of a stage where there is no terminal.
+#: Time between two lines of a stage without a terminal, seconds.
 EVERY_S = 60.0
 
 
 class Report(Protocol):
-    """Told the stage, how much of it is done, of how much."""
+    """Progress callback."""
 
     def __call__(self, stage: str, done: int, total: int, /) -> None:
-        """Move the stage's bar."""
+        """Report progress.
+
+        Args:
+            stage: name of the stage.
+            done: finished units of work.
+            total: all units of work of the stage.
+        """
 
     def describe(self, stage: str, text: str, /) -> None:
-        """Write something else than its name beside the stage's bar."""
+        """Show a text for a stage.
+
+        Args:
+            stage: name of a stage that was reported.
+            text: replaces the name of the stage at its bar; lines show it after the name.
+        """
 
 
 class _Bars:
@@ -49,7 +60,16 @@ class _Bars:
 
 @dataclass(slots=True)
 class _Stage:
-    """Where a stage began (``first``: what was done by then, of a build that goes on), and where it is."""
+    """State of a stage.
+
+    Attributes:
+        began_s: time of its first report, seconds.
+        first: units that were already done then, because a build resumes.
+        done: finished units.
+        total: all units.
+        text: text of ``describe``.
+        told_end: whether the line for its end is written.
+    """
 
     began_s: float
     first: int
@@ -60,12 +80,12 @@ class _Stage:
 
 
 class Lines:
-    """Tells progress in lines: when a stage begins, once a minute, and when it has ended.
+    """Report progress in lines: at the start of a stage, once per minute, and at its end.
 
     Args:
-        write: is given each line, without its end.
-        clock: seconds, as ``time.monotonic``.
-        every_s: between two lines of a running stage.
+        write: function that writes a line; the line has no line break.
+        clock: function that returns monotonic seconds.
+        every_s: time between two lines of a running stage, seconds.
     """
 
     def __init__(
@@ -78,7 +98,13 @@ class Lines:
         self._lock = threading.Lock()
 
     def __call__(self, stage: str, done: int, total: int, /) -> None:
-        """Take note; write what is due."""
+        """Store the progress, and write a line if one is due.
+
+        Args:
+            stage: name of the stage.
+            done: finished units of work.
+            total: all units of work of the stage.
+        """
         with self._lock:
             if stage != self._current:
                 self._end_current()
@@ -86,23 +112,28 @@ class Lines:
             known = self._stages.get(stage)
             if known is None or done < known.done:  # less than before: the same work on something else
                 self._stages[stage] = _Stage(self._clock(), done, done, total)
-                self._tell(f"{stage}: {_share(done, total)}, begins")
+                self._tell(f"{stage}: {_share(done, total)}, started")
             else:
                 known.done, known.total = done, total
             self._tell_if_due()
 
     def describe(self, stage: str, text: str, /) -> None:
-        """Keep a text that is told with the stage's next lines."""
+        """Store a text for the next lines of a stage.
+
+        Args:
+            stage: name of a stage that was reported.
+            text: shown after the name of the stage.
+        """
         with self._lock:
             self._stages[stage].text = text
 
     def tick(self) -> None:
-        """Write a line if the last one is long ago: stages that report seldom must not look dead."""
+        """Write a line if the last one is ``every_s`` old, so that a stage with rare reports does not seem to hang."""
         with self._lock:
             self._tell_if_due()
 
     def close(self) -> None:
-        """Tell the end of the last stage."""
+        """Write the line for the end of the last stage."""
         with self._lock:
             self._end_current()
 
@@ -125,8 +156,8 @@ class Lines:
         parts += [stage.text] if stage.text else []
         rate = (stage.done - stage.first) / elapsed_s if elapsed_s > 0 else 0.0
         if rate > 0:
-            parts.append(f"{rate:.3g} a second" if rate >= 1 else f"{60 * rate:.3g} a minute")
-        parts.append(f"{_span(elapsed_s)} so far")
+            parts.append(f"{rate:.3g} per second" if rate >= 1 else f"{60 * rate:.3g} per minute")
+        parts.append(f"{_span(elapsed_s)} elapsed")
         if rate > 0 and stage.done < stage.total:
             parts.append(f"about {_span((stage.total - stage.done) / rate)} left")
         return ", ".join(parts)
@@ -137,7 +168,7 @@ def _share(done: int, total: int) -> str:
 
 
 def _span(seconds: float) -> str:
-    """As people say it: 40 s, 12 min, 2 h 10 min."""
+    """Format a time, such as 40 s, 12 min or 2 h 10 min."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -146,7 +177,12 @@ def _span(seconds: float) -> str:
 
 @contextmanager
 def lines(write: Callable[[str], None], *, every_s: float = EVERY_S) -> Iterator[Lines]:
-    """``Lines`` that also tell when nothing is reported for long."""
+    """Provide ``Lines`` that also write if no report comes for a long time.
+
+    Args:
+        write: function that writes a line.
+        every_s: time between two lines of a running stage, seconds.
+    """
     told, ended = Lines(write, every_s=every_s), threading.Event()
 
     def watch() -> None:
@@ -171,7 +207,7 @@ def _to_stderr(line: str) -> None:
 
 @contextmanager
 def bars() -> Iterator[Report]:
-    """A bar for each stage that is reported; lines where stderr is no terminal that can draw bars."""
+    """Provide one bar per reported stage, or lines if stderr is not a terminal that can draw bars."""
     console = Console(stderr=True)
     if not console.is_terminal or console.is_dumb_terminal:
         with lines(_to_stderr) as told:

@@ -27,7 +27,9 @@ def command(
     packs: Annotated[Path, typer.Option(help="Folder of the simulated training cities.")] = Path("runs/packs"),
     cities: Annotated[
         int,
-        typer.Option(help="Training cities that the views come from. The command makes missing ones.", min=1, max=1000),
+        typer.Option(
+            help="Training cities that the views come from. The command creates missing ones.", min=1, max=1000
+        ),
     ] = 2,
     pairs: Annotated[int, typer.Option(help="Pairs of views per batch.", min=2, max=2048)] = 128,
     seed: Annotated[int, typer.Option(help="Seed of the views.", min=0)] = 0,
@@ -53,6 +55,6 @@ def command(
         # Views of the checks come after those of the ranges, of the same cities.
         agreement = quantise(encoder, out, islice(drawn, RANGES), islice(drawn, CHECKS))
     Console().print(
-        f"{out}: {out.stat().st_size / 1e6:.1f} MB; cosine to float32's descriptors {agreement.mean:.4f} in the mean, "
-        f"{agreement.of_hundred:.4f} of the worst hundredth of {agreement.views} views"
+        f"{out}: {out.stat().st_size / 1e6:.1f} MB; cosine to the float32 descriptors: mean {agreement.mean:.4f}, 1st "
+        f"percentile {agreement.of_hundred:.4f} ({agreement.views} views)"
     )

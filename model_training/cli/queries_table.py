@@ -1,4 +1,4 @@
-"""Answers one by one, for people: no error without its status and confidence."""
+"""Print answers one by one, each error with its status and confidence."""
 
 import math
 
@@ -14,10 +14,10 @@ def print_queries(name: str, answers: Predictions, console: Console, *, most: in
     """Print the worst answers of a query set: accepted and wrong first, then the others by distance.
 
     Args:
-        name: of the set.
-        answers: to all of its queries.
-        console: where to.
-        most: no more than so many; 0 prints nothing.
+        name: name of the query set.
+        answers: answers to all of its queries.
+        console: destination.
+        most: largest number of rows; 0 prints nothing.
     """
     if most == 0:
         return

@@ -31,7 +31,7 @@ def command(
       streetfix import carla recordings/town01 --out data/town01
     """
     if kind != "carla":
-        raise DatasetError(f"kind: {kind!r} is not known; there is: carla", field="kind")
+        raise DatasetError(f"kind: {kind!r} is not a known simulator; choose: carla", field="kind")
     from model_training.importing.carla_record import RecordSettings, record
 
     settings = RecordSettings(town=town, weather=weather, frames=frames, step_s=step, seed=seed)

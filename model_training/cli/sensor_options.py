@@ -1,4 +1,4 @@
-"""``--set SENSOR.NUMBER=VALUE``: numbers of sensors that replace those of their presets."""
+"""Option ``--set SENSOR.NUMBER=VALUE``: sensor parameters that replace those of the presets."""
 
 from pydantic import BaseModel, ValidationError
 
@@ -23,13 +23,13 @@ _MODELS: dict[str, type[BaseModel]] = {
 def sensor_parameters(
     settings: list[str],
 ) -> tuple[LidarParameters, RgbParameters, DepthParameters, StereoParameters, SurveyParameters]:
-    """What the settings say of the LiDAR, the RGB camera, the depth camera, the stereo rig and the survey's drive.
+    """Parse the parameters of the LiDAR, the RGB camera, the depth camera, the stereo rig and the survey.
 
     Args:
         settings: texts such as ``lidar.channels=64``.
 
     Raises:
-        DatasetError: a text of another form, a name that is unknown or there twice, or a value out of bounds.
+        DatasetError: a text has another form, a name is unknown or occurs twice, or a value is out of bounds.
     """
     given: dict[str, dict[str, str]] = {sensor: {} for sensor in _MODELS}
     for text in settings:
@@ -38,12 +38,12 @@ def sensor_parameters(
         if not equals or not field:
             raise DatasetError(f"set: {text!r} is not SENSOR.NUMBER=VALUE, such as lidar.channels=64", field="set")
         if sensor not in _MODELS:
-            raise DatasetError(f"{name}: there is no sensor {sensor!r}; there are: {', '.join(_MODELS)}", field=name)
+            raise DatasetError(f"{name}: unknown sensor {sensor!r}; choose one of: {', '.join(_MODELS)}", field=name)
         known = _MODELS[sensor].model_fields
         if field not in known:
-            raise DatasetError(f"{name}: {sensor} has no number {field!r}; it has: {', '.join(known)}", field=name)
+            raise DatasetError(f"{name}: {sensor} has no parameter {field!r}; it has: {', '.join(known)}", field=name)
         if field in given[sensor]:
-            raise DatasetError(f"{name}: it is set twice; give it once", field=name)
+            raise DatasetError(f"{name}: set twice; set it once", field=name)
         given[sensor][field] = value
     try:
         return (

@@ -77,8 +77,10 @@ def command(
     rgb: Annotated[
         str,
         typer.Option(
-            help="RGB camera: automatic, small, fixed or machine. machine is a machine-vision camera. Its lights "
-            "clip, and its shadows are dark."
+            help=(
+                "RGB camera: automatic, small, fixed or machine. machine is a machine-vision camera. Highlights "
+                "saturate, and shadows are dark."
+            )
         ),
     ] = "automatic",
     sun_elevation: Annotated[
@@ -115,7 +117,7 @@ def command(
         ),
     ] = 15.0,
     turn: Annotated[
-        float, typer.Option(help="Turn of the camera against the vehicle, degrees.", min=-180, max=180)
+        float, typer.Option(help="Yaw of the camera relative to the vehicle, degrees.", min=-180, max=180)
     ] = 0.0,
     pitch: Annotated[float, typer.Option(help="Pitch error of the camera, degrees.", min=-45, max=45)] = 0.0,
     followed: Annotated[
@@ -123,7 +125,7 @@ def command(
         typer.Option(help="Share of images with a vehicle driving ahead (not --blocked).", min=0, max=1),
     ] = None,
     blocked: Annotated[
-        float, typer.Option(help="Share of the columns that a lorry right ahead hides.", min=0, max=0.9)
+        float, typer.Option(help="Share of the image columns that a lorry ahead hides.", min=0, max=0.9)
     ] = 0.0,
     max_depth: Annotated[
         float | None, typer.Option(help="Largest depth, metres. The simulator removes depth beyond it.", min=1)
@@ -133,8 +135,10 @@ def command(
         typer.Option(
             "--set",
             metavar="SENSOR.NUMBER=VALUE",
-            help="A number of lidar, rgb, depth, stereo or survey. It replaces the preset's number. Repeat for "
-            "several.",
+            help=(
+                "Set one sensor parameter of lidar, rgb, depth, stereo or survey. It replaces the preset's value. "
+                "Repeat for several."
+            ),
         ),
     ] = None,
     camera: Annotated[str, typer.Option(help="Image size, pixels, up to 4096x4096.")] = "640x480",
@@ -165,18 +169,18 @@ def command(
     for option, value in looks.items():
         if not plans and value is not None:
             raise DatasetError(
-                f"{option}: without queries nothing takes pictures; ask for some, or leave it out", field=option
+                f"{option}: this option has no effect without queries; set --queries, or omit the option", field=option
             )
     untaken = (depth_parameters, rgb_parameters, stereo_parameters)
     if not plans and untaken != (DepthParameters(), RgbParameters(), StereoParameters()):
         raise DatasetError(
-            "set: without queries nothing takes pictures or measures depth; ask for some, or set numbers of lidar only",
+            "set: without queries only parameters of lidar and survey have an effect; set --queries, or set only those",
             field="set",
         )
     if city not in ("paper", "city", "mixed"):
-        raise DatasetError(f"city: {city!r} is none of paper, city and mixed", field="city")
+        raise DatasetError(f"city: {city!r} is not valid; choose paper, city or mixed", field="city")
     if city == "paper" and size is not None:
-        raise DatasetError("size: the paper's city has its own; leave it out, or take --city city", field="size")
+        raise DatasetError("size: the paper's city has a fixed size; omit --size, or use --city city", field="size")
     width, height = _pair(camera, "camera", least=48, most=4096)
     plan = SimulationPlan(
         name=name or out.name, city=cast(Literal["paper", "city", "mixed"], city), seed=seed,
@@ -199,7 +203,7 @@ def _pair(text: str, field: str, *, least: float, most: float) -> tuple[float, f
         first, second = (float(part) for part in parts)
     except ValueError as error:
         raise DatasetError(
-            f"{field}: {text!r} is not two numbers with an x between, such as 640x480", field=field
+            f"{field}: {text!r} is not two numbers separated by x, such as 640x480", field=field
         ) from error
     for value in (first, second):
         if not least <= value <= most:  # which NaN is not either

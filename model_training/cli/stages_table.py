@@ -1,4 +1,4 @@
-"""A table of queries against the truth, stage by stage, for people."""
+"""Print a table that compares queries with their ground truth, stage by stage."""
 
 import math
 
@@ -16,12 +16,12 @@ WIDTH = 120
 
 
 def print_stages(name: str, found: list[QueryStages], console: Console) -> None:
-    """Print a row a query, then how many queries each stage lost.
+    """Print one row per query, then how many queries each stage lost.
 
     Args:
-        name: of the query set.
+        name: name of the query set.
         found: its queries.
-        console: where to.
+        console: destination.
     """
     table = Table(box=None, padding=(0, 1, 0, 0), title=f"{name}: each stage against the truth", title_justify="left")
     for k, head in enumerate(_HEAD):

@@ -70,7 +70,7 @@ def command(
     _require_metres("section_length", section_length, 1e6)
     opened = Dataset(dataset)
     if (dataset / FILE).exists() and not replace:
-        raise DatasetError(f"{dataset / FILE} is there; give --replace to write over it", field=FILE)
+        raise DatasetError(f"{dataset / FILE} exists; pass --replace", field=FILE)
     read = _read(kind, source, opened, frame, cast(Lanes, lanes), width)
     streets = read.streets
     if section_length is not None:
@@ -90,12 +90,12 @@ def command(
 def _require(name: str, value: str | None, known: tuple[str | None, ...]) -> None:
     if value not in known:
         words = ", ".join(word for word in known if word is not None)
-        raise DatasetError(f"{name}: {value!r} is not known; there is: {words}", field=name)
+        raise DatasetError(f"{name}: {value!r} is not valid; choose one of: {words}", field=name)
 
 
 def _require_metres(name: str, value: float | None, most: float) -> None:
     if value is not None and not 0 < value <= most:
-        raise DatasetError(f"{name}: {value:g} is no length in metres between 0 and {most:g}", field=name)
+        raise DatasetError(f"{name}: {value:g} is not a length in metres between 0 and {most:g}", field=name)
 
 
 def _read(
@@ -104,12 +104,12 @@ def _read(
     georeference = dataset.description.georeference
     if georeference is None and (frame == "wgs84" or kind == "osm"):
         raise DatasetError(
-            f"{dataset.folder}/dataset.json: georeference is null, so places on the Earth have no place in its map; import the "
-            "survey with its georeference" + ("" if kind == "osm" else ", or give --frame map"),
+            f"{dataset.folder}/dataset.json: georeference is null, so WGS-84 coordinates have no position in its map; "
+            "import the survey with its georeference" + ("" if kind == "osm" else ", or give --frame map"),
             field="georeference",
         )
     if kind == "osm" and frame == "map":
-        raise DatasetError("frame: OpenStreetMap is in degrees; leave --frame map out", field="frame")
+        raise DatasetError("frame: OpenStreetMap data are in degrees; omit --frame map", field="frame")
     on_earth = None if georeference is None or frame == "map" else MapFrame(georeference)
     if kind == "osm" and on_earth is not None:
         return read_openstreetmap(source, frame=on_earth, lanes=lanes, width_m=width_m)
@@ -126,12 +126,12 @@ def _told(read: StreetSource, collection: StreetCollection, written: Streets, pl
     if read.unnamed:
         lines.append(f"roads without a name: {read.unnamed}")
     if collection.overlap_m2 >= 1.0:
-        lines.append(f"{collection.overlap_m2:.0f} m2 lay in two streets and went to the earlier one")
+        lines.append(f"{collection.overlap_m2:.0f} m2 belong to two streets and were given to the first of them")
     dropped = [*read.dropped, *collection.dropped]
     lines += [f"left out: {each}" for each in dropped[:_SHOWN]]
     if len(dropped) > _SHOWN:
         lines.append(f"left out: {len(dropped) - _SHOWN} more")
-    lines.append(f"{inside} of {len(places)} places of the survey lie in a street")
+    lines.append(f"{inside} of {len(places)} places of the survey are in a street")
     if not inside:
-        lines.append("so the streets do not fit the map: look at --picture, and at --frame")
+        lines.append("so the streets do not fit the map: check --frame, and look at --picture")
     return lines

@@ -67,15 +67,17 @@ def command(
       streetfix train --run runs/stock && streetfix export runs/stock --out encoder.onnx
     """
     if recipe not in RECIPES:
-        raise DatasetError(f"recipe: {recipe!r} is none of {', '.join(RECIPES)}", field="recipe")
+        raise DatasetError(f"recipe: {recipe!r} is not valid; choose one of: {', '.join(RECIPES)}", field="recipe")
     if cities is not None and recipe != "stock":
-        raise DatasetError(f"cities: the recipe {recipe!r} has its own; leave it out", field="cities")
+        raise DatasetError(f"cities: the recipe {recipe!r} has fixed cities; omit --cities", field="cities")
     if optimiser not in ("adamw", "sgdm"):
-        raise DatasetError(f"optimiser: {optimiser!r} is neither 'adamw' nor 'sgdm'", field="optimiser")
+        raise DatasetError(f"optimiser: {optimiser!r} is not valid; choose adamw or sgdm", field="optimiser")
     if precision not in ("float32", "bfloat16"):
-        raise DatasetError(f"precision: {precision!r} is neither 'float32' nor 'bfloat16'", field="precision")
+        raise DatasetError(f"precision: {precision!r} is not valid; choose float32 or bfloat16", field="precision")
     if negatives not in ("batch", "look-alikes", "memory"):
-        raise DatasetError(f"negatives: {negatives!r} is not batch, look-alikes or memory", field="negatives")
+        raise DatasetError(
+            f"negatives: {negatives!r} is not valid; choose batch, look-alikes or memory", field="negatives"
+        )
     device_of(device)  # said before an hour of simulation, not after it
     config = TrainingConfig.model_validate(
         {

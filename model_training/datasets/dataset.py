@@ -119,7 +119,7 @@ class CameraSensor(_Model):
     @model_validator(mode="after")
     def _deviation_of_a_height(self) -> Self:
         if self.height_m is None and self.height_std_m is not None:
-            raise ValueError(f"camera {self.name!r} has height_std_m, but no height_m; give both, or none")
+            raise ValueError(f"camera {self.name!r} has height_std_m, but no height_m; give both or neither")
         return self
 
     @model_serializer(mode="wrap")
@@ -268,7 +268,8 @@ class Dataset:
                     field="dataset.json",
                 )
             raise DatasetError(
-                f"{folder} is no finished dataset: dataset.json is missing; run `streetfix simulate` or `streetfix import` (again)",
+                f"{folder} is not a complete dataset: dataset.json is missing; run `streetfix simulate` or `streetfix "
+                "import` (again)",
                 field="dataset.json",
             )
         try:
@@ -279,7 +280,7 @@ class Dataset:
             raise DatasetError(f"{path}: {where}: {first['msg']}", field=where) from error
         if self.description.format != FORMAT:
             raise DatasetError(
-                f"{path}: format {self.description.format} is not {FORMAT}; make the dataset anew", field="format"
+                f"{path}: format {self.description.format} is not {FORMAT}; create the dataset again", field="format"
             )
 
     @property
@@ -299,7 +300,7 @@ class Dataset:
         try:
             loaded: dict[str, Any] = json.loads(read_bytes(path))
         except (ValueError, RecursionError) as error:
-            raise DatasetError(f"{path}: not JSON: {error}", field="streets.geojson") from error
+            raise DatasetError(f"{path}: not valid JSON: {error}", field="streets.geojson") from error
         return loaded
 
     def survey_poses(self) -> Transforms:
@@ -335,7 +336,8 @@ class Dataset:
         size = size_of(path)
         if size == 0 or size % ROW_BYTES:
             raise DatasetError(
-                f"{path}: {size} bytes are no rows of four float32; the file is truncated", field=str(path.name)
+                f"{path}: {size} bytes are not a multiple of 16 (rows of four float32); the file is truncated",
+                field=str(path.name),
             )
         points = read_rows(path, size)
         finite: NDArray[np.float32] = points[np.isfinite(points[:, :3]).all(axis=1)]
@@ -376,19 +378,19 @@ class Dataset:
         names = _camera_names(folder, len(pictures))
         cameras = {camera.name: camera for camera in self.description.sensors.cameras}
         if not cameras:
-            raise DatasetError(f"{self.folder}/dataset.json names no camera", field="sensors.cameras")
+            raise DatasetError(f"{self.folder}/dataset.json has no camera", field="sensors.cameras")
         first = next(iter(cameras))
         for rgb_path in pictures:
             number = int(rgb_path.stem)
             depth_path = next((p for p in (folder / "depth").glob(f"{rgb_path.stem}.*")), None)
             if depth_path is None:
-                raise DatasetError(f"{folder}/depth has no picture {rgb_path.stem}", field="depth")
+                raise DatasetError(f"{folder}/depth has no image {rgb_path.stem}", field="depth")
             if truth is not None and number >= len(truth):
                 raise DatasetError(f"{poses_path} has {len(truth)} lines, none for {rgb_path.name}", field="poses.txt")
             camera_name = names[number] if names else first
             if camera_name not in cameras:
                 raise DatasetError(
-                    f"{folder}/cameras.txt names {camera_name!r}, which dataset.json does not", field="cameras.txt"
+                    f"{folder}/cameras.txt names {camera_name!r}, which is not in dataset.json", field="cameras.txt"
                 )
             yield QueryFrame(
                 number, rgb_path, depth_path, cameras[camera_name],
@@ -412,7 +414,7 @@ def _camera_names(folder: Path, count: int) -> list[str] | None:
         return None
     names = read_bytes(path).decode(errors="replace").split()
     if len(names) != count:
-        raise DatasetError(f"{path} has {len(names)} lines for {count} pictures", field="cameras.txt")
+        raise DatasetError(f"{path} has {len(names)} lines for {count} images", field="cameras.txt")
     return names
 
 

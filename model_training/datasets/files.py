@@ -44,9 +44,15 @@ def unreadable(path: Path, error: OSError) -> DatasetError:
         error: error of the operating system.
     """
     if isinstance(error, FileNotFoundError):
-        what = "it is missing, or vanished while it was wanted; bring it back, leave the folder as it is meanwhile, and start again"
+        what = (
+            "the file is missing, or was removed during the run; restore it, do not change the folder meanwhile, and "
+            "start again"
+        )
     else:
-        what = f"it cannot be read ({error.strerror or type(error).__name__}); check its permissions and the disk, and start again"
+        what = (
+            f"the file cannot be read ({error.strerror or type(error).__name__}); check its permissions and the disk, "
+            "and start again"
+        )
     return DatasetError(f"{path}: {what}", field=path.name)
 
 
@@ -90,8 +96,8 @@ def read_rows(path: Path, size: int) -> Float32[NDArray[np.float32], "N 4"]:
         values = np.fromfile(path, np.float32, count=size // 4)
     if len(values) != size // 4:
         raise DatasetError(
-            f"{path}: it had {size} bytes and then {4 * len(values)}: something writes it while it is read; leave the folder as it is "
-            "meanwhile, and start again", field=path.name,
+            f"{path}: the file changed while it was read (from {size} to {4 * len(values)} bytes); "
+            "do not change the folder meanwhile, and start again", field=path.name,
         )  # fmt: skip
     return values.reshape(-1, 4)
 
@@ -111,4 +117,4 @@ def read_arrays(path: Path, read: Callable[[], T], *, remedy: str) -> T:
         try:
             return read()
         except (KeyError, BadZipFile, *NPY_HEADER_ERRORS) as error:
-            raise DatasetError(f"{path}: it is damaged ({error}); {remedy}", field=path.name) from error
+            raise DatasetError(f"{path}: the file is damaged ({error}); {remedy}", field=path.name) from error

@@ -19,7 +19,7 @@ def whole_or_not_at_all(out: Path) -> Iterator[Path]:
         DatasetError: ``out`` exists and is not an empty folder.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DatasetError(f"{out} exists and is not empty; name another folder, or remove it first", field="out")
+        raise DatasetError(f"{out} exists and is not empty; choose another folder, or remove it first", field="out")
     part = out.with_name(f".{out.name}.part")
     if part.exists():
         shutil.rmtree(part)

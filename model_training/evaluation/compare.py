@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.evaluation.failures import position_errors
-from model_training.evaluation.measures import RIGHT_M, recall_at
+from model_training.evaluation.measures import recall_at
 from model_training.evaluation.paired import PairedErrors, PairedShares, paired_errors, paired_shares
 from model_training.evaluation.predict import RANKED, Predictions, joined
 from model_training.evaluation.saved_run import SavedRun
 from service.errors import DatasetError
+from service.geometry.rigid import SAME_M
+from service.maps.calibration import RIGHT_M
 
 #: A difference is significant if its p-value is below this.
 _P = 0.05
-#: Largest difference of equal ground-truth poses, in each number of the matrix. Files store nine digits.
-_SAME_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Comparison:
         won, lost = _surely_more(right), _surely_less(right)
         safer, riskier = _surely_less(wrong), _surely_more(wrong)
         if (won and wrong.difference <= 0) or (safer and not lost):
-            return f"B is better than A by more than chance explains: {told}."
+            return f"B is significantly better than A: {told}."
         if (lost and wrong.difference >= 0) or (riskier and not won):
-            return f"B is worse than A by more than chance explains: {told}."
+            return f"B is significantly worse than A: {told}."
         if won or lost:
             more, fewer = ("B", "A") if won else ("A", "B")
             return f"Neither is better: {more} has more right answers, {fewer} accepts fewer wrong ones: {told}."
@@ -65,7 +65,7 @@ class Comparison:
                 f"No difference: A and B are right about the same queries ({right.count}, {right.second:.1%} within 1 m), "
                 "and accept the same wrong ones."
             )
-        return f"No difference can be told from chance: {told}."
+        return f"No significant difference: {told}."
 
     def as_json(self) -> dict[str, Any]:
         """Return all figures as JSON values."""
@@ -147,14 +147,15 @@ def _require_same_queries(first: SavedRun, second: SavedRun) -> None:
     if names != others:
         alone = ", ".join(sorted(names ^ others))
         raise DatasetError(
-            f"{first.folder} and {second.folder} did not ask the same query sets: only one has {alone}; "
+            f"{first.folder} and {second.folder} have different query sets: only one has {alone}; "
             "evaluate both with the same --queries", field="queries",
         )  # fmt: skip
     for name in sorted(names):
         one, other = first.predictions[name].T_true, second.predictions[name].T_true
-        if len(one) != len(other) or not np.allclose(one, other, rtol=0, atol=_SAME_M):
+        if len(one) != len(other) or not np.allclose(one, other, rtol=0, atol=SAME_M):
             raise DatasetError(
-                f"query set {name!r}: {first.folder} ({first.settings.dataset.name}, {len(one)} queries) and {second.folder} "
-                f"({second.settings.dataset.name}, {len(other)} queries) asked other queries; evaluate both on the same dataset",
+                f"query set {name!r}: {first.folder} ({first.settings.dataset.name}, {len(one)} queries) and "
+                f"{second.folder} ({second.settings.dataset.name}, {len(other)} queries) have different queries; "
+                "evaluate both on the same dataset",
                 field="queries",
             )  # fmt: skip

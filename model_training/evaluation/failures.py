@@ -6,18 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.evaluation.error_measures import distance_errors
-from model_training.evaluation.measures import RIGHT_M, RIGHT_PLACE_M, recall_at
+from model_training.evaluation.measures import RIGHT_PLACE_M, recall_at
 from model_training.evaluation.predict import RANKED, Predictions
+from service.maps.calibration import RIGHT_M
 
 
 class Stage(StrEnum):
     """The outcome of a query, in the words of a report. ``WHY`` explains each."""
 
     RIGHT = "right"
-    DOUBTED = "right, but doubted"
+    DOUBTED = "right, but not accepted"
     IMPRECISE = "right place, imprecise"
-    ELSEWHERE = "decided for another place"
-    STARTS = "no start near the truth"
+    ELSEWHERE = "another place chosen"
+    STARTS = "no initial pose near the truth"
     RETRIEVAL = "lost by retrieval"
     REFUSED = "refused"
 
@@ -27,10 +28,13 @@ WHY = {
     Stage.RIGHT: "The answer is within 1 m of the truth and was accepted.",
     Stage.DOUBTED: "The position is within 1 m, but its confidence did not reach the threshold, so it was not accepted.",
     Stage.IMPRECISE: "The answer lies 1 to 5 m off: the right place, not the right pose.",
-    Stage.ELSEWHERE: "A pose near the truth was there to choose, or the right place among the ten nearest; another had more support.",
-    Stage.STARTS: "The right place is among the ten nearest, but no pose near it was left at the end of registration.",
+    Stage.ELSEWHERE: (
+        "A candidate pose was near the truth, or the right place was among the ten nearest; another one had more "
+        "support."
+    ),
+    Stage.STARTS: "The right place is among the ten nearest, but after registration no candidate pose was near it.",
     Stage.RETRIEVAL: "No place within 5 m of the truth is among the ten nearest, and no pose near it was registered.",
-    Stage.REFUSED: "The depth picture holds nothing that could be looked up, so there is no answer.",
+    Stage.REFUSED: "The depth image has no usable measurement, so there is no answer.",
 }
 
 

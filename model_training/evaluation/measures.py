@@ -19,11 +19,10 @@ from model_training.evaluation.error_measures import (
     wilson_interval,
 )
 from model_training.evaluation.predict import Predictions, headings_of
+from service.maps.calibration import RIGHT_M
 
 #: Largest distance of a right place, metres on the ground.
 RIGHT_PLACE_M = 5.0
-#: Largest distance of a right answer, metres on the ground. ``confidence`` is the probability of a right answer.
-RIGHT_M = 1.0
 
 
 def recall_at(

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.datasets.dataset import Dataset
-from model_training.mapping.build import BuildSettings, view_ranges
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import view_ranges
 from service.errors import NoDepthError
 from service.imaging.query_view import query_views
 from service.imaging.view_grid import ViewGrid

@@ -120,14 +120,14 @@ class SavedRun:
         path = folder / FILE
         if not path.is_file():
             raise DatasetError(
-                f"{folder} is no saved run: {FILE} is missing; `streetfix evaluate --report` makes one", field=FILE
+                f"{folder} is not a saved run: {FILE} is missing; `streetfix evaluate --report` writes one", field=FILE
             )
         try:
             settings = RunSettings.model_validate_json(path.read_bytes())
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise DatasetError(f"{path}: {where}: {first['msg']}; make the report anew", field=FILE) from error
+            raise DatasetError(f"{path}: {where}: {first['msg']}; create the report again", field=FILE) from error
         return SavedRun(folder, settings, {each.name: _answers(folder, each) for each in settings.sets})
 
 
@@ -136,10 +136,13 @@ def _answers(folder: Path, each: RunSet) -> Predictions:
     try:
         found = Predictions.load(path)
     except (OSError, KeyError, BadZipFile, *NPY_HEADER_ERRORS) as error:
-        raise DatasetError(f"{path}: no answers of ours ({error}); make the report anew", field=each.name) from error
+        raise DatasetError(
+            f"{path}: not an answer file of Streetfix ({error}); create the report again", field=each.name
+        ) from error
     if len(found.T_true) != each.queries:
         raise DatasetError(
-            f"{path}: {len(found.T_true)} answers, {FILE} says {each.queries}; make the report anew", field=each.name
+            f"{path}: {len(found.T_true)} answers, but {FILE} says {each.queries}; create the report again",
+            field=each.name,
         )
     return found
 

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from model_training.datasets.dataset import Dataset, QueryFrame
-from model_training.evaluation.measures import RIGHT_M, RIGHT_PLACE_M
+from model_training.evaluation.measures import RIGHT_PLACE_M
 from service.errors import DatasetError, NoDepthError
 from service.geometry.rigid import Rotation, Transform, heading_of_camera, transform_from, wrap_angle
 from service.localization.answer import Answer
 from service.localization.localizer import Localizer
 from service.localization.refine import settings_for_rig
+from service.maps.calibration import RIGHT_M
 from service.registration.kernel import STATE, QueryPoints
 from service.registration.points import blocks_of, points_from
 from service.registration.register import RegistrationSettings, Start, register, registered_of, score
@@ -53,8 +54,8 @@ class Lost(StrEnum):
 #: Explanation of each stage for the report.
 MEANING = {
     Lost.NOT: "the answer is within 1 m and accepted",
-    Lost.LEVEL: f"the estimated level is more than {TILT_DEG:g} degrees or {HEIGHT_M:g} m off",
-    Lost.RETRIEVAL: f"no start is within {START_M:g} m and {START_DEG:g} degrees of the truth",
+    Lost.LEVEL: f"the estimated tilt is off by more than {TILT_DEG:g} degrees, or the height by more than {HEIGHT_M:g} m",
+    Lost.RETRIEVAL: f"no initial pose is within {START_M:g} m and {START_DEG:g} degrees of the truth",
     Lost.CANDIDATES: "no registered pose is within 1 m, although registration from the true pose stays there",
     Lost.REGISTRATION: "registration leaves even the true pose by more than 1 m",
     Lost.CHOICE: "a registered pose is within 1 m, but another one was chosen",

@@ -107,7 +107,7 @@ def out_of_range(calibration: Calibration, evidence: NDArray[np.float64]) -> lis
     found = []
     for reason in reasons_of(calibration, np.median(known, axis=0)):
         told = ", ".join(f"{name} {size:+.1f}" for name, size in reason.evidence)
-        what = f"{reason.check} (standard deviations from what calibration saw: {told})"
+        what = f"{reason.check} (standard deviations from the mean of the calibration data: {told})"
         found.append(Cause(what, reason.remedy))
     return found
 
@@ -131,7 +131,7 @@ def _tried(localizer: Localizer, queries: list[Query]) -> list[Cause]:
         return []
     kind, factor = best
     if kind == "focal":
-        check = "check the intrinsics, and whether they are of pictures of this size"
+        check = "check the intrinsics, and whether they belong to images of this size"
         return [Cause(f"the focal length is off by a factor of two: fx and fy times {factor:g} fit the map", check)]
     return [
         Cause(f"the depth unit is off: depth times {factor:g} fits the map", "check depth.scale_m and the baseline")

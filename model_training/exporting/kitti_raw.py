@@ -55,7 +55,7 @@ def write_kitti_raw(dataset: Dataset, queries: str | None, out: Path, *, report:
         times = "".join(f"{_time(stamp_s)}\n" for stamp_s in stamps)
         for folder in ("velodyne_points", "image_02"):
             (drive / folder / "timestamps.txt").write_text(times)
-        (drive / SCANS_AT_REST).write_text("Each scan was measured at one moment; nothing is to be corrected.\n")
+        (drive / SCANS_AT_REST).write_text("Each scan was measured at one instant, so it needs no motion correction.\n")
         _write_calibration(part / DAY, T_vehicle_scan, camera)
     return len(stamps)
 

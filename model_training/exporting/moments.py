@@ -67,7 +67,7 @@ def the_camera(dataset: Dataset, queries: str) -> CameraSensor:
     cameras = {frame.camera.name: frame.camera for frame in dataset.queries(queries)}
     if len(cameras) != 1:
         raise DatasetError(
-            f"query set {queries!r} has pictures of {len(cameras)} cameras ({', '.join(cameras)}); one is wanted",
+            f"query set {queries!r} has images of {len(cameras)} cameras ({', '.join(cameras)}); expected one camera",
             field="queries",
         )
     return next(iter(cameras.values()))
@@ -90,7 +90,7 @@ def moments(dataset: Dataset, queries: str | None) -> Iterator[Moment]:
     shift_s: float | None = None
     for frame in dataset.queries(queries) if queries else ():
         if frame.T_map_camera is None or frame.stamp_s is None:
-            raise DatasetError(f"query set {queries!r} has no poses.txt, so it is no part of a drive", field="queries")
+            raise DatasetError(f"query set {queries!r} has no poses.txt, so it cannot be exported", field="queries")
         if shift_s is None:
             shift_s = max(0.0, float(stamps[-1]) + PAUSE_S - frame.stamp_s)
         T_map_vehicle = frame.T_map_camera @ inverse(T_vehicle_camera(frame.camera))

@@ -46,10 +46,10 @@ def write_bag(
         DatasetError: ``out`` already exists or has an unsuitable name, or the dataset cannot be written as one traversal.
     """
     if out.exists():
-        raise DatasetError(f"{out} is there already; name another", field="out")
+        raise DatasetError(f"{out} already exists; choose another --out", field="out")
     if kind != "bag" and out.suffix == ".bag":
         raise DatasetError(
-            f"{out}: .bag is what ROS 1 calls its files, and readers take it for one; name the folder otherwise",
+            f"{out}: readers take the ending .bag for a ROS 1 file; choose another name for the folder",
             field="out",
         )
     camera = None if queries is None else the_camera(dataset, queries)

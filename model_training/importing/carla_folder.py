@@ -178,10 +178,10 @@ class CarlaFolder:
             header = header_of(data, "PNG", field="depth")
             require_pixels(header.height, header.width, _LIMITS, field="depth")
         except (StreetfixError, OSError) as error:
-            return Unusable("picture", rgb_path.name, f"cannot be read: {type(error).__name__}")
+            return Unusable("image", rgb_path.name, f"cannot be read: {type(error).__name__}")
         bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if bgr is None:
-            return Unusable("picture", rgb_path.name, "its depth cannot be decoded")
+            return Unusable("image", rgb_path.name, "its depth cannot be decoded")
         T = optical(camera.mounting.T_vehicle_sensor())
         depth = depth_from_carla(np.asarray(bgr, np.uint8))
         return RecordedPicture(rgb_path.name, stamp_s, rgb, camera.pinhole(), T, depth=depth, file=rgb_path)
@@ -201,7 +201,7 @@ def open_carla(source: Path) -> CarlaFolder:
         recording = CarlaRecording.model_validate_json(told.read_bytes())
     except OSError as error:
         raise DatasetError(
-            f"{told} cannot be read ({error}); it tells where sensors are mounted: see docs/recordings.md",
+            f"{told} cannot be read ({error}); it gives the mounting of the sensors, see docs/recordings.md",
             field=told.name,
         ) from error
     except ValidationError as error:
@@ -229,7 +229,7 @@ POSE_COLUMNS = ("frame", "timestamp", "x", "y", "z", "roll", "pitch", "yaw")
 def _poses(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     if not path.is_file():
         raise DatasetError(
-            f"{path} is missing: {', '.join(POSE_COLUMNS)} of the vehicle, a line a frame", field=path.name
+            f"{path} is missing; it has one line per frame: {', '.join(POSE_COLUMNS)} of the vehicle", field=path.name
         )
     names, stamps, poses = [], [], []
     with path.open(newline="", errors="replace") as file:
@@ -240,7 +240,7 @@ def _poses(path: Path) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
                 raise DatasetError(f"{path}, line {number}: not {', '.join(POSE_COLUMNS)}", field=path.name) from error
             if not (row["frame"] or "").isdigit() or not np.isfinite(values).all():
                 raise DatasetError(
-                    f"{path}, line {number}: the frame is no number, or a value is not finite", field=path.name
+                    f"{path}, line {number}: the frame is not a number, or a value is not finite", field=path.name
                 )
             names.append(row["frame"])
             stamps.append(values[0])

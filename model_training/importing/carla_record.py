@@ -65,7 +65,7 @@ class MomentWriter:
 
     def __init__(self, out: Path, recording: CarlaRecording) -> None:
         if out.exists() and any(out.iterdir()):
-            raise DatasetError(f"{out} exists and is not empty; name another folder", field="out")
+            raise DatasetError(f"{out} exists and is not empty; choose another folder", field="out")
         for kind in ("lidar", "rgb", "depth"):
             (out / kind).mkdir(parents=True, exist_ok=True)
         write_recording(out, recording)
@@ -127,8 +127,10 @@ def record(host: str, port: int, out: Path, settings: RecordSettings, *, report:
     try:
         return _recorded(carla, client, out, settings, told)
     except RuntimeError as error:  # all errors of the client, time-outs included
-        told_by = f"CARLA at {host}:{port} does not do its part ({error})"
-        remedy = f"{done} frames are in {out}; start it again" if done else "start it, or name another --host or --town"
+        told_by = f"CARLA at {host}:{port} failed ({error})"
+        remedy = (
+            f"{done} frames are in {out}; start it again" if done else "start it, or choose another --host or --town"
+        )
         raise DatasetError(f"{told_by}; {remedy}", field="host") from error
 
 
@@ -137,7 +139,7 @@ def _recorded(carla: Any, client: Any, out: Path, settings: RecordSettings, repo
     if settings.weather:
         if not hasattr(carla.WeatherParameters, settings.weather):
             raise DatasetError(
-                f"weather: CARLA has none called {settings.weather!r}, such as ClearNoon", field="weather"
+                f"weather: CARLA has no preset {settings.weather!r}; use one such as ClearNoon", field="weather"
             )
         world.set_weather(getattr(carla.WeatherParameters, settings.weather))
     town = world.get_map().name.rsplit("/", 1)[-1]
@@ -227,13 +229,13 @@ def _of_frame(waiting: "queue.Queue[Any]", frame: int, timeout_s: float) -> Any:
             data = waiting.get(timeout=timeout_s)
         except queue.Empty as error:
             raise DatasetError(
-                f"a sensor gave nothing for {timeout_s:g} s; is the server alive?", field="host"
+                f"a sensor sent no data for {timeout_s:g} s; check that the server runs", field="host"
             ) from error
         if data.frame == frame:
             return data
         if data.frame > frame:
             raise DatasetError(
-                f"a sensor skipped frame {frame}; is another client ticking this server? Let this be the only one",
+                f"a sensor skipped frame {frame}; check that no other client ticks this server",
                 field="host",
             )
 

@@ -43,9 +43,9 @@ def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
     except OSError as error:
         if error.errno is not None:  # the system's error; a package's error about the content has no errno
             raise unreadable(path, error) from error
-        return f"it cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
+        return f"cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
     except Exception as error:  # three packages and NumPy raise errors without a common base on damaged files
-        return f"it cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
+        return f"cannot be read as {path.suffix[1:].upper()}: {type(error).__name__}"
     if isinstance(columns, str):
         return columns
     if len(columns) > max_points:
@@ -54,7 +54,10 @@ def read_cloud(path: Path, *, max_points: int = 5_000_000) -> Points | str:
         return "no points"
     away = np.abs(columns[:, :3])
     if away.max(initial=0.0, where=np.isfinite(away)) > _FARTHEST_M:
-        return f"its points lie more than {_FARTHEST_M / 1000:g} km away: a scan is wanted in its LiDAR's frame, not in a map's"
+        return (
+            f"its points are more than {_FARTHEST_M / 1000:g} km away: expected a scan in the frame of its LiDAR, not "
+            "of a map"
+        )
     return columns
 
 

@@ -79,16 +79,15 @@ def open_clouds(source: Path, poses: Path | None = None) -> Clouds:
     """
     files = tuple(sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES)) if source.is_dir() else ()
     if not files:
-        raise DatasetError(
-            f"{source}: a folder of scans is wanted ({', '.join(SUFFIXES)}); here is none", field="source"
-        )
+        raise DatasetError(f"{source}: no scans found; give a folder of scans ({', '.join(SUFFIXES)})", field="source")
     named = poses or next((source / name for name in POSES if (source / name).is_file()), None)
     if named is None:
         return Clouds(source, files, tuple(k * STEP_S for k in range(len(files))), None)
     stamps, T = read_tum(named)
     if len(stamps) != len(files):
         raise DatasetError(
-            f"{named} has {len(stamps)} poses for {len(files)} scans; a line a scan is wanted, in the order of their names",
+            f"{named} has {len(stamps)} poses for {len(files)} scans; expected one line per scan, in the order of "
+            "their names",
             field="poses",
         )
     return Clouds(source, files, tuple(float(s) for s in stamps), Trajectory(stamps, T, str(named)))

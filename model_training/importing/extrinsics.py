@@ -38,9 +38,9 @@ def read_extrinsics(path: Path) -> Extrinsics:
     try:
         loaded = json.loads(path.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DatasetError(f"{path}: no JSON that can be read: {error}", field="extrinsics") from error
+        raise DatasetError(f"{path}: cannot be read as JSON: {error}", field="extrinsics") from error
     if not isinstance(loaded, dict) or not loaded.keys() <= set(_KEYS):
-        raise DatasetError(f"{path}: an object with {' and '.join(_KEYS)} is wanted", field="extrinsics")
+        raise DatasetError(f"{path}: expected an object with {' and '.join(_KEYS)}", field="extrinsics")
     return Extrinsics(**{key: _rigid(path, key, value) for key, value in loaded.items()})
 
 
@@ -67,9 +67,9 @@ def read_camera(path: Path) -> PinholeCamera:
         TypeError,
         ValueError,
     ) as error:
-        raise DatasetError(f"{path}: no camera: {type(error).__name__}: {error}", field="camera") from error
+        raise DatasetError(f"{path}: not a valid camera: {type(error).__name__}: {error}", field="camera") from error
     if not all(np.isfinite(x) and x > 0 for key, x in numbers.items() if key not in ("cx", "cy")):
-        raise DatasetError(f"{path}: width, height, fx and fy are to be more than 0", field="camera")
+        raise DatasetError(f"{path}: width, height, fx and fy must be more than 0", field="camera")
     return PinholeCamera(
         int(numbers["width"]), int(numbers["height"]), numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"], distortion
     )  # fmt: skip
@@ -79,10 +79,10 @@ def _rigid(path: Path, key: str, value: object) -> Transform:
     try:
         T = np.array(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise DatasetError(f"{path}: {key} is no matrix of numbers", field=key) from error
+        raise DatasetError(f"{path}: {key} is not a matrix of numbers", field=key) from error
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
         raise DatasetError(f"{path}: {key} is not 4 rows of 4 numbers, the last 0 0 0 1", field=key)
     R = T[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-4) or np.linalg.det(R) < 0:
-        raise DatasetError(f"{path}: {key} turns by no rotation (its columns are not square to each other)", field=key)
+        raise DatasetError(f"{path}: {key} has no valid rotation (the columns are not orthonormal)", field=key)
     return T

@@ -81,9 +81,11 @@ def open_recording(kind: str, source: Path, settings: OpenSettings) -> Recording
         DatasetError: the kind is unknown, a setting does not apply to it, or the reader cannot open the source.
     """
     if kind not in KINDS:
-        raise DatasetError(f"kind: {kind!r} is not known; there is: {', '.join(sorted(KINDS))}", field="kind")
+        raise DatasetError(
+            f"kind: {kind!r} is not a known format; choose one of: {', '.join(sorted(KINDS))}", field="kind"
+        )
     if not source.exists():
-        raise DatasetError(f"{source}: there is nothing of that name", field="source")
+        raise DatasetError(f"{source}: file or folder not found", field="source")
     _refuse_what_does_not_apply(kind, settings)
     return KINDS[kind].open(source, settings)
 
@@ -92,11 +94,11 @@ def _refuse_what_does_not_apply(kind: str, settings: OpenSettings) -> None:
     known, unasked = KINDS[kind], OpenSettings()
     if settings.depth not in known.depths:
         raise DatasetError(
-            f"depth: {kind} has no {settings.depth!r} depth; there is: {', '.join(known.depths)}", field="depth"
+            f"depth: {kind} has no {settings.depth!r} depth; choose one of: {', '.join(known.depths)}", field="depth"
         )
     for field_name, option in _OPTIONS.items():
         if field_name not in known.takes and getattr(settings, field_name) != getattr(unasked, field_name):
-            raise DatasetError(f"{option}: {kind} has no use for it; leave it out", field=option)
+            raise DatasetError(f"{option}: {kind} does not support this option; omit it", field=option)
 
 
 def _kitti_raw(source: Path, settings: OpenSettings) -> Recording:

@@ -41,7 +41,7 @@ def open_kitti_360(source: Path, *, depth: KittiDepth) -> KittiSequence:
     pictures = root / "data_2d_raw" / name
     scans = numbered(scans_of / "data", (".bin",))
     if not scans:
-        wanted, otherwise = f"a drive's folder in {', '.join(_PARTS)}", f"{scans_of}/data has no scan"
+        wanted, otherwise = f"the folder of one drive in {', '.join(_PARTS)}", f"{scans_of}/data has no scan"
         raise wrong_folder(source, wanted, _drives_near(source), otherwise)
     left, right = (numbered(pictures / f"image_{eye}" / "data_rect", _PICTURES) for eye in ("00", "01"))
     calibration = _calibration(root / "calibration")
@@ -91,7 +91,7 @@ def _T_lidar_cam0(folder: Path) -> Transform:
         rows = np.array(read_bytes(path).decode("ascii").split(), np.float64).reshape(3, 4)
     except (ValueError, UnicodeDecodeError) as error:
         raise DatasetError(
-            f"{path}: not the 12 numbers of a transform; take the file from the recording again", field=path.name
+            f"{path}: not the 12 numbers of a transform; copy the file from the recording again", field=path.name
         ) from error
     return _rigid(rows, str(path), path.name)
 
@@ -104,7 +104,9 @@ def _rigid(rows: NDArray[np.float64], where: str, field: str) -> Transform:
     """
     R = rows[:, :3]
     if not np.isfinite(rows).all() or not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        raise DatasetError(f"{where}: no rotation and position; take the file from the recording again", field=field)
+        raise DatasetError(
+            f"{where}: not a rotation and a position; copy the file from the recording again", field=field
+        )
     return transform_from(R, rows[:, 3])
 
 

@@ -77,8 +77,8 @@ def calibration_from(path: Path, *, P2: Matrix, P3: Matrix | None, R0: Matrix, T
     baseline = None if P3 is None else float(P2[0, 3] - P3[0, 3])
     if not is_rotation or K[0, 0] <= 0 or K[1, 1] <= 0 or (baseline is not None and baseline <= 0):
         raise DatasetError(
-            f"{path}: R0_rect and Tr_velo_to_cam are no rotation, or P2 and P3 no pair with the right camera on "
-            "the right; take the file from the recording again",
+            f"{path}: R0_rect and Tr_velo_to_cam are not a rotation, or P2 and P3 are not a stereo pair with the "
+            "right camera on the right; copy the file from the recording again",
             field=path.name,
         )
     translation = R0 @ Tr[:, 3] + np.linalg.solve(K, P2[:, 3])
@@ -122,9 +122,9 @@ def read_matrices(
         except (KeyError, ValueError) as error:
             size = "x".join(str(n) for n in shape)
             raise DatasetError(
-                f"{path}: {key} is missing or is not {size} numbers; take the file from the recording again",
+                f"{path}: {key} is missing or is not {size} numbers; copy the file from the recording again",
                 field=path.name,
             ) from error
         if not np.isfinite(values).all():
-            raise DatasetError(f"{path}: {key} is not finite; take the file from the recording again", field=path.name)
+            raise DatasetError(f"{path}: {key} is not finite; copy the file from the recording again", field=path.name)
     return matrices

@@ -26,7 +26,7 @@ def copy_scan(path: Path, to: Path) -> None:
     """
     size = size_of(path)
     if size == 0 or size % ROW_BYTES:
-        raise damaged(path, f"{size} bytes are no rows of four float32")
+        raise damaged(path, f"{size} bytes are not a multiple of 16 (rows of four float32)")
     points = read_rows(path, size)
     if not np.isfinite(points).all():
         raise damaged(path, "a coordinate is not finite")
@@ -60,13 +60,13 @@ def read_stored_depth(path: Path, size: tuple[int, ...]) -> UInt16[NDArray[np.ui
         DatasetError: it is missing or damaged, or has another size.
     """
     if not path.is_file():
-        raise damaged(path, "the stored depth of this frame is missing (--depth sgbm does without)")
+        raise damaged(path, "the stored depth of this frame is missing (--depth sgbm needs none)")
     try:
         values = read_depth_values(read_bytes(path), encoding=None, limits=_LIMITS)
     except StreetfixError as error:
         raise damaged(path, str(error)) from error
     if values.dtype != np.uint16 or values.shape != size:
-        raise damaged(path, f"it is {values.shape} of {values.dtype}, and its left picture is {size}")
+        raise damaged(path, f"its size is {values.shape} of {values.dtype}, but the left image has {size}")
     return values.astype(np.uint16, copy=False)
 
 
@@ -77,4 +77,4 @@ def damaged(path: Path, why: str) -> DatasetError:
         path: of the file.
         why: the reason.
     """
-    return DatasetError(f"{path}: {why}; take the file from the recording again, or remove the frame", field=path.name)
+    return DatasetError(f"{path}: {why}; copy the file from the recording again, or remove the frame", field=path.name)

@@ -44,8 +44,8 @@ def wrong_folder(source: Path, wanted: str, drives: Iterable[Path], otherwise: s
     """
     found = list(drives)
     if not found:
-        return DatasetError(f"{source}: {wanted} is wanted; {otherwise}", field="source")
+        return DatasetError(f"{source}: expected {wanted}; {otherwise}", field="source")
     named = ", ".join(map(str, found[:MOST_NAMED]))
     more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
     choice = "give one of these" if len(found) > 1 else "give this one"
-    return DatasetError(f"{source}: {wanted} is wanted; {choice}: {named}{more}", field="source")
+    return DatasetError(f"{source}: expected {wanted}; {choice}: {named}{more}", field="source")

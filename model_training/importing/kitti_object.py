@@ -91,8 +91,8 @@ def import_kitti_object(
     names = sorted({p.stem for kind in _KINDS for p in (training / kind).glob("*") if p.suffix in _SUFFIXES})
     if not names:
         raise DatasetError(
-            f"{source} holds no frame of KITTI's object layout; name the folder with training/image_2 and "
-            "training/velodyne in it",
+            f"{source} has no frame of KITTI's object layout; give the folder that contains training/image_2 and "
+            "training/velodyne",
             field="source",
         )
     with whole_or_not_at_all(out) as part:
@@ -127,7 +127,7 @@ class _Importer:
         elif right is not None:
             self._skipped.append(f"{name}: no scan and no stored depth; --depth sgbm can use it")
         elif not has_scan:
-            self._skipped.append(f"{name}: neither a scan nor a right picture")
+            self._skipped.append(f"{name}: neither a scan nor a right image")
         if has_scan:
             copy_scan(scan, scan_path(self._out, len(self._places)))
             self._places.append(name)
@@ -173,7 +173,7 @@ class _Importer:
     def _add_query(self, name: str, right: Path, stored: Path, T_map_lidar: Transform | None) -> None:
         left = self._picture("image_2", name)
         if left is None:
-            raise damaged(self._training / "image_2" / f"{name}.png", "the left picture of this frame is missing")
+            raise damaged(self._training / "image_2" / f"{name}.png", "the left image of this frame is missing")
         rgb = read_rgb(left)
         calibration = read_calibration(self._training / "calib" / f"{name}.txt")
         is_stored = self._depth == "stored"
@@ -225,7 +225,7 @@ def _write_poses(path: Path, poses: list[Transform]) -> None:
 def _match(left: NDArray[np.uint8], right_path: Path, calibration: KittiCalibration) -> NDArray[np.uint16]:
     right = read_rgb(right_path)
     if right.shape != left.shape:
-        raise damaged(right_path, f"it is {right.shape[:2]}, and its left picture is {left.shape[:2]}")
+        raise damaged(right_path, f"its size is {right.shape[:2]}, but the left image has {left.shape[:2]}")
     assert calibration.focal_baseline_px_m is not None  # noqa: S101  # the object layout always names both cameras
     depth_m = depth_from_stereo(left, right, focal_baseline_px_m=calibration.focal_baseline_px_m)
     values = np.rint(depth_m / DEPTH_SCALE_M)

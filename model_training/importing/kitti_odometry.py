@@ -34,7 +34,12 @@ def open_kitti_odometry(source: Path, *, depth: KittiDepth, vertical_deg: float 
     scans = numbered(source / "velodyne", (".bin",))
     if not scans:
         sequences = below(source, "velodyne", _is_sequence) or above(source, _is_sequence)
-        raise wrong_folder(source, "a folder sequences/NN with velodyne/*.bin in it", sequences, "here is no scan")
+        raise wrong_folder(
+            source,
+            "the folder of one sequence, for example sequences/00 with velodyne/*.bin",
+            sequences,
+            "no scans found",
+        )
     eyes = next((pair for pair in _PAIRS if (source / f"image_{pair[0]}").is_dir()), _PAIRS[0])
     left, right = (numbered(source / f"image_{eye}", (".png", ".jpg")) for eye in eyes)
     stored = numbered(source / f"depth_{eyes[0]}", (".png",))
@@ -65,9 +70,9 @@ def _times(path: Path, last: int) -> list[float]:
     try:
         times = [float(line) for line in read_bytes(path).decode("ascii").split()]
     except ValueError as error:
-        raise DatasetError(f"{path}: not a number a line: {error}", field=path.name) from error
+        raise DatasetError(f"{path}: not one number per line: {error}", field=path.name) from error
     if len(times) <= last:
-        raise DatasetError(f"{path} has {len(times)} lines, and there is a frame {last:06d}", field=path.name)
+        raise DatasetError(f"{path} has {len(times)} lines, but there is a frame {last:06d}", field=path.name)
     return times
 
 

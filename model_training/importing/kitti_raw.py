@@ -69,7 +69,12 @@ def _drive(source: Path) -> Path:
     if len(drives) == 1 and drives[0].parent == source:
         return drives[0]
     drives = drives or above(source, lambda folder: (folder / "velodyne_points").is_dir())
-    raise wrong_folder(source, "the folder of one drive, with velodyne_points in it,", drives, "here: none")
+    raise wrong_folder(
+        source,
+        "the folder of one drive, for example 2011_09_26_drive_0005_sync with velodyne_points",
+        drives,
+        "no drives found",
+    )
 
 
 def _calibration(drive: Path, left: str, right: str) -> KittiCalibration:
@@ -90,8 +95,8 @@ def _calibration_file(drive: Path, name: str) -> Path:
     found = next((folder / name for folder in places if (folder / name).is_file()), None)
     if found is None:
         raise DatasetError(
-            f"{drive}: there is no {name}, neither in the drive's folder nor next to it; put the day's calibration there "
-            "(KITTI offers it as DATE_calib.zip)", field=name,
+            f"{drive}: {name} not found, neither in the folder of the drive nor next to it; put the "
+            "calibration of that day there (KITTI's DATE_calib.zip)", field=name,
         )  # fmt: skip
     return found
 

@@ -97,16 +97,19 @@ class KittiSequence:
         if self.depth == "sgbm":
             source["matching"] = StereoMatching().description()
         times = (
-            "scans are taken as compensated for the vehicle's motion"
+            "scans are assumed to be corrected for the vehicle's motion"
             if self.turn_s is None
-            else f"points' times by azimuth, {self.turn_s:.4f} s a turn"
+            else f"points' times by azimuth, {self.turn_s:.4f} s per turn"
         )
         turned = f"; points turned up by {self.vertical_deg:g} degrees" if self.vertical_deg else ""
-        counted = f"{len(self.frames)} moments: {scans} scans, {left} left and {right} right pictures"
+        counted = f"{len(self.frames)} moments: {scans} scans, {left} left and {right} right images"
         needed = {"stored": "stored", "sgbm": "right"}.get(self.depth)
         lacking = left > 0 and needed and not any(frame.left and getattr(frame, needed) for frame in self.frames)
-        what = "stored depth" if needed == "stored" else "a right picture"
-        hint = f"no picture has {what}, so no picture becomes a query: {self._depth_choices()}; --no-pictures leaves pictures out"
+        what = "stored depth" if needed == "stored" else "a right image"
+        hint = (
+            f"no image has {what}, so no image becomes a query: {self._depth_choices()}; --no-pictures imports no "
+            "images"
+        )
         return Notes((counted, times + turned), source, (hint,) if lacking else ())
 
     def _depth_choices(self) -> str:
@@ -115,7 +118,7 @@ class KittiSequence:
         stored = sum(frame.left is not None and frame.stored is not None for frame in self.frames)
         pairs = sum(frame.left is not None and frame.right is not None for frame in self.frames)
         scans = sum(frame.scan is not None for frame in self.frames)
-        pictures = f"of {left} picture{'s' * (left != 1)}"
+        pictures = f"of {left} image{'s' * (left != 1)}"
         choices = []
         if self.kind != "kitti-360":
             choices.append(f"stored ({stored} {pictures} {'has' if stored == 1 else 'have'} it)")
@@ -145,8 +148,8 @@ class KittiSequence:
         """
         if pictures and self.depth == "sgbm" and self.calibration.focal_baseline_px_m is None:
             raise DatasetError(
-                f"{self.path}: the calibration does not name the right camera (P3), so stereo has no baseline; "
-                "add it, or take --depth lidar",
+                f"{self.path}: the calibration has no right camera (P3), so stereo has no baseline; add it, or use "
+                "--depth lidar",
                 field="P3",
             )
         choices = self._depth_choices()
@@ -172,19 +175,19 @@ class KittiSequence:
             )  # fmt: skip
             if self.depth == "stored":
                 if frame.stored is None:
-                    return Unusable("picture", name, f"no stored depth beside it; {choices}")
+                    return Unusable("image", name, f"no stored depth beside it; {choices}")
                 return replace(picture, depth=read_stored_depth(frame.stored, rgb.shape[:2]))
             if self.depth == "sgbm":
                 if frame.right is None:
-                    return Unusable("picture", name, f"no right picture beside it; {choices}")
+                    return Unusable("image", name, f"no right image beside it; {choices}")
                 return self._matched(picture, read_rgb(frame.right))
             return picture
         except DatasetError as error:
-            return Unusable("picture", name, _without_names(error.message, (left, frame.right, frame.stored)))
+            return Unusable("image", name, _without_names(error.message, (left, frame.right, frame.stored)))
 
     def _matched(self, picture: RecordedPicture, right: NDArray[np.uint8]) -> RecordedPicture | Unusable:
         if right.shape != picture.rgb.shape:
-            return Unusable("picture", picture.name, "its right picture has another size")
+            return Unusable("image", picture.name, "its right image has another size")
         assert self.calibration.focal_baseline_px_m is not None  # noqa: S101  # ``events`` checked this
         depth_m: Float32[NDArray[np.float32], "H W"] = depth_from_stereo(
             picture.rgb, right, focal_baseline_px_m=self.calibration.focal_baseline_px_m

@@ -39,7 +39,8 @@ def stamps_of(path: Path, numbers: list[int]) -> dict[int, float] | None:
     lines = read_bytes(path).decode("ascii", errors="replace").rstrip().splitlines()
     if numbers and numbers[-1] >= len(lines):
         raise DatasetError(
-            f"{path} has {len(lines)} lines, and there is a frame {numbers[-1]:010d}; take the file from the recording again",
+            f"{path} has {len(lines)} lines, but there is a frame {numbers[-1]:010d}; copy the file from the "
+            "recording again",
             field=path.name,
         )
     stamps = {}
@@ -50,5 +51,5 @@ def stamps_of(path: Path, numbers: list[int]) -> dict[int, float] | None:
             moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
             stamps[number] = moment.timestamp() + float(f"0.{nanoseconds or 0}")
         except ValueError as error:
-            raise DatasetError(f"{path}, line {number + 1}: no time: {text[:40]!r}", field=path.name) from error
+            raise DatasetError(f"{path}, line {number + 1}: not a time: {text[:40]!r}", field=path.name) from error
     return stamps

@@ -18,6 +18,9 @@ from model_training.importing.trajectory import Trajectory
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import Transform
 
+#: Greatest time between colour and depth of a pair, seconds. One camera gives both nearly the same stamp. TUM's sequences have
+#: separate stamps.
+PAIR_TOLERANCE_S = 0.02
 Lens = Literal["pinhole", "fisheye"]
 Depth = UInt16[NDArray[np.uint16], "H W"] | Float32[NDArray[np.float32], "H W"]
 
@@ -74,7 +77,7 @@ class Unusable:
     """A frame that cannot be used.
 
     Attributes:
-        kind: such as ``scan`` or ``picture``.
+        kind: such as ``scan`` or ``image``.
         name: of the frame.
         why: the reason; the same text for all frames with that reason.
     """

@@ -13,7 +13,7 @@ from model_training.datasets.dataset import LidarSensor, read_tum
 from model_training.datasets.files import read_bytes
 from model_training.importing.depth_scan import scan_from_depth
 from model_training.importing.kitti_files import read_rgb
-from model_training.importing.recording import Event, Notes, RecordedPicture, Unusable
+from model_training.importing.recording import PAIR_TOLERANCE_S, Event, Notes, RecordedPicture, Unusable
 from model_training.importing.rectify import rectified
 from model_training.importing.trajectory import Trajectory
 from service.errors import DatasetError, StreetfixError
@@ -24,8 +24,6 @@ from service.imaging.picture_headers import ImageLimits
 
 #: Depth step, metres: TUM's files have 5000 steps per metre; Open3D's tools write millimetres.
 TUM_SCALE_M, OPEN3D_SCALE_M = 1 / 5000, 0.001
-#: Greatest time between colour and depth of a pair, seconds; TUM's sequences have separate stamps.
-PAIR_TOLERANCE_S = 0.02
 #: Frames per second of a folder without times.
 RATE_HZ = 30.0
 _AHEAD: Transform = transform_from(R_BODY_OPTICAL, np.zeros(3))
@@ -76,7 +74,9 @@ class RgbdFolder:
     @property
     def notes(self) -> Notes:
         """Number of frames."""
-        line = f"{len(self.frames)} RGB-D frames; scans are made of their depth, so the map sees only where the camera looked"
+        line = (
+            f"{len(self.frames)} RGB-D frames; scans come from their depth, so the map covers only what the camera saw"
+        )
         return Notes((line,), {"path": self.path.name})
 
     def count(self) -> int:
@@ -99,7 +99,7 @@ class RgbdFolder:
                 yield picture
                 continue
             scan = scan_from_depth(rectified(picture))
-            yield Unusable("scan", picture.name, "no depth in it") if scan is None else scan
+            yield Unusable("scan", picture.name, "the image has no depth") if scan is None else scan
             if pictures:
                 yield picture
 
@@ -115,12 +115,12 @@ class RgbdFolder:
                 if isinstance(error.__cause__ or error, FileNotFoundError)
                 else f"cannot be read ({type(error).__name__})"
             )
-            return Unusable("picture", frame.rgb.name, f"{file} {why}")
+            return Unusable("image", frame.rgb.name, f"{file} {why}")
         depth = np.asarray(values, np.uint16) if values.dtype == np.uint16 else np.asarray(values, np.float32)
         size = (self.camera.height, self.camera.width)
         if rgb.shape[:2] != size or depth.shape != size:
             return Unusable(
-                "picture", frame.rgb.name, f"sizes differ: colour {rgb.shape[:2]}, depth {depth.shape}, camera {size}"
+                "image", frame.rgb.name, f"sizes differ: colour {rgb.shape[:2]}, depth {depth.shape}, camera {size}"
             )
         return RecordedPicture(
             frame.rgb.name, frame.stamp_s, rgb, self.camera, _AHEAD, depth=depth, depth_scale_m=self.scale_m, file=frame.rgb
@@ -145,10 +145,12 @@ def open_tum_rgbd(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
         if abs(stamps[nearest] - stamp_s) <= PAIR_TOLERANCE_S:
             frames.append(RgbdFrame(stamp_s, path, depth[nearest][1]))
     if not frames:
-        raise DatasetError(f"{source}: no colour picture has a depth within {PAIR_TOLERANCE_S:g} s", field="depth.txt")
+        raise DatasetError(
+            f"{source}: no depth image within {PAIR_TOLERANCE_S:g} s of any colour image", field="depth.txt"
+        )
     if camera is None:
         raise DatasetError(
-            f"{source}: TUM's layout does not tell the camera; give --camera FILE with width, height, fx, fy, cx, cy",
+            f"{source}: TUM's layout has no camera parameters; give --camera FILE with width, height, fx, fy, cx, cy",
             field="camera",
         )
     truth = source / "groundtruth.txt"
@@ -176,7 +178,7 @@ def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
     )
     if not colour or len(colour) != len(depth):
         raise DatasetError(
-            f"{source}: as many pictures in color as in depth are wanted; there are {len(colour)} and {len(depth)}",
+            f"{source}: color and depth must have the same number of images; they have {len(colour)} and {len(depth)}",
             field="source",
         )
     intrinsics = next(
@@ -185,9 +187,7 @@ def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
     if camera is None and intrinsics is not None:
         camera = _open3d_camera(intrinsics)
     if camera is None:
-        raise DatasetError(
-            f"{source}: there is no camera_intrinsic.json; add it, or give --camera FILE", field="camera"
-        )
+        raise DatasetError(f"{source}: camera_intrinsic.json not found; add it, or give --camera FILE", field="camera")
     frames = tuple(RgbdFrame(k / RATE_HZ, a, b) for k, (a, b) in enumerate(zip(colour, depth, strict=True)))
     log = next((p for p in (source / "trajectory.log", source / "scene" / "trajectory.log") if p.is_file()), None)
     poses = None if log is None else _open3d_poses(log).moved_by(_AHEAD)
@@ -197,7 +197,7 @@ def open_open3d(source: Path, camera: PinholeCamera | None) -> RgbdFolder:
 def _listed(path: Path) -> list[tuple[float, Path]]:
     """Read times and files of one of TUM's lists."""
     if not path.is_file():
-        raise DatasetError(f"{path} is missing; TUM's layout has it beside the pictures", field=path.name)
+        raise DatasetError(f"{path} is missing; TUM's layout has it beside the images", field=path.name)
     found = []
     for number, line in enumerate(read_bytes(path).decode(errors="replace").splitlines(), 1):
         if not line.strip() or line.startswith("#"):
@@ -209,10 +209,10 @@ def _listed(path: Path) -> list[tuple[float, Path]]:
             raise DatasetError(f"{path}, line {number}: not `timestamp file`", field=path.name) from error
         named = (path.parent / name).resolve()
         if not named.is_relative_to(path.parent.resolve()):
-            raise DatasetError(f"{path}, line {number}: the file lies outside of the recording", field=path.name)
+            raise DatasetError(f"{path}, line {number}: the file is outside the recording", field=path.name)
         found.append((stamp_s, named))
     if not found:
-        raise DatasetError(f"{path} lists no picture", field=path.name)
+        raise DatasetError(f"{path} lists no image", field=path.name)
     return found
 
 
@@ -222,7 +222,7 @@ def _open3d_camera(path: Path) -> PinholeCamera:
         K = np.array(loaded["intrinsic_matrix"], np.float64).reshape(3, 3).T  # stored column by column
         return PinholeCamera(int(loaded["width"]), int(loaded["height"]), K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{path}: no camera of Open3D: {error}", field=path.name) from error
+        raise DatasetError(f"{path}: not a camera file of Open3D: {error}", field=path.name) from error
 
 
 def _open3d_poses(path: Path) -> Trajectory:
@@ -237,6 +237,8 @@ def _open3d_poses(path: Path) -> Trajectory:
             raise DatasetError(f"{path}, line {start + 1}: not a frame of five lines", field=path.name) from error
         R = T[:3, :3]
         if not (np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3)):
-            raise DatasetError(f"{path}, line {start + 1}: the frame's matrix is no pose", field=path.name)
+            raise DatasetError(
+                f"{path}, line {start + 1}: the matrix of the frame is not a valid pose", field=path.name
+            )
         poses.append(T)
     return Trajectory(np.array(stamps), np.array(poses).reshape(-1, 4, 4), str(path))

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from model_training.datasets.dataset import LidarSensor
-from model_training.importing.recording import Event, Notes, RecordedPicture, RecordedScan, Unusable
+from model_training.importing.recording import PAIR_TOLERANCE_S, Event, Notes, RecordedPicture, RecordedScan, Unusable
 from model_training.importing.ros_cloud import points_of_cloud
 from model_training.importing.ros_content import BagSettings, content_of
 from model_training.importing.ros_frames import stamp_of
@@ -15,8 +15,6 @@ from model_training.importing.ros_reader import Damage, opened
 from model_training.importing.ros_topics import ROLES
 from model_training.importing.trajectory import Trajectory
 
-#: Greatest time between depth and colour of a pair, seconds. One camera gives both nearly the same stamp.
-PAIR_TOLERANCE_S = 0.02
 _WITHOUT_DEPTH = f"no depth within {PAIR_TOLERANCE_S:g} s of it"
 
 
@@ -53,8 +51,8 @@ class RosBag:
         lines = (*topics.lines(), *self._content.remarks)
         lacking = self._settings.want_depth and topics.color is not None and topics.depth is None
         hint = (
-            "no topic of depth, so no picture becomes a query: give --depth lidar (depth from the scans), "
-            "--topic depth=NAME, or --no-pictures"
+            "no depth topic, so no image becomes a query: give --depth lidar (depth from the scans), --topic "
+            "depth=NAME, or --no-pictures"
         )
         source = {"path": self._path.name, "topics": names, "vehicle": self._content.vehicle}
         return Notes(lines, source, (hint,) if lacking else ())
@@ -79,7 +77,7 @@ class RosBag:
         with opened(self._path) as bag:
             for found in bag.messages(roles):
                 if isinstance(found, Damage):
-                    kind = "bag" if found.is_end else "scan" if roles[found.topic] == "scan" else "picture"
+                    kind = "bag" if found.is_end else "scan" if roles[found.topic] == "scan" else "image"
                     yield Unusable(kind, found.topic or self._path.name, found.why)
                     continue
                 role, stamp_s = roles[found.topic], stamp_of(found.content.header)
@@ -108,7 +106,7 @@ class RosBag:
     def _paired(self, found: Pair | Alone) -> Event:
         if isinstance(found, Pair):
             return self._picture(found)
-        return Unusable("picture", f"{found.role} at {found.stamp_s:.6f}", _WITHOUT_DEPTH)
+        return Unusable("image", f"{found.role} at {found.stamp_s:.6f}", _WITHOUT_DEPTH)
 
     def _picture(self, pair: Pair) -> Event:
         camera, topic = self._content.camera, self._content.topics.color
@@ -118,13 +116,13 @@ class RosBag:
         rgb = colour_of(pair.color)
         depth = None if pair.depth is None else depth_of(pair.depth)
         if isinstance(rgb, str):
-            return Unusable("picture", name, rgb)
+            return Unusable("image", name, rgb)
         if isinstance(depth, str):
-            return Unusable("picture", name, f"depth: {depth}")
+            return Unusable("image", name, f"depth: {depth}")
         size = (camera.pinhole.height, camera.pinhole.width)
         if rgb.shape[:2] != size or (depth is not None and depth.shape != size):
             have = f"colour {rgb.shape[:2]}" + ("" if depth is None else f", depth {depth.shape}")
-            return Unusable("picture", name, f"sizes differ: {have}, camera {size}; record depth aligned to colour")
+            return Unusable("image", name, f"sizes differ: {have}, camera {size}; record depth aligned to colour")
         return RecordedPicture(
             name, pair.stamp_s, rgb, camera.pinhole, camera.T_vehicle_camera, depth=depth, lens=camera.lens
         )

@@ -63,9 +63,11 @@ def _rows(message: Any, used: Sequence[Any]) -> NDArray[Any] | str:
     step, row_step = int(message.point_step), int(message.row_step)
     ends = [field.offset + int(_TYPES[field.datatype][1]) * max(1, field.count) for field in used]
     if step < max(ends) or row_step < step * message.width:
-        return f"its point_step of {step} bytes does not hold its fields, or its row_step not its points"
+        return (
+            f"its point_step of {step} bytes is too small for its fields, or its row_step is too small for its points"
+        )
     if len(message.data) < row_step * message.height:
-        return "its data are fewer bytes than its row_step and height say: truncated"
+        return "its data have fewer bytes than row_step times height: truncated"
     dtype = np.dtype(
         {
             "names": [field.name for field in used],

@@ -136,7 +136,7 @@ def _poses(bag: BagReader, topics: Topics, remarks: list[str]) -> tuple[FrameTre
                 stamps.append(stamp_s)
                 poses.append(T)
     if left_out:
-        remarks.append(f"poses: {left_out} left out, which are no numbers or not later than the one before")
+        remarks.append(f"poses: {left_out} left out: not finite, or not later than the pose before")
     if topic is None or topic.msgtype == _TF:
         return tree, None, ""
     return (
@@ -182,8 +182,8 @@ def _camera(
         return None
     if topics.info is None and settings.camera is None:
         raise DatasetError(
-            f"{bag.name}: {topics.color.name} has no sensor_msgs/CameraInfo, so its pictures cannot be used; give the camera with "
-            "--camera FILE, name its topic with --topic info=..., or take --no-pictures",
+            f"{bag.name}: {topics.color.name} has no sensor_msgs/CameraInfo, so its images cannot be used; give the "
+            "camera with --camera FILE, give its topic with --topic info=..., or pass --no-pictures",
             field="info",
         )
     lens: Lens = "pinhole"
@@ -211,7 +211,8 @@ def _mounting(name: str, tree: FrameTree, target: str, source: str, key: str) ->
     found = tree.fixed(target, source)
     if found is None:
         raise DatasetError(
-            f"{name}: /tf_static has no way from {target!r} to {source!r}; give {key} in a JSON file with --extrinsics FILE",
+            f"{name}: /tf_static has no transform from {target!r} to {source!r}; give {key} in a JSON file with "
+            "--extrinsics FILE",
             field=key,
         )
     return found

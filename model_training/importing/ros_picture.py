@@ -104,7 +104,7 @@ def camera_of(message: Any, *, is_rectified: bool) -> tuple[PinholeCamera, Lens]
     lens: Lens = "fisheye" if model in _FISHEYE_MODELS else "pinhole"
     if distortion and (len(distortion) not in _COEFFICIENTS[lens] or not np.isfinite(distortion).all()):
         wanted = " or ".join(str(n) for n in _COEFFICIENTS[lens])
-        return f"distortion_model {model!r} has {len(distortion)} coefficients; {wanted} finite ones are wanted"
+        return f"distortion_model {model!r} has {len(distortion)} coefficients; expected {wanted} finite ones"
     camera = PinholeCamera(
         int(message.width), int(message.height), float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]),
         distortion,
@@ -117,9 +117,9 @@ def _pixels(message: Any, dtype: str, channels: int) -> NDArray[Any] | str:
     height, width, step = int(message.height), int(message.width), int(message.step)
     size = np.dtype(dtype).itemsize
     if height < 1 or width < 1 or height * width > _LIMITS.max_pixels:
-        return f"its size of {width}x{height} pixels is none, or over the limit"
+        return f"its size of {width}x{height} pixels is 0, or over the limit"
     if step < width * channels * size or len(message.data) < step * height:
-        return f"its data are too few bytes for {width}x{height} {message.encoding}: truncated"
+        return f"its data have too few bytes for {width}x{height} {message.encoding}: truncated"
     order = ">" if message.is_bigendian else "<"
     rows: NDArray[Any] = np.ndarray(
         (height, width, channels), np.dtype(order + dtype), np.ascontiguousarray(message.data).data,

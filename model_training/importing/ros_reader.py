@@ -10,8 +10,8 @@ from model_training.importing.ros_topics import Topic
 from service.errors import DatasetError
 
 _MEND = (
-    "if it was cut off, mend it with `rosbag reindex` (.bag), `mcap recover` (.mcap) or `sqlite3 FILE .recover` (.db3), "
-    "then `ros2 bag reindex` its folder"
+    "if it is truncated, repair it with `rosbag reindex` (.bag), `mcap recover` (.mcap) or `sqlite3 FILE .recover` "
+    "(.db3), then `ros2 bag reindex` its folder"
 )
 
 
@@ -79,12 +79,13 @@ class BagReader:
             except StopIteration:
                 return
             except Exception as error:
-                yield Damage("", f"it cannot be read on from here ({_told(error)}); {_MEND}", is_end=True)
+                yield Damage("", f"reading stopped here ({_told(error)}); {_MEND}", is_end=True)
                 return
             try:
                 content = self.reader.deserialize(data, connection.msgtype)
             except Exception as error:
-                yield Damage(connection.topic, f"its bytes are no {connection.msgtype} ({type(error).__name__})", is_end=False)  # fmt: skip
+                why = f"its bytes are not a valid {connection.msgtype} ({type(error).__name__})"
+                yield Damage(connection.topic, why, is_end=False)
                 continue
             yield Message(connection.topic, connection.msgtype, content)
 
@@ -101,7 +102,7 @@ class BagReader:
         for found in self.messages([topic]):
             if isinstance(found, Message):
                 return found.content
-            why = f"has no message that can be read: {found.why}"
+            why = f"has no readable message: {found.why}"
         raise DatasetError(f"{self.name}: topic {topic} {why}", field="topic")
 
 
@@ -124,7 +125,7 @@ def opened(path: Path) -> Iterator[BagReader]:
         reader.open()
     except Exception as error:  # as above: no common base class
         raise DatasetError(
-            f"{path}: it cannot be opened as a ROS bag ({_told(error)}); {_MEND}", field="source"
+            f"{path}: cannot be opened as a ROS bag ({_told(error)}); {_MEND}", field="source"
         ) from error
     try:
         yield BagReader(path.name, reader)

@@ -83,14 +83,15 @@ def topics_of(available: list[Topic], told: Mapping[str, str], *, source: str) -
     by_name = {topic.name: topic for topic in available}
     for role, name in told.items():
         if role not in ROLES:
-            raise DatasetError(f"topic: {role!r} is no role; there are: {', '.join(ROLES)}", field="topic")
+            raise DatasetError(f"topic: {role!r} is not a valid role; choose one of: {', '.join(ROLES)}", field="topic")
         if name not in by_name:
             raise DatasetError(
                 f"{source} has no topic {name!r}; it has: {', '.join(sorted(by_name)) or 'none'}", field="topic"
             )
         if by_name[name].msgtype not in _TYPES[role]:
             raise DatasetError(
-                f"topic {name!r} is {by_name[name].msgtype}; for {role} one is wanted of: {', '.join(_TYPES[role])}",
+                f"topic {name!r} is {by_name[name].msgtype}; for {role} the type must be one of: "
+                f"{', '.join(_TYPES[role])}",
                 field="topic",
             )
     chosen = {role: by_name[name] for role, name in told.items()}

@@ -26,7 +26,7 @@ def read_scan(path: Path, *, max_points: int = 5_000_000) -> Float32[NDArray[np.
     if size == 0:
         return "the file is empty"
     if size % ROW_BYTES:
-        return "its bytes are no rows of four float32: truncated"
+        return "its size is not a multiple of 16 bytes (rows of four float32): truncated"
     if size > max_points * ROW_BYTES:
         return f"more than {max_points} points"
     return read_rows(path, size)

@@ -65,13 +65,16 @@ class TakeSettings:
             DatasetError: a setting is invalid; the error names it.
         """
         if self.hold_out == 1 or self.hold_out < 0:
-            raise DatasetError("hold_out: 1 would leave no survey; give 0, or 2 and more", field="hold_out")
+            raise DatasetError("hold_out: 1 would leave no survey; give 0, or 2 or more", field="hold_out")
         if self.hold_out_first is not None and not 0 <= self.hold_out_first < self.hold_out:
             raise DatasetError(
-                f"hold_out_first: {self.hold_out_first} is none of 0 to {self.hold_out - 1}", field="hold_out_first"
+                f"hold_out_first: {self.hold_out_first} is not valid; it must be 0 to {self.hold_out - 1}",
+                field="hold_out_first",
             )
         if not 0 <= self.tolerance_s < np.inf:
-            raise DatasetError(f"tolerance_s: {self.tolerance_s:g} is no time; give seconds", field="tolerance_s")
+            raise DatasetError(
+                f"tolerance_s: {self.tolerance_s:g} is not valid; it must be seconds, 0 or more", field="tolerance_s"
+            )
 
     def holds_out(self, number: int) -> bool:
         """Check whether a usable scan is left out of the survey.
@@ -195,10 +198,10 @@ class _Taking:
         self._answer_waiting(until_s=np.inf)
         recording, settings = self._recording, self._settings
         if not self._survey.count:
-            why = "; ".join(self.dropped.lines()) or "there is none"
+            why = "; ".join(self.dropped.lines()) or "the recording has none"
             where = recording.notes.source.get("path", recording.kind)
             raise DatasetError(
-                f"{where}: no scan can be used ({why}); mend the first reason, or name other poses", field="scans"
+                f"{where}: no scan is usable ({why}); correct the first reason, or give other poses", field="scans"
             )
         self._survey.finish()
         cameras = self._queries.finish()
@@ -226,7 +229,7 @@ class _Taking:
         if len(scan.points) > self._settings.max_points:
             return f"more than {self._settings.max_points} points"
         if not scan.stamp_s > self._last_scan_s:  # true for NaN too
-            return "its time is not after the scan's before it"
+            return "its time is not later than that of the scan before"
         return None
 
     def _needs_scans(self) -> bool:
@@ -240,13 +243,13 @@ class _Taking:
     def _answer(self, picture: RecordedPicture) -> None:
         """Add an image with its nearest scan, or count why not."""
         if not self._recent:
-            self.dropped.add("picture", picture.name, "no scan near it in time")
+            self.dropped.add("image", picture.name, "no scan near it in time")
             return
         stamp_s, is_held, points = min(self._recent, key=lambda scan: abs(scan[0] - picture.stamp_s))
         if self._settings.depth == "lidar" and abs(stamp_s - picture.stamp_s) > self._settings.tolerance_s:
-            self.dropped.add("picture", picture.name, f"no scan within {self._settings.tolerance_s:g} s")
+            self.dropped.add("image", picture.name, f"no scan within {self._settings.tolerance_s:g} s")
         elif self._settings.hold_out and not is_held:
-            self.dropped.add("picture", picture.name, "the scan nearest to it is in the survey (--hold-out)")
+            self.dropped.add("image", picture.name, "the scan nearest to it is in the survey (--hold-out)")
         else:
             self._query(picture, (stamp_s, points))
 
@@ -255,18 +258,16 @@ class _Taking:
             picture.stamp_s, sync=self._settings.sync, tolerance_s=self._settings.tolerance_s
         )
         if isinstance(T_map_vehicle, str):
-            self.dropped.add("picture", picture.name, T_map_vehicle)
+            self.dropped.add("image", picture.name, T_map_vehicle)
             return
         pinhole = rectified(picture)
         if self._settings.depth == "lidar" and scan is not None:
             pinhole = replace(pinhole, depth=self._lidar_depth(pinhole, *scan))
         if pinhole.depth is None:
-            self.dropped.add(
-                "picture", picture.name, "no depth in the recording; --depth lidar takes it from the scans"
-            )
+            self.dropped.add("image", picture.name, "no depth in the recording; --depth lidar takes it from the scans")
             return
         if why := self._queries.add(pinhole, T_map_vehicle @ picture.T_vehicle_camera):
-            self.dropped.add("picture", picture.name, why)
+            self.dropped.add("image", picture.name, why)
 
     def _lidar_depth(
         self, picture: RecordedPicture, stamp_s: float, points: NDArray[np.float32]

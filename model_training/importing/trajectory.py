@@ -40,19 +40,19 @@ class Trajectory:
             DatasetError: there are no poses, one is not finite, or the times do not rise.
         """
         if not len(self.stamps_s):
-            raise DatasetError(f"{self.name}: there is no pose in it; name another source of poses", field="poses")
+            raise DatasetError(f"{self.name}: the file has no pose; give another source of poses", field="poses")
         finite = np.isfinite(self.stamps_s) & np.isfinite(self.T_map_vehicle).all(axis=(1, 2))
         if not finite.all():
             raise DatasetError(
-                f"{self.name}, pose {int(np.argmin(finite)) + 1}: a number in it is not finite; leave it out",
+                f"{self.name}, pose {int(np.argmin(finite)) + 1}: a value is not finite; remove the pose",
                 field="poses",
             )
         late = np.flatnonzero(np.diff(self.stamps_s) <= 0)
         if len(late):
             k = int(late[0]) + 1
             raise DatasetError(
-                f"{self.name}, pose {k + 1}: its time {self.stamps_s[k]:.6f} s is not after the {self.stamps_s[k - 1]:.6f} s before it; "
-                "sort the poses by time and drop doubled ones",
+                f"{self.name}, pose {k + 1}: its time {self.stamps_s[k]:.6f} s is not after the "
+                f"{self.stamps_s[k - 1]:.6f} s before it; sort the poses by time and remove duplicates",
                 field="poses",
             )
 
@@ -76,7 +76,7 @@ class Trajectory:
                 return f"no pose within {tolerance_s:g} s"
             return np.asarray(self.T_map_vehicle[around[int(np.argmin(away))]])
         if len(around) == 1:
-            return "it lies before the first pose" if after == 0 else "it lies after the last pose"
+            return "before the first pose" if after == 0 else "after the last pose"
         if away.max() > tolerance_s + _SLACK_S:
             return f"no poses within {tolerance_s:g} s before and after"
         return np.asarray(self.between(np.array([stamp_s]))[0])

@@ -58,7 +58,10 @@ class QueryWriter:
             return f"sizes differ: colour {picture.rgb.shape[:2]}, depth {depth}, camera {size}"
         values, scale_m = whole_steps(picture.depth, picture.depth_scale_m)
         if picture.depth.dtype != np.uint16 and unit_factor(picture.depth) == MILLIMETRE_FACTOR:
-            return "its floating-point depth looks like millimetres, and metres are wanted: divide it by 1000, or record 16-bit integers"
+            return (
+                "its floating-point depth looks like millimetres, but metres are expected: divide it by 1000, or "
+                "record 16-bit integers"
+            )
         if not values.any():
             return "its depth is empty"
         number = f"{self.count:06d}"

@@ -57,7 +57,7 @@ def payloads(
     if not names or queries not in (None, *dataset.query_sets()):
         there = ", ".join(dataset.query_sets()) or "none"
         raise DatasetError(
-            f"{dataset.folder}: there is no query set {queries or 'at all'}; it has {there}", field="queries"
+            f"{dataset.folder}: query set {queries or '(any)'} not found; the dataset has: {there}", field="queries"
         )
     frames = list(dataset.queries(queries or names[0]))
     if not frames:
@@ -95,7 +95,8 @@ def _as_raw16(depth: bytes, frame: QueryFrame) -> bytes:
     values = read_depth_values(depth, encoding=None, limits=DEFAULT_LIMITS)
     if values.dtype != np.uint16:
         raise DatasetError(
-            f"{frame.depth_path}: raw16 holds 16-bit values, these are {values.dtype}; send depth as it is",
+            f"{frame.depth_path}: raw16 needs 16-bit values, but these are {values.dtype}; send the depth file "
+            "unchanged",
             field="cheap_depth",
         )
     return write_raw16(values, "lz4")

@@ -27,7 +27,7 @@ def draw(found: list[Summary], path: Path) -> None:
     offered = [each.offered_per_s for each in runs]
     below.plot(offered, [each.answered_per_s for each in runs], "o-", label="answered")
     below.plot(offered, offered, ":", color="gray", label="offered")
-    below.set_xlabel("requests offered a second")
+    below.set_xlabel("requests sent per second")
     below.set_ylabel("answered/s")
     below.grid(visible=True, alpha=0.3)
     below.legend()

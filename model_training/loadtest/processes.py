@@ -74,7 +74,9 @@ def _anonymous_mib(pid: int) -> float:
 
 def _tree(table: dict[int, tuple[int, float, int]], pid: int) -> set[int]:
     if pid not in table:
-        raise RequestError(f"--pid {pid}: there is no such process here; give the service's own", field="pid")
+        raise RequestError(
+            f"--pid {pid}: process not found on this machine; give the process id of the service", field="pid"
+        )
     tree, grew = {pid}, True
     while grew:
         children = {child for child, (parent, _, _) in table.items() if parent in tree} - tree

@@ -10,9 +10,8 @@ from model_training.loadtest.drive import Load, Shot
 from model_training.loadtest.payloads import Payload
 from model_training.loadtest.processes import Usage
 from model_training.loadtest.targets import Reply
-
-RIGHT_M = 1.0
-_SAME_M = 1e-6
+from service.geometry.rigid import SAME_M
+from service.maps.calibration import RIGHT_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -104,7 +103,7 @@ def _same(one: Reply, other: Reply) -> bool:
     if one.status != other.status:
         return False
     pairs = ((one.position_m, other.position_m), (one.spread_mean_m, other.spread_mean_m))
-    return all(a is None or b is None or bool(np.linalg.norm(np.subtract(a, b)) <= _SAME_M) for a, b in pairs)
+    return all(a is None or b is None or bool(np.linalg.norm(np.subtract(a, b)) <= SAME_M) for a, b in pairs)
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float]:

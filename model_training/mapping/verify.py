@@ -54,11 +54,11 @@ def damage_of(path: Path, *, report: Report = lambda *_: None) -> list[str]:
 def _damage_of_file(folder: Path, name: str, entry: FileEntry) -> str:
     file = folder / name
     if not file.is_file() or not file.resolve().is_relative_to(folder.resolve()):
-        return "the file is missing, or is outside the bundle"
+        return "missing, or outside the bundle"
     size = file.stat().st_size
     if size != entry.size:
-        return f"the file has {size} bytes instead of {entry.size}"
-    return "" if sha256_of(file) == entry.sha256 else "its hash differs from the manifest"
+        return f"{size} bytes instead of {entry.size}"
+    return "" if sha256_of(file) == entry.sha256 else "the hash does not match the manifest"
 
 
 def _contradictions(bundle: MapBundle) -> Iterator[str]:

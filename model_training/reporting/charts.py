@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from model_training.evaluation.error_measures import wilson_interval
 from model_training.evaluation.failures import position_errors
-from model_training.evaluation.measures import RIGHT_M, recall_at
+from model_training.evaluation.measures import recall_at
 from model_training.evaluation.predict import RANKED, Predictions, joined
 from model_training.reporting.chart import SERIES, chart, shares_up
+from service.maps.calibration import RIGHT_M
 
 #: Ends of the axis of distances, and the distances with a number, metres.
 _NEAR_M, _FAR_M = 0.01, 300.0
@@ -102,7 +103,7 @@ def recall_curves(runs: Mapping[str, Predictions]) -> str:
     def draw(axes: Axes) -> None:
         for name, recall in recalls.items():
             axes.plot(k, recall, label=name, clip_on=False)
-        axes.set(xlim=(1, RANKED), xticks=k, xlabel="most similar places that are looked at")
+        axes.set(xlim=(1, RANKED), xticks=k, xlabel="number of most similar places")
         shares_up(axes, "share of queries, %")
 
     return chart("Recall at 5 m", told, draw, legend=len(runs) > 1)

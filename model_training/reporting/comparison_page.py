@@ -42,10 +42,10 @@ def write_comparison_page(
     """
     sections = [
         Section("shares", "Shares", _shares(found)),
-        Section("errors", "How far off", _errors(found)),
+        Section("errors", "Errors", _errors(found)),
         Section("curves", "Curves", f'<div class="pair">{_curves(found)}</div>'),
         Section("lost", f"Lost: {len(found.lost)}", _changed(found.lost, first, found, dataset, plan)),
-        Section("won", f"Won: {len(found.gained)}", _changed(found.gained, first, found, dataset, plan, has_plan=bool(found.lost))),
+        Section("gained", f"Gained: {len(found.gained)}", _changed(found.gained, first, found, dataset, plan, has_plan=bool(found.lost))),
     ]  # fmt: skip
     title = f"{first.settings.dataset.name}: A against B"
     path = folder / PAGE
@@ -63,7 +63,7 @@ def _curves(found: Comparison) -> str:
 
 def _lead(first: SavedRun, second: SavedRun, found: Comparison) -> str:
     lines = "".join(f"<br>{name}: {escape(_run(run))}" for name, run in (("A", first), ("B", second)))
-    asked = f"{len(found.first.T_true)} queries, asked of both."
+    asked = f"{len(found.first.T_true)} queries, sent to both."
     return f'<p class="verdict">{escape(found.verdict)}</p><p class="soft">{asked}{lines}</p>'
 
 
@@ -94,8 +94,9 @@ HEAD = ("", "A", "B", "B - A", "95 % interval", "only A", "only B", "p")
 
 def _shares(found: Comparison) -> str:
     whole = table(
-        "Paired differences in points over all queries: Newcombe's interval (method 10), McNemar's exact p. "
-        "Forced: whatever the status. Of so many measures some part by chance: one in twenty has p below 0.05 where nothing differs.",
+        "Paired differences in percentage points over all queries: Newcombe's interval (method 10), McNemar's exact "
+        "p. Forced: whatever the status. With many measures some differ by chance: without any true difference, one "
+        "in twenty has p below 0.05.",
         HEAD, [row_of(escape(LABELS[name]), each) for name, each in found.shares.items()],
     )  # fmt: skip
     if len(found.sets) == 1:
@@ -150,11 +151,14 @@ def _changed(
             for k, run in enumerate(("A", "B"))
         )
         shown.append(Shown(name, number, row, f"<p>{told.removeprefix('<br>')}</p>"))
-    more = f"<p>The {_SHOWN} that changed most are shown.</p>" if len(rows) > _SHOWN else ""
+    more = f"<p>The page shows the {_SHOWN} queries that changed most.</p>" if len(rows) > _SHOWN else ""
     legend = (
         ""
         if plan is None
-        else "<p>Circle: the truth. Red cross: A's answer. Blue cross: B's. Dots: places and poses that A looked at.</p>"
+        else (
+            "<p>Circle: the true position. Red cross: the answer of A. Blue cross: the answer of B. Dots: candidate "
+            "places and poses of A.</p>"
+        )
     )
     return more + legend + gallery(shown, found.first, dataset, plan, other=found.second, has_plan=has_plan)
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from service.imaging.view_grid import MAX_RANGE_M
+
 #: Width of the images that stand side by side, pixels.
 WIDTH = 320
 _JPEG, _WEBP = [cv2.IMWRITE_JPEG_QUALITY, 72], [cv2.IMWRITE_WEBP_QUALITY, 80]
-#: Depth with the darkest colour, metres. The view grid discards ranges beyond it.
-FARTHEST_M = 40.0
 
 
 def colour_uri(rgb: NDArray[np.uint8], *, width: int = WIDTH) -> str:
@@ -35,7 +35,7 @@ def depth_uri(depth_m: NDArray[np.float32], *, width: int = WIDTH) -> str:
 
 
 def depth_bgr(depth_m: NDArray[np.float32], *, width: int) -> NDArray[np.uint8]:
-    """Colour a depth image by the logarithm of depth; return BGR (h, width, 3).
+    """Colour a depth image by the logarithm of depth; return BGR (h, width, 3). ``MAX_RANGE_M`` has the darkest colour.
 
     Args:
         depth_m: depth (H, W), metres.
@@ -45,7 +45,7 @@ def depth_bgr(depth_m: NDArray[np.float32], *, width: int) -> NDArray[np.uint8]:
         depth_m, (width, round(depth_m.shape[0] * width / depth_m.shape[1])), interpolation=cv2.INTER_NEAREST
     )
     measured = np.isfinite(small) & (small > 0)
-    near = 1 - np.log(np.clip(np.where(measured, small, 1.0), 1.0, FARTHEST_M)) / np.log(FARTHEST_M)
+    near = 1 - np.log(np.clip(np.where(measured, small, 1.0), 1.0, MAX_RANGE_M)) / np.log(MAX_RANGE_M)
     picture = np.asarray(cv2.applyColorMap((30 + 225 * near).astype(np.uint8), cv2.COLORMAP_VIRIDIS), np.uint8)
     picture[~measured] = (128, 128, 128)
     return picture

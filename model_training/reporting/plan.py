@@ -12,7 +12,7 @@ from model_training.reporting.pictures import grey_webp_uri
 from service.maps.reader import MapBundle
 
 #: Classes of error: upper limit in metres, style class, and text of the legend.
-ERRORS = ((0.5, "e0", "up to 0.5 m"), (1.0, "e1", "up to 1 m"), (5.0, "e2", "up to 5 m"), (np.inf, "e3", "farther off"))
+ERRORS = ((0.5, "e0", "up to 0.5 m"), (1.0, "e1", "up to 1 m"), (5.0, "e2", "up to 5 m"), (np.inf, "e3", "over 5 m"))
 _LONGEST_PX = 1400
 _MARGIN_M = 8.0
 #: Surfels are walls if the vertical part of their normal is smaller.
@@ -119,9 +119,7 @@ class Plan:
             parts.append(_cross(answers_xy[k, 0], -answers_xy[k, 1], side / 28, f"answer{k}"))
         parts.append(f'<circle class="truth" cx="{true_xy[0]:.2f}" cy="{-true_xy[1]:.2f}" r="{side / 28:.2f}"/>')
         told = f"{side * 4 / 3:.0f} m across"
-        return _drawing(
-            "Where the query was taken and where it was put", told, "".join(parts), view=view, kind="small-plan"
-        )
+        return _drawing("True and estimated position of the query", told, "".join(parts), view=view, kind="small-plan")
 
     def _image(self) -> str:
         return f'<image id="{_GROUND_ID}" href="{self.picture}" {_box(self.view)}/>'

@@ -110,6 +110,6 @@ def _pictures(each: Shown, dataset: Dataset, frames: dict[str, list[QueryFrame]]
         frames[each.query_set] = list(dataset.queries(each.query_set))
     frame = frames[each.query_set][each.number]
     return (
-        f'<img src="{colour_uri(frame.rgb())}" alt="Colour picture of {name}"><img src="{depth_uri(frame.depth_m())}" '
-        f'alt="Depth picture of {name}: near is yellow, far is dark, grey is not measured">'
+        f'<img src="{colour_uri(frame.rgb())}" alt="Colour image of {name}"><img src="{depth_uri(frame.depth_m())}" '
+        f'alt="Depth image of {name}: near is yellow, far is dark, grey is not measured">'
     )

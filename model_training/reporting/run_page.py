@@ -49,13 +49,13 @@ def write_run_page(run: SavedRun, bundle: MapBundle, dataset: Dataset, figures: 
     plan = Plan.of(bundle)
     sections = [
         Section("figures", "Figures", _figures(figures)),
-        Section("errors", "How far off", _errors(run.predictions, everything)),
+        Section("errors", "Errors", _errors(run.predictions, everything)),
         Section("search", "Search and confidence", _search(run.predictions, everything)),
         Section("map", "The map, coloured by error", _map(plan, everything)),
-        Section("lost", "What was lost where", _lost(everything)),
+        Section("lost", "Losses by stage", _lost(everything)),
     ]
     if len(run.predictions) > 1:
-        sections.insert(1, Section("conditions", "Conditions side by side", _conditions(run, figures)))
+        sections.insert(1, Section("conditions", "Conditions", _conditions(run, figures)))
     if figures.get("confusion"):
         sections.append(Section("streets", "Streets", _confusion(figures["confusion"])))
     sections.append(Section("worst", "The worst queries", _worst(run.predictions, everything, dataset, plan)))
@@ -91,7 +91,10 @@ def _figures(figures: dict[str, Any]) -> str:
     ]
     head = ["", *(f'{escape(name)}<span class="ci">{values["queries"]} queries, {escape(values["split"].replace("_", " "))}</span>'
                   for name, values in columns.items())]  # fmt: skip
-    caption = "Shares are over all queries, an unanswered one being wrong, with 95 % intervals; distances are over accepted answers."
+    caption = (
+        "Shares are over all queries, with 95 % intervals; a query without an answer counts as wrong. Distances are "
+        "over accepted answers."
+    )
     return table(caption, head, rows)
 
 
@@ -129,7 +132,8 @@ def _errors(runs: dict[str, Predictions], everything: Predictions) -> str:
         error_curve(series_of(runs)), "Share of all queries whose answer, accepted or not, lies within a distance."
     )
     bars = figure(
-        error_histogram(everything), "Answers by their distance from the truth; the last bar holds all beyond."
+        error_histogram(everything),
+        "Answers by their distance from the truth; the last bar counts all larger distances.",
     )
     return _pair([curve, bars])
 
@@ -148,14 +152,14 @@ def _search(runs: dict[str, Predictions], everything: Predictions) -> str:
     drawn = reliability(everything)
     if drawn is not None:
         words = (
-            "How often answers of a confidence are within 1 m, with 95 % intervals; on the dashed line it is what it says. "
-            f"Expected calibration error {drawn[1]:.3f}."
+            "Share of answers within 1 m by confidence, with 95 % intervals. On the dashed line the confidence equals "
+            f"the share. Expected calibration error {drawn[1]:.3f}."
         )
         parts.append(figure(drawn[0], words))
     note = (
         ""
         if drawn is not None
-        else "<p>Answers of this run carry no confidence: the map is not calibrated, or nothing was registered.</p>"
+        else "<p>Answers of this run have no confidence: the map is not calibrated, or nothing was registered.</p>"
     )
     return _pair(parts) + note
 
@@ -163,8 +167,8 @@ def _search(runs: dict[str, Predictions], everything: Predictions) -> str:
 def _map(plan: Plan, everything: Predictions) -> str:
     legend = "".join(f'<li><i class="key {name}"></i>{label}</li>' for _, name, label in ERRORS)
     words = (
-        "Walls from above, each query where it was taken. Crosses are farther off than 5 m or have no answer; "
-        "dashed lines lead to where they were put."
+        "Walls from above, each query at its true position. Crosses are more than 5 m off or have no answer; dashed "
+        "lines lead to the estimated positions."
     )
     return figure(plan.whole(everything) + f'<ul class="legend">{legend}</ul>', words)
 
@@ -177,9 +181,7 @@ def _lost(everything: Predictions) -> str:
         for stage in Stage
         if counts[stage]
     ]
-    return table(
-        "Every query counts once.", ["what became of it", "queries", "share", "that is"], rows, kind="last-told"
-    )
+    return table("Every query counts once.", ["outcome", "queries", "share", "meaning"], rows, kind="last-told")
 
 
 def _confusion(confusion: dict[str, Any]) -> str:
@@ -195,8 +197,8 @@ def _confusion(confusion: dict[str, Any]) -> str:
         )  # fmt: skip
         body.append(f'<tr><th scope="row">{escape(name)} ({number + 1})</th>{cells}</tr>')
     return (
-        '<div class="scroll"><table class="confusion"><caption>True streets down, answered ones across, by number; the last column is '
-        "no street, or an answer that was not accepted. Streets without queries are left out.</caption>"
+        '<div class="scroll"><table class="confusion"><caption>Rows are true streets, columns are answered streets, by number. The last '
+        "column counts answers without a street, and answers that were not accepted. Streets without queries are left out.</caption>"
         f'<thead><tr><th class="text">true street</th>{head}<th scope="col">none</th></tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
@@ -209,7 +211,7 @@ def _worst(runs: dict[str, Predictions], everything: Predictions, dataset: Datas
         for name, number, row in locate(worst(everything, WORST), runs)
     ]
     words = (
-        "<p>Wrong answers that were accepted come first, since they do harm; then the others by distance. "
-        "On the little maps the circle is the truth, the cross the answer, dots are places and poses that were looked at.</p>"
+        "<p>Accepted wrong answers come first, then the others by distance. On the small maps the circle is the true "
+        "position, the cross is the answer, and dots are candidate places and poses.</p>"
     )
     return words + gallery(shown, everything, dataset, plan, has_plan=True)

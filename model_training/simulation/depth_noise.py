@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model_training.simulation.conditions import Condition
+from service.registration.points import FOCAL_BASELINE_PX_M
 
 Depth = NDArray[np.float32]
 
@@ -40,7 +41,7 @@ class DepthModel:
     """
 
     name: str
-    focal_baseline_px_m: float = 80.0
+    focal_baseline_px_m: float = FOCAL_BASELINE_PX_M
     noise_px: float = 0.1
     correlated: float = 0.5
     step_px: float = 1 / 16

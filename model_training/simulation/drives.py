@@ -54,9 +54,7 @@ def driven(city: City, plan: SimulationPlan, step_m: float) -> list[Station]:
     known = [street.street for street in city.streets]
     for wanted in plan.streets:
         if wanted not in known:
-            raise DatasetError(
-                f"streets: there is no street {wanted!r} here; there are: {', '.join(known)}", field="streets"
-            )
+            raise DatasetError(f"streets: unknown street {wanted!r}; choose from: {', '.join(known)}", field="streets")
     wanted_streets = [street for street in city.streets if not plan.streets or street.street in plan.streets]
     return stations_along(wanted_streets, step_m)
 

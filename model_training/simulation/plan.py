@@ -103,7 +103,7 @@ class QueryPlan(_Model):
     turn_deg: float = Field(0.0, ge=-180, le=180)
     pitch_deg: float = Field(0.0, ge=-45, le=45)
     blocked: float = Field(0.0, ge=0, le=0.9)
-    followed: float | None = Field(None, ge=0, le=1, description="share of pictures with a vehicle driving ahead")
+    followed: float | None = Field(None, ge=0, le=1, description="share of images with a vehicle driving ahead")
     max_depth_m: float | None = Field(None, ge=1)
     depth_parameters: DepthParameters = DepthParameters()
     stereo_parameters: StereoParameters = StereoParameters()
@@ -128,34 +128,33 @@ class QueryPlan(_Model):
         Raises:
             DatasetError: a field has no effect. The error names the field, its value and the reason.
         """
-        poses, vehicles = "stands at the survey's own poses", "meets the survey's own vehicles"
+        poses, vehicles = "which uses the survey's own poses", "which has the survey's own vehicles"
         refused = [("aside_m", poses), ("heading_deg", poses)] if self.on_track else []
         refused += [("parked_changed", vehicles)] if self.traversal == 0 else []
-        refused += [("step_m", "has no sequence")] if self.sequence is None else []
+        refused += [("step_m", "which has no sequence")] if self.sequence is None else []
         if self.depth_parameters != DepthParameters() and self.matched():
             raise DatasetError(
-                f"depth_parameters: they would do nothing, since {self.name!r} has depth of matched pairs; set numbers of stereo",
+                f"depth_parameters: this option has no effect with {self.name!r}, whose depth comes from matched "
+                "pairs; set parameters of stereo",
                 field="depth_parameters",
             )
         if self.stereo_parameters != StereoParameters() and not self.matched():
             raise DatasetError(
-                f"stereo_parameters: they would do nothing, since {self.name!r} matches no pairs; "
-                f"take a depth of {', '.join(STEREOS)}", field="stereo_parameters",
+                f"stereo_parameters: this option has no effect with {self.name!r}, which "
+                f"matches no pairs; use a depth of {', '.join(STEREOS)}", field="stereo_parameters",
             )  # fmt: skip
         if self.followed is not None and self.blocked > 0:
             raise DatasetError(
-                f"followed: {self.name!r} has pictures that are blocked by a vehicle already; leave out one of blocked and followed",
+                f"followed: --blocked and --followed exclude each other ({self.name!r} has both); omit one",
                 field="followed",
             )
-        sunless = f"has no sun, being of the condition {self.condition!r}"
+        sunless = f"whose condition {self.condition!r} has no sun"
         if CONDITIONS[self.condition].sun_strength == 0:
             refused += [("sun_elevation_deg", sunless), ("sun_azimuth_deg", sunless)]
         for field, why in refused:
             value = getattr(self, field)
             if value != type(self).model_fields[field].default:
-                raise DatasetError(
-                    f"{field}: {value:g} would do nothing, since {self.name!r} {why}; leave it out", field=field
-                )
+                raise DatasetError(f"{field}: {value:g} has no effect with {self.name!r}, {why}; omit it", field=field)
 
 
 class SimulationPlan(_Model):
@@ -211,13 +210,15 @@ class SimulationPlan(_Model):
             named += [("depth", depth, (*DEPTHS, *STEREOS)) for depth in query.depths]
         for field, value, known in named:
             if value not in set(known):
-                raise DatasetError(f"{field}: {value!r} is no preset; there are: {', '.join(known)}", field=field)
+                raise DatasetError(
+                    f"{field}: {value!r} is not a valid preset; choose one of: {', '.join(known)}", field=field
+                )
         self.lidar_parameters.on(self.lidar)
         survey = self.survey_parameters
         survey.model()
         if not self.survey_error and (survey.position_m, survey.angle_deg) != (None, None):
             raise DatasetError(
-                "survey_error: it is off, so survey.position_m and survey.angle_deg would do nothing; leave them out",
+                "survey_error: with the error off, survey.position_m and survey.angle_deg have no effect; omit them",
                 field="survey_error",
             )
         for query in self.queries:
@@ -228,7 +229,7 @@ class SimulationPlan(_Model):
         self._refuse_two_rigs()
         names = [query.name for query in self.queries]
         if len(set(names)) != len(names):
-            raise DatasetError(f"queries: two traversals of one name among {names}", field="queries")
+            raise DatasetError(f"queries: two traversals have the same name: {names}", field="queries")
         if self.city != "paper" and any(query.per_class for query in self.queries):
             raise DatasetError(
                 "table1: only the paper's city has the classes of Table I; add --city paper", field="per_class"
@@ -246,8 +247,9 @@ class SimulationPlan(_Model):
         """Refuse several rigs: a dataset describes one camera with one baseline."""
         if len({depth in STEREOS for query in self.queries for depth in query.depths}) > 1:
             raise DatasetError(
-                f"depth: matched pairs ({', '.join(STEREOS)}) and depth drawn by a model ({', '.join(DEPTHS)}) do not go into one "
-                "dataset, whose camera has one baseline or none; simulate two", field="depth",
+                f"depth: matched pairs ({', '.join(STEREOS)}) and depth drawn by a model "
+                f"({', '.join(DEPTHS)}) cannot be in one dataset, because its camera has one baseline "
+                "or none; simulate two datasets", field="depth",
             )  # fmt: skip
         if len({query.stereo_parameters for query in self.queries}) > 1:
             raise DatasetError("stereo_parameters: the drives differ; a dataset has one rig", field="stereo_parameters")

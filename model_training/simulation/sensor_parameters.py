@@ -82,7 +82,8 @@ class RgbParameters(_Parameters):
         model = replace(RGBS[preset], **self.model_dump())
         if model.fixed_gain > 0 and self.most_gain is not None:
             raise DatasetError(
-                f"rgb.most_gain: {self.most_gain:g} would do nothing, since rgb.fixed_gain is {model.fixed_gain:g}; leave one out",
+                f"rgb.most_gain: {self.most_gain:g} has no effect with rgb.fixed_gain {model.fixed_gain:g}; omit one "
+                "of them",
                 field="rgb.most_gain",
             )
         return model
@@ -135,7 +136,7 @@ class SurveyParameters(_Parameters):
         model = SurveyModel(**self.model_dump())
         if self.deskewed is not None and model.speed_m_s == 0:
             raise DatasetError(
-                "survey.deskewed: it would do nothing, since survey.speed_m_s is 0; set a speed, or leave it out",
+                "survey.deskewed: this option has no effect with survey.speed_m_s 0; set a speed, or omit it",
                 field="survey.deskewed",
             )
         return model

@@ -96,11 +96,11 @@ def _claim(out: Path, plan: SimulationPlan) -> bool:
         if path.exists():
             if path.read_text() != text:
                 raise DatasetError(
-                    f"{out} holds the simulation of another plan; choose another --out or remove it", field="out"
+                    f"{out} contains the simulation of another plan; choose another --out, or remove it", field="out"
                 )
             return name == "simulation.json"
     if out.exists() and any(out.iterdir()):
-        raise DatasetError(f"{out} is not empty and holds no simulation; choose another --out", field="out")
+        raise DatasetError(f"{out} is not empty and contains no simulation; choose another --out", field="out")
     out.mkdir(parents=True, exist_ok=True)
     (out / "simulation.json").write_text(text)
     return True
@@ -253,7 +253,8 @@ def _free_candidates(job: _Job, quota: Quota) -> NDArray[np.int64]:
             break
     if any(left):
         raise DatasetError(
-            f"only {sum(map(len, chosen.values()))} of {sum(quota.wanted)} queries found room; drive more streets or ask for fewer",
+            f"only {sum(map(len, chosen.values()))} of {sum(quota.wanted)} queries could be placed; simulate more "
+            "streets or fewer queries",
             field="queries",
         )
     return np.array([k for index in sorted(chosen) for k in chosen[index]])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from model_training.importing.stereo import BLOCK_MATCHING, SEMI_GLOBAL, StereoMatching, depth_from_stereo
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import rotation_x, rotation_y, rotation_z, transform_from
+from service.registration.points import FOCAL_BASELINE_PX_M
 
 #: Smallest distance that the matcher searches, metres, and least number of disparities.
 NEAREST_M, FEWEST_DISPARITIES = 3.0, 64
@@ -37,7 +38,7 @@ class StereoModel:
 
     name: str
     matching: StereoMatching = SEMI_GLOBAL
-    focal_baseline_px_m: float = 80.0
+    focal_baseline_px_m: float = FOCAL_BASELINE_PX_M
     offset_px: float = 0.55
     vertical_px: float = 0.4
     roll_px: float = 0.4

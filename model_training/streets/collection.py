@@ -60,7 +60,7 @@ def collection_of(streets: Iterable[NamedStreet]) -> StreetCollection:
             overlap += surface.area - own.area
         coordinates = _coordinates(own)
         if not coordinates:
-            why = "lies wholly within other streets" if surface.area >= _SLIVER_M2 else "covers less than 1 m2"
+            why = "is completely inside other streets" if surface.area >= _SLIVER_M2 else "covers less than 1 m2"
             dropped.append(f"{street.name} {why}")
             continue
         identity = street.id or _free(_id_from(street), taken)
@@ -76,7 +76,7 @@ def collection_of(streets: Iterable[NamedStreet]) -> StreetCollection:
         })  # fmt: skip
     if not features:
         raise DatasetError(
-            f"no street covers any ground ({'; '.join(dropped[:5])}); are the coordinates degrees? --frame wgs84 says so",
+            f"no street covers any area ({'; '.join(dropped[:5])}); if the coordinates are degrees, pass --frame wgs84",
             field="features",
         )
     return StreetCollection({"type": "FeatureCollection", "features": features}, tuple(dropped), overlap)
@@ -98,7 +98,7 @@ def write_streets(path: Path, document: dict[str, Any], *, replace: bool = False
         BundleError: the service would refuse the document.
     """
     if path.exists() and not replace:
-        raise DatasetError(f"{path} is there; give --replace to write over it", field=path.name)
+        raise DatasetError(f"{path} exists; pass --replace", field=path.name)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     streets = Streets.from_geojson(json.loads(text))
     part = path.with_name(path.name + ".part")
@@ -130,7 +130,7 @@ def _own_ids(streets: list[NamedStreet]) -> list[str]:
     ids = [street.id for street in streets if street.id is not None]
     most = Counter(ids).most_common(1)
     if most and most[0][1] > 1:
-        raise DatasetError(f"two streets have the id {most[0][0]!r}; give each its own, or none", field="id")
+        raise DatasetError(f"two streets have the id {most[0][0]!r}; give each its own id, or none", field="id")
     return ids
 
 

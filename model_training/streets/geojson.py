@@ -57,7 +57,7 @@ def read_geojson(path: Path, *, width_m: float | None = None, frame: MapFrame | 
     document = _load(path)
     features = document.get("features")
     if document.get("type") != "FeatureCollection" or not isinstance(features, list) or not features:
-        raise DatasetError(f"{path}: it is no FeatureCollection with features; export it as one", field="features")
+        raise DatasetError(f"{path}: not a FeatureCollection with features; export it as one", field="features")
     to_map = _to_map(document, frame)
     joined: dict[tuple[str, ...], list[tuple[_Naming, list[BaseGeometry], float]]] = defaultdict(list)
     left_out: Counter[str] = Counter()
@@ -76,8 +76,8 @@ def read_geojson(path: Path, *, width_m: float | None = None, frame: MapFrame | 
                 key = (naming.id,)
                 if naming.id in number_of_id:
                     raise DatasetError(
-                        f"{where}.properties.id: {naming.id!r} is that of features[{number_of_id[naming.id]}] too; give each "
-                        "feature its own, or none",
+                        f"{where}.properties.id: {naming.id!r} is also the id of features[{number_of_id[naming.id]}]; "
+                        "give each feature its own id, or none",
                         field="id",
                     )
                 number_of_id[naming.id] = number
@@ -94,20 +94,23 @@ def read_geojson(path: Path, *, width_m: float | None = None, frame: MapFrame | 
 
 def _load(path: Path) -> dict[str, Any]:
     def refuse(word: str) -> NoReturn:
-        raise ValueError(f"{word} is no number of JSON's")
+        raise ValueError(f"{word} is not a valid JSON number")
 
     try:
         if path.stat().st_size > _LARGEST_BYTES:
             raise DatasetError(
-                f"{path}: larger than {_LARGEST_BYTES} bytes; cut it down to the survey's surroundings", field=path.name
+                f"{path}: larger than {_LARGEST_BYTES} bytes; reduce it to the surroundings of the survey",
+                field=path.name,
             )
         document = json.loads(path.read_bytes(), parse_constant=refuse)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}", field=path.name) from error
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: not whole JSON: {error}; export it again", field=path.name) from error
+        raise DatasetError(
+            f"{path}: not valid JSON: {error}; the file may be incomplete, export it again", field=path.name
+        ) from error
     if not isinstance(document, dict):
-        raise DatasetError(f"{path}: it is no GeoJSON object; export it as a FeatureCollection", field=path.name)
+        raise DatasetError(f"{path}: not a GeoJSON object; export it as a FeatureCollection", field=path.name)
     return document
 
 
@@ -124,19 +127,19 @@ def _to_map(document: dict[str, Any], frame: MapFrame | None) -> ToMap:
 
 def _naming(feature: Any, where: str) -> _Naming | None:
     if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
-        raise DatasetError(f"{where}: it is no Feature with properties; export the file again", field="properties")
+        raise DatasetError(f"{where}: not a Feature with properties; export the file again", field="properties")
     properties = feature.get("properties") or {}
     name, street, section = properties.get("name"), properties.get("street"), properties.get("section")
     identity = properties.get("id")
     for field, text in (("name", name), ("street", street), ("id", identity)):
         if text is not None and not (isinstance(text, str) and len(text) <= 200):
             raise DatasetError(
-                f"{where}.properties.{field}: {str(text)[:40]!r} is no text of at most 200 letters; make it one",
+                f"{where}.properties.{field}: {str(text)[:40]!r} is not a text of at most 200 characters; correct it",
                 field=field,
             )
     if section not in ("beginning", "end", None):
         raise DatasetError(
-            f"{where}.properties.section: {str(section)[:40]!r} is neither beginning, end nor null; put it into the name",
+            f"{where}.properties.section: {str(section)[:40]!r} is not beginning, end or null; put it into the name",
             field="section",
         )
     known = name or street
@@ -150,21 +153,21 @@ def _parts(feature: dict[str, Any], to_map: ToMap, where: str) -> list[BaseGeome
     geometry = feature.get("geometry")
     kind = geometry.get("type") if isinstance(geometry, dict) else None
     if not isinstance(geometry, dict) or kind not in ("Polygon", "MultiPolygon", "LineString", "MultiLineString"):
-        return f"are of the kind {str(kind)[:40]}, which covers no ground"
+        return f"have the type {str(kind)[:40]}, which covers no area"
     try:
         with np.errstate(invalid="ignore"):
             shape = shapely.geometry.shape(geometry)
             placed = shapely.transform(shapely.force_2d(shape), to_map)
     except (TypeError, ValueError, IndexError, KeyError, AttributeError, shapely.errors.ShapelyError) as error:
         raise DatasetError(
-            f"{where}.geometry: its coordinates make no {kind}: {error}; correct them", field="geometry"
+            f"{where}.geometry: its coordinates are not a valid {kind}: {error}; correct them", field="geometry"
         ) from error
     if not (np.abs(shapely.get_coordinates(placed)) <= LARGEST_M).all():
-        return f"lie more than {FARTHEST_M / 1000:.0f} km from the map's origin, or nowhere (are they WGS-84?)"
+        return f"are more than {FARTHEST_M / 1000:.0f} km from the map's origin, or not finite (are they WGS-84?)"
     repaired = shapely.make_valid(placed) if "Polygon" in kind else placed
     wanted: type[BaseGeometry] = shapely.Polygon if "Polygon" in kind else shapely.LineString
     parts = [part for part in _leaves(repaired) if isinstance(part, wanted) and not part.is_empty and part.length > 0]
-    return parts or "cover no ground"
+    return parts or "cover no area"
 
 
 def _leaves(shape: BaseGeometry) -> list[BaseGeometry]:
@@ -184,8 +187,8 @@ def _width(feature: dict[str, Any], width_m: float | None, where: str) -> float:
         width = math.nan
     if not 0 < width <= WIDEST_M:
         raise DatasetError(
-            f"{where}.properties.width: {str(given)[:40]!r} is no width in metres between 0 and {WIDEST_M:g}; correct it, or "
-            "take it out for the default",
+            f"{where}.properties.width: {str(given)[:40]!r} is not a width in metres between 0 and {WIDEST_M:g}; "
+            "correct it, or remove it to use the default",
             field="width",
         )
     return width

@@ -77,8 +77,8 @@ class MapFrame:
             to_earth = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
         except pyproj.exceptions.ProjError as error:
             raise DatasetError(
-                f"geoReference {projection!r} is no projection that PROJ knows ({error}); correct it, or take the "
-                "coordinates as they are with --frame map",
+                f"geoReference {projection!r} is not a projection that PROJ knows ({error}); correct it, or use the "
+                "coordinates unchanged with --frame map",
                 field="geoReference",
             ) from error
         return self.from_wgs84(np.column_stack(to_earth.transform(points[:, 0], points[:, 1])))

@@ -67,12 +67,12 @@ def read_network(path: Path, *, lanes: Lanes = "all") -> RoadNetwork:
     tree = read_xml(path, root="OpenDRIVE")
     elements = tree.findall("road")
     if not elements:
-        raise DatasetError(f"{path}: it has no <road>; export the road network along with the scene", field="road")
+        raise DatasetError(f"{path}: the file has no <road>; export the road network with the scene", field="road")
     length = sum(number_of(element, "length", f"{path}: road {element.get('id')}") for element in elements)
     if length > _LONGEST_M:
         raise DatasetError(
-            f"{path}: {length / 1000:.0f} km of roads are more than {_LONGEST_M / 1000:.0f}; cut the map down to the "
-            "survey's surroundings",
+            f"{path}: {length / 1000:.0f} km of roads are more than {_LONGEST_M / 1000:.0f}; reduce the map to the "
+            "surroundings of the survey",
             field="road",
         )
     roads = tuple(read_road(element, lanes, path) for element in elements)
@@ -138,8 +138,8 @@ def _in_map(street: NamedStreet, network: RoadNetwork, frame: MapFrame | None, p
         return street
     if network.projection is None:
         raise DatasetError(
-            f"{path}: header.geoReference is missing, so its place on the Earth is not known; give --frame map if its "
-            "coordinates are the map's",
+            f"{path}: header.geoReference is missing, so its position on the Earth is unknown; give --frame map if "
+            "its coordinates are the map's",
             field="geoReference",
         )
     projection = network.projection
@@ -148,8 +148,8 @@ def _in_map(street: NamedStreet, network: RoadNetwork, frame: MapFrame | None, p
         points = frame.from_projection(network.to_projection(points), projection)
         if not np.isfinite(points).all():
             raise DatasetError(
-                f"{path}: {street.name} lies more than 50 km from the map's origin by geoReference {projection!r}; correct "
-                "one of the georeferences, or give --frame map if its coordinates are the map's",
+                f"{path}: {street.name} is more than 50 km from the map's origin by geoReference {projection!r}; "
+                "correct one of the georeferences, or give --frame map if its coordinates are the map's",
                 field="geoReference",
             )
         return points

@@ -54,7 +54,7 @@ def attribute(element: Element, name: str, where: str) -> str:
     """
     value = element.get(name)
     if value is None:
-        raise DatasetError(f"{where}: <{element.tag}> lacks the attribute {name!r}; export the map again", field=name)
+        raise DatasetError(f"{where}: <{element.tag}> has no attribute {name!r}; export the map again", field=name)
     return value
 
 
@@ -108,7 +108,9 @@ def read_road(element: Element, lanes: Lanes, path: Path) -> Road:
     try:
         surface, centre = shape.surface(lanes), shapely.LineString(shape.centre())
     except (ValueError, shapely.errors.GEOSException) as error:
-        raise DatasetError(f"{where}: its planView or lanes make no surface: {error}", field="planView") from error
+        raise DatasetError(
+            f"{where}: its planView or lanes do not form a surface: {error}", field="planView"
+        ) from error
     return Road(
         identity, (element.get("name") or "").strip(), None if junction in ("-1", "") else junction, tuple(linked),
         surface, centre,
@@ -134,7 +136,7 @@ def road_shape(road: Element, where: str) -> RoadShape:
     drawn = sorted((each for each in geometries if each.length_m > 0), key=lambda each: each.s)
     if not drawn:
         raise DatasetError(
-            f"{where}: planView has no <geometry> of any length, so the road lies nowhere; export the map again",
+            f"{where}: planView has no <geometry> of any length, so the road has no position; export the map again",
             field="planView",
         )
     sections = [_section(element, where) for element in road.findall("lanes/laneSection")]
@@ -172,7 +174,7 @@ def _shape(element: Element, length_m: float, where: str) -> Bend | Cubic:
             return polynomial_shape(u, v, length_m=length_m, p_range=known)
     shapes = ", ".join(kind.tag for kind in element) or "nothing"
     raise DatasetError(
-        f"{where}: a <geometry> holds {shapes}; line, arc, spiral, poly3 or paramPoly3 is needed", field="geometry"
+        f"{where}: a <geometry> has {shapes}; expected line, arc, spiral, poly3 or paramPoly3", field="geometry"
     )
 
 
@@ -197,7 +199,7 @@ def _lane(element: Element, where: str) -> Lane:
         raise DatasetError(f"{where}: a lane's id is {number!r}, not an integer", field="lane.id")
     if not widths and element.find("border") is not None:
         raise DatasetError(
-            f"{where}: lane {number} is described by <border>, which is not read; export the map with <width>",
+            f"{where}: lane {number} is described by <border>, which is not supported; export the map with <width>",
             field="border",
         )
     return Lane(int(number), element.get("type", "none"), _records(widths, "sOffset", where))

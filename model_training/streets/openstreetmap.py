@@ -59,7 +59,7 @@ def read_openstreetmap(
     import osmium
 
     if not path.is_file():
-        raise DatasetError(f"{path}: there is no such file", field=path.name)
+        raise DatasetError(f"{path}: file not found", field=path.name)
     of_name: dict[str, list[_Way]] = defaultdict(list)
     left_out: Counter[str] = Counter()
     try:
@@ -75,13 +75,13 @@ def read_openstreetmap(
                 of_name[_name(tags)].append(read)
     except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:  # from the parser, text, coordinates
         raise DatasetError(
-            f"{path}: not whole OpenStreetMap data: {error}; fetch the extract again", field=path.name
+            f"{path}: not valid OpenStreetMap data: {error}; download the extract again", field=path.name
         ) from error
     reasons = tuple(f"{count} ways {reason}" for reason, count in left_out.items())
     if not of_name:
         raise DatasetError(
-            f"{path}: no way with the tags highway and name lies near the map ({'; '.join(reasons) or 'no highways at all'}); "
-            "fetch an extract of the survey's surroundings",
+            f"{path}: no way with the tags highway and name is near the map "
+            f"({'; '.join(reasons) or 'no highways at all'}); download an extract of the surroundings of the survey",
             field="way",
         )
     order = sorted(of_name, key=lambda name: (min(way.rank for way in of_name[name]), in_natural_order(name)))
@@ -117,7 +117,7 @@ def _way(
     if len(points) < 2 or not np.ptp(points, axis=0).any():
         return "have fewer than two nodes in the file"
     if not np.isfinite(points).all():
-        return f"reach further than {FARTHEST_M / 1000:.0f} km from the map's origin"
+        return f"reach farther than {FARTHEST_M / 1000:.0f} km from the map's origin"
     width = _carriageway_m(tags, width_m)
     if lanes == "all" and kind not in _WITHOUT_PAVEMENT and tags.get("sidewalk") not in ("no", "none"):
         width += 2 * PAVEMENT_M

@@ -31,8 +31,8 @@ def read_xml(path: Path, *, root: str, largest_bytes: int = LARGEST_BYTES) -> El
 
     def refuse(*_: object) -> NoReturn:
         raise DatasetError(
-            f"{path}: line {parser.CurrentLineNumber}: a document type (DTD) is not read, since its entities may grow "
-            "without bound; remove the <!DOCTYPE> line",
+            f"{path}: line {parser.CurrentLineNumber}: a document type (DTD) is not supported, because its entities "
+            "can expand without limit; remove the <!DOCTYPE> line",
             field=path.name,
         )
 
@@ -41,7 +41,7 @@ def read_xml(path: Path, *, root: str, largest_bytes: int = LARGEST_BYTES) -> El
         size = path.stat().st_size
         if size > largest_bytes:
             raise DatasetError(
-                f"{path}: {size} bytes are more than {largest_bytes}; cut the map down to the survey's surroundings",
+                f"{path}: {size} bytes are more than {largest_bytes}; reduce the map to the surroundings of the survey",
                 field=path.name,
             )
         parser.Parse(path.read_bytes(), True)
@@ -49,11 +49,11 @@ def read_xml(path: Path, *, root: str, largest_bytes: int = LARGEST_BYTES) -> El
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}", field=path.name) from error
     except expat.ExpatError as error:
         raise DatasetError(
-            f"{path}: not whole XML: {error}; the file is cut off or of another kind", field=path.name
+            f"{path}: not valid XML: {error}; the file is incomplete or has another format", field=path.name
         ) from error
     tree: Element = builder.close()
     if tree.tag != root:
         raise DatasetError(
-            f"{path}: its outermost element is <{tree.tag}>, not <{root}>; it is of another kind", field=path.name
+            f"{path}: its root element is <{tree.tag}>, not <{root}>; the file has another format", field=path.name
         )
     return tree

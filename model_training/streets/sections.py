@@ -43,8 +43,8 @@ def _cut(street: NamedStreet, length_m: float, cut: Cut) -> list[NamedStreet]:
         return [street]
     if axis.length > _MOST * length_m:
         raise DatasetError(
-            f"{street.name} is {axis.length:.0f} m long: more than {_MOST} sections of {length_m:g} m; are the coordinates metres "
-            "of the map (--frame), and the length?",
+            f"{street.name} is {axis.length:.0f} m long: more than {_MOST} sections of {length_m:g} m; check that the "
+            "coordinates are metres of the map (--frame), and the length of a section",
             field="section_length",
         )
     named: list[tuple[str, Section | None]]

@@ -13,9 +13,7 @@ from torch.nn import functional
 from service.imaging.brightness import FLOOR, LEAST_SPREAD, LIMIT
 from service.imaging.ihs import IHS_FROM_RGB
 from service.imaging.view_grid import PLANES, ViewGrid
-
-#: Focal length times baseline of the simulated stereo camera, pixels times metres.
-FOCAL_BASELINE_PX_M = 80.0
+from service.registration.points import FOCAL_BASELINE_PX_M
 
 
 class Augmentation(BaseModel):

@@ -49,13 +49,11 @@ def average(
         DatasetError: a folder holds no run, the shapes of the encoders differ, or ``run`` already exists.
     """
     if (run / "checkpoint.pt").exists():
-        raise DatasetError(f"{run} holds a run already; take another --run folder, or remove it", field="run")
+        raise DatasetError(f"{run} already contains a run; choose another --run folder, or remove it", field="run")
     net, other = load_run(first), load_run(second)
     config = read_config(second)
     if net.shape != other.shape:
-        raise DatasetError(
-            f"{first} and {second} are encoders of different shapes; only like ones have a mean", field="run"
-        )
+        raise DatasetError(f"{first} and {second}: the encoders must have the same shape", field="run")
     mean = {
         name: torch.lerp(value, other.state_dict()[name], share) if value.is_floating_point() else value
         for name, value in net.state_dict().items()

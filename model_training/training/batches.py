@@ -71,8 +71,9 @@ def open_cities(folders: list[Path], grid: ViewGrid, *, turn_deg: float, pairs: 
         city = City(Pack.open(folder), grid, turn_deg=turn_deg)
         if len(city.usable) < pairs:
             raise DatasetError(
-                f"{folder}: {len(city.usable)} of its {len(city.pack.queries)} queries lie within {PAIR_REACH_M:g} m of a place, and a "
-                f"batch takes {pairs} pairs; make the city with more places or queries, or train with --pairs {len(city.usable)} or fewer",
+                f"{folder}: {len(city.usable)} of its {len(city.pack.queries)} queries lie within {PAIR_REACH_M:g} m "
+                f"of a place, but a batch needs {pairs} pairs; create the city with more places or queries, or train "
+                f"with --pairs {len(city.usable)} or fewer",
                 field="pairs",
             )  # fmt: skip
         cities.append(city)

@@ -42,7 +42,7 @@ def net_of(encoder: Path, shape: EncoderShape, planes: Tensor, side: Tensor) -> 
     for module, (weight, bias) in zip(convolutions, layers, strict=True):
         if module.weight.shape != weight.shape:
             raise _foreign(
-                encoder, f"a layer of {tuple(weight.shape)} stands where {tuple(module.weight.shape)} is expected"
+                encoder, f"a layer has the shape {tuple(weight.shape)}, expected {tuple(module.weight.shape)}"
             )
         module.weight.data.copy_(torch.from_numpy(weight))
         if module.bias is not None:
@@ -79,7 +79,8 @@ def require_shape(encoder: Path, shape: EncoderShape) -> list[tuple[Floats, Floa
     found = _shape(opened, layers, encoder)
     if found != shape:
         raise EncoderError(
-            f"{encoder}: it has the shape {found}, and the training wants {shape}; start from an encoder of that shape",
+            f"{encoder}: it has the shape {found}, but the training expects {shape}; start from an encoder of that "
+            "shape",
             field="encoder",
         )
     return layers
@@ -97,7 +98,7 @@ def _matching(bias: Tensor):  # type: ignore[no-untyped-def]  # torch's hook typ
             (norm.bias, bias + mean),
         ):
             if known is None:
-                raise TypeError("the normalisation keeps no statistics")
+                raise TypeError("the normalisation has no running statistics")
             known.data.copy_(value)
 
     return hook
@@ -106,7 +107,7 @@ def _matching(bias: Tensor):  # type: ignore[no-untyped-def]  # torch's hook typ
 def _norm(block: nn.Sequential) -> nn.BatchNorm2d:
     norm = block[1]
     if not isinstance(norm, nn.BatchNorm2d):
-        raise TypeError(f"{norm} is no batch normalisation")
+        raise TypeError(f"{norm} is not a batch normalisation")
     return norm
 
 
@@ -148,5 +149,5 @@ def _shape(encoder: Encoder, layers: list[tuple[Floats, Floats]], path: Path) ->
 
 def _foreign(path: Path, why: str) -> EncoderError:
     return EncoderError(
-        f"{path} is no encoder that can be trained on: {why}; take one that `streetfix export` wrote", field="encoder"
+        f"training cannot start from {path}: {why}; give an encoder that `streetfix export` wrote", field="encoder"
     )

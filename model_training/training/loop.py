@@ -269,20 +269,22 @@ def require_start(start_from: Path, shape: EncoderShape) -> None:
     """
     if not start_from.exists():
         raise DatasetError(
-            f"start_from: {start_from} is not there; name a run's folder or an encoder (.onnx)", field="start_from"
+            f"start_from: {start_from}: file or folder not found; give the folder of a run, or an encoder (.onnx)",
+            field="start_from",
         )
     if not start_from.is_dir():
         require_shape(start_from, shape)
         return
     if not (start_from / "checkpoint.pt").is_file():
         raise DatasetError(
-            f"start_from: {start_from} holds no checkpoint.pt; name the folder of a run that was trained, or an encoder (.onnx)",
+            f"start_from: {start_from} has no checkpoint.pt; give the folder of a trained run, or an encoder (.onnx)",
             field="start_from",
         )
     found = read_config(start_from).encoder
     if found != shape:
         raise DatasetError(
-            f"start_from: {start_from} has the shape {found}, and this training wants {shape}; start from a run of that shape",
+            f"start_from: {start_from} has the shape {found}, but this training expects {shape}; start from a run of "
+            "that shape",
             field="start_from",
         )
 
@@ -343,7 +345,7 @@ def load_run(run: Path, *, device: str = "cpu") -> EncoderNet:
         DatasetError: the folder holds no run.
     """
     if not (run / "checkpoint.pt").exists():
-        raise DatasetError(f"{run} holds no checkpoint.pt; train first: streetfix train --run {run}", field="run")
+        raise DatasetError(f"{run} has no checkpoint.pt; train first: streetfix train --run {run}", field="run")
     net = EncoderNet(read_config(run).encoder)
     net.load_state_dict(read_checkpoint(run, device)["net"])
     return net.eval()
@@ -365,7 +367,8 @@ def read_checkpoint(run: Path, device: str | torch.device) -> dict[str, Any]:
             loaded: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
         except (RuntimeError, EOFError, UnpicklingError) as error:
             raise DatasetError(
-                f"{path}: it is damaged ({type(error).__name__}); train again in another --run folder", field="run"
+                f"{path}: the file is damaged ({type(error).__name__}); train again in another --run folder",
+                field="run",
             ) from error
     return loaded
 
@@ -403,9 +406,9 @@ def read_packs(run: Path) -> list[str]:
     try:
         names = json.loads(read_bytes(path))
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: it is no JSON; train in another --run folder", field="run") from error
+        raise DatasetError(f"{path}: not valid JSON; train again in another --run folder", field="run") from error
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise DatasetError(f"{path}: it is no list of names; train again in another --run folder", field="run")
+        raise DatasetError(f"{path}: not a list of names; train again in another --run folder", field="run")
     return names
 
 
@@ -431,7 +434,7 @@ def _keep_packs(run: Path, packs: list[Path], start_from: Path | None) -> None:
         earlier = [f"encoder-{name}" for name in Encoder.open(start_from).trained_on]
     names = earlier + [folder.name for folder in packs]
     if path.exists() and read_packs(run) != names:
-        raise DatasetError(f"{path} names other cities; take another --run folder, or remove this one", field="run")
+        raise DatasetError(f"{path} names other cities; choose another --run folder, or remove this one", field="run")
     path.write_text(json.dumps(names, indent=1) + "\n")
 
 
@@ -440,7 +443,7 @@ def _keep_config(run: Path, config: TrainingConfig) -> None:
     if path.exists():
         if read_config(run) != config:
             raise DatasetError(
-                f"{path} is of another configuration; take another --run folder, or remove this one", field="run"
+                f"{path} has another configuration; choose another --run folder, or remove this one", field="run"
             )
         return
     path.write_text(config.model_dump_json(indent=2) + "\n")

@@ -105,7 +105,7 @@ class Pack:
         Raises:
             DatasetError: an array is missing or damaged.
         """
-        remedy = f"remove {folder}, so that the next training makes the city anew"
+        remedy = f"remove {folder}, so that the next training creates the city again"
         matched = MATCHED in folder.name
         return Pack(**{
             name: read_arrays(path, partial(np.load, path, mmap_mode="r", allow_pickle=False), remedy=remedy)

@@ -88,7 +88,7 @@ def quantise(encoder: Path, out: Path, ranges: Iterable[Views], checks: Iterable
     before = Encoder.open(encoder)
     model = onnx.load(encoder)
     if any(node.op_type == "QuantizeLinear" for node in model.graph.node):
-        raise EncoderError(f"{encoder} is in eight bits already; quantise the file that `streetfix export` wrote")
+        raise EncoderError(f"{encoder} already has 8 bits; give the file that `streetfix export` wrote")
     data = _in_eight_bits(encoder, model, ranges)
     after, cosines = Encoder.open(data), list[NDArray[np.float32]]()
     for views in checks:
@@ -97,8 +97,8 @@ def quantise(encoder: Path, out: Path, ranges: Iterable[Views], checks: Iterable
     agreement = Agreement(float(found.mean()), float(np.quantile(found, 0.01)), len(found))
     if agreement.mean < LEAST_MEAN or agreement.of_hundred < LEAST_OF_HUNDRED:
         raise EncoderError(
-            f"in eight bits descriptors differ: cosine {agreement.mean:.4f} in the mean (least: {LEAST_MEAN}), "
-            f"{agreement.of_hundred:.4f} of the worst hundredth ({LEAST_OF_HUNDRED}); nothing was written"
+            f"8-bit descriptors differ too much: mean cosine {agreement.mean:.4f} (at least {LEAST_MEAN}), 1st "
+            f"percentile {agreement.of_hundred:.4f} (at least {LEAST_OF_HUNDRED}); nothing was written"
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(out.name + ".part")

@@ -62,7 +62,7 @@ def view_of(frame: QueryFrame, now_s: float, T_map_camera: NDArray[np.float64]) 
     rgb, depth_m = frame.rgb(), frame.depth_m()
     if depth_m.shape != rgb.shape[:2]:
         depth_m = cv2.resize(depth_m, rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST).astype(np.float32)
-    fused = picture_of(fuse(rgb, depth_m), ViewGrid().max_range_m)
+    fused = picture_of(fuse(rgb, depth_m).planes, ViewGrid().max_range_m)
     camera = frame.camera.pinhole()
     return View("query/camera", now_s, T_map_camera, camera, _jpeg(rgb), depth_m, _jpeg(fused))
 

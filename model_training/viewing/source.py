@@ -36,8 +36,8 @@ def events_of(folder: Path, *, most_scans: int, most_points: int) -> Iterator[Ev
         yield from events_of_dataset(Dataset(folder), most_scans=most_scans, most_points=most_points)
     else:
         raise DatasetError(
-            f"{folder} is no dataset, no map bundle and no folder of `evaluate --report`: it has none of dataset.json, "
-            f"{manifest.FILE}, {saved_run.FILE}", field="source",
+            f"{folder} is not a dataset, a map bundle or a folder of `evaluate --report`: it has none "
+            f"of dataset.json, {manifest.FILE}, {saved_run.FILE}", field="source",
         )  # fmt: skip
 
 

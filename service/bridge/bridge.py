@@ -109,9 +109,9 @@ class Bridge:
         missing = self.pairs.missing()
         if missing:
             told = ", ".join(f"{name} ({getattr(self.topics, name)})" for name in missing)
-            message = f"nothing comes by: {told}; do the topics have publishers?"
+            message = f"no messages on {told}; check that the topics have publishers"
         else:
-            message = "no colour and depth of one instant; are they synchronised? see --tolerance"
+            message = "no colour and depth image with matching stamps; synchronise the publishers, or raise --tolerance"
         return Diagnosis(0, Level.WARN, message, self._counted())
 
     def _ask(self, pair: Pair) -> Published:

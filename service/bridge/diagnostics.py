@@ -81,6 +81,7 @@ def of_answer(
         ("street", "none" if answer.street is None else answer.street.name),
         ("map", f"{answer.map.name}@{answer.map.version}"),
         ("camera_height", "unknown" if height is None else f"{height.height_m:.2f} m, {height.origin}"),
+        ("calibration", answer.calibration or "unknown"),
         ("latency_ms", f"{1e3 * latency_s:.0f}"),
     )  # fmt: skip
     if why_not:

@@ -27,11 +27,12 @@ class Gate:
         """
         if not 0 <= self.rate_hz < float("inf"):
             raise RequestError(
-                f"--rate: {self.rate_hz} is no rate; give questions a second, 0 for no limit", field="rate"
+                f"--rate: {self.rate_hz} is not a valid rate; give queries per second, 0 for no limit", field="rate"
             )
         if not 0 <= self.min_confidence <= 1:
             raise RequestError(
-                f"--min-confidence: {self.min_confidence} is no probability; give 0 to 1", field="min_confidence"
+                f"--min-confidence: {self.min_confidence} is not a valid probability; give 0 to 1",
+                field="min_confidence",
             )
 
     def wait_s(self, now_s: float) -> float:
@@ -61,7 +62,7 @@ class Gate:
         if answer.status != "LOCALIZED":
             return answer.status
         if self.min_confidence > 0 and answer.confidence is None:
-            return "no confidence: the map is not calibrated; pass --min-confidence 0 to publish nevertheless"
+            return "no confidence: the map is not calibrated; pass --min-confidence 0 to publish anyway"
         if (answer.confidence or 0.0) < self.min_confidence:
             return f"confidence {answer.confidence:.3f} is below {self.min_confidence:g}"
         return ""

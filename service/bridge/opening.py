@@ -37,7 +37,8 @@ def opened(settings: BridgeSettings) -> Iterator[Bridge]:
     height = height_from(settings.camera_height_m, mount, base_on_ground=settings.base_on_ground)
     if settings.queue < 0:
         raise RequestError(
-            f"--queue: {settings.queue} is no number of images; give 1 or more, or 0 to keep all", field="queue"
+            f"--queue: {settings.queue} is not a valid number of images; give 1 or more, or 0 to keep all",
+            field="queue",
         )
     with _asking(settings, height) as localize:
         yield Bridge(
@@ -51,9 +52,14 @@ def _asking(settings: BridgeSettings, height: GivenHeight | None = None) -> Iter
     """Provide the function that localizes: by a service, or by the map in this process."""
     if settings.map is not None:
         if given := next((name for name in ("ca", "cert", "key") if getattr(settings, name) is not None), None):
-            raise RequestError(f"--{given} is for a service; --map asks none", field=given)
+            raise RequestError(
+                f"--{given}: it is only for a service, but --map uses none; omit --{given} or --map", field=given
+            )
         if settings.map_name is not None:
-            raise RequestError("--map-name is for a service; --map has one map alone", field="map_name")
+            raise RequestError(
+                "--map-name: it is only for a service, but --map gives one map; omit --map-name or --map",
+                field="map_name",
+            )
         from service.runtime.threads import limit_pools_before_import
 
         limit_pools_before_import()

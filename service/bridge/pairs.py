@@ -52,9 +52,11 @@ class Pairs:
 
     def __init__(self, *, tolerance_s: float = 0.02, most: int = 10) -> None:
         if not tolerance_s >= 0:
-            raise RequestError(f"tolerance: {tolerance_s} is no time; give seconds, as 0.02", field="tolerance")
+            raise RequestError(
+                f"tolerance: {tolerance_s} is not a valid time; give seconds, such as 0.02", field="tolerance"
+            )
         if most < 1:
-            raise RequestError(f"queue: {most} keeps nothing; give 1 or more", field="queue")
+            raise RequestError(f"queue: {most} is not a valid size; give 1 or more", field="queue")
         self._tolerance_ns = round(1e9 * tolerance_s)
         self.most = most
         self._colors: OrderedDict[int, ImageLike] = OrderedDict()

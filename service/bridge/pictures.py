@@ -114,8 +114,8 @@ def camera_from(message: CameraInfoLike, topic: str, *, rectified: bool = False)
     """
     if any(message.d) and not rectified:
         raise RequestError(
-            f"{topic}: the lens distorts (d = {[round(each, 4) for each in message.d]}), and pictures must be rectified; subscribe to "
-            "image_proc's rectified topics and say --rectified", field=topic,
+            f"{topic}: the lens distorts (d = {[round(each, 4) for each in message.d]}), but the images must be rectified; subscribe to "
+            "the rectified topics of image_proc and pass --rectified", field=topic,
         )  # fmt: skip
     p, k = message.p, message.k
     fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if p[0] else (k[0], k[4], k[2], k[5])
@@ -139,8 +139,8 @@ def _rows(message: ImageLike, topic: str, dtype: np.dtype[Any], channels: int) -
     data = np.frombuffer(bytes(message.data) if isinstance(message.data, list) else message.data, np.uint8)
     if height < 1 or width < 1 or step < row or data.size < height * step:
         raise RequestError(
-            f"{topic}: {data.size} bytes are no picture of {width}x{height} {message.encoding} with rows of {step} bytes (a row needs "
-            f"{row}, all of them {height * max(step, row)}); mend the publisher", field=topic,
+            f"{topic}: {data.size} bytes are not an image of {width}x{height} {message.encoding} with rows of {step} bytes (a row needs "
+            f"{row}, the image {height * max(step, row)}); fix the publisher", field=topic,
         )  # fmt: skip
     rows = data[: height * step].reshape(height, step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
@@ -148,6 +148,6 @@ def _rows(message: ImageLike, topic: str, dtype: np.dtype[Any], channels: int) -
 
 def _unread(message: ImageLike, topic: str, known: dict[str, Any]) -> RequestError:
     return RequestError(
-        f"{topic}: pictures come as {message.encoding!r}, which is not read here; publish one of {', '.join(known)}",
+        f"{topic}: the encoding {message.encoding!r} is not supported; publish one of {', '.join(known)}",
         field=topic,
     )

@@ -106,7 +106,7 @@ def mount_from(text: str) -> Transform:
         numbers = []
     if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or abs(math.hypot(*numbers[3:]) - 1) > 0.01:
         raise RequestError(
-            f"--mount: {text!r} is not X,Y,Z,QX,QY,QZ,QW (metres, unit quaternion), such as 0.2,0,0.5,-0.5,0.5,-0.5,0.5",
+            f"--mount: {text!r} is invalid; give X,Y,Z,QX,QY,QZ,QW (metres, unit quaternion), such as 0.2,0,0.5,-0.5,0.5,-0.5,0.5",
             field="mount",
         )
     return transform_from(rotation_from_quaternion_xyzw(np.array(numbers[3:])), np.array(numbers[:3]))
@@ -128,7 +128,7 @@ def height_from(
     if camera_height_m:
         if not LEAST_HEIGHT_M <= camera_height_m <= MOST_HEIGHT_M:
             raise RequestError(
-                f"--camera-height-m: {camera_height_m:g} m is no height of a camera; give {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m, "
+                f"--camera-height-m: {camera_height_m:g} m is not a valid camera height; give {LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m, "
                 "or 0 to find it in the depth image", field="camera_height_m",
             )  # fmt: skip
         return GivenHeight(camera_height_m, HEIGHT_STD_M)
@@ -136,14 +136,14 @@ def height_from(
         return None
     if T_vehicle_camera is None:
         raise RequestError(
-            "--base-on-ground: the height of the camera follows from --mount, which is missing; give --mount, or --camera-height-m",
+            "--base-on-ground: --mount is missing, and the camera height follows from it; give --mount, or --camera-height-m",
             field="base_on_ground",
         )
     height_m = float(T_vehicle_camera[2, 3])
     if not LEAST_HEIGHT_M <= height_m <= MOST_HEIGHT_M:
         raise RequestError(
-            f"--mount: with --base-on-ground, its Z of {height_m:g} m is the height of the camera, and {LEAST_HEIGHT_M:g} to "
-            f"{MOST_HEIGHT_M:g} m are read; give the mounting on base_footprint, or --camera-height-m and no --base-on-ground",
+            f"--mount: with --base-on-ground, its Z of {height_m:g} m is the camera height, which must be {LEAST_HEIGHT_M:g} to "
+            f"{MOST_HEIGHT_M:g} m; give the mounting on base_footprint, or --camera-height-m without --base-on-ground",
             field="mount",
         )
     return GivenHeight(height_m, VEHICLE_HEIGHT_STD_M)

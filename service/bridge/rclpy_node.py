@@ -41,7 +41,7 @@ def ros_node(*, args: list[str] | None = None, domain: int | None = None) -> Ite
     except ModuleNotFoundError as error:
         raise ExtraMissingError(
             f"--node rclpy needs the package {error.name!r}, which comes with ROS 2: source /opt/ros/DISTRIBUTION/setup.bash in an "
-            "environment with system packages, or say --node dds, which needs no ROS", field="node",
+            "environment with system packages, or use --node dds, which needs no ROS", field="node",
         ) from error  # fmt: skip
     rclpy.init(args=args, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     try:

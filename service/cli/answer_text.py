@@ -4,7 +4,11 @@ import math
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+
+#: Width of a table with one row per pair in a file or a pipe, characters.
+_WIDTH = 160
 
 
 def print_answer(answer: dict[str, Any], console: Console | None = None) -> None:
@@ -35,16 +39,53 @@ def print_answer(answer: dict[str, Any], console: Console | None = None) -> None
     out.print(f"milliseconds: {times}", style="dim")
 
 
+def print_outcomes(names: list[str], outcomes: list[dict[str, Any]], console: Console | None = None) -> None:
+    """Print one row per answer of a batch, the problems of refused pairs, and a summary.
+
+    Args:
+        names: of the image pairs, in order. There may be more names than outcomes.
+        outcomes: each has ``answer`` or ``problem``, as in the REST contract.
+        console: destination; None prints to standard output.
+    """
+    out = console or Console(highlight=False)
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for heading in ("pair", "image", "status", "confidence", "street", "position", "heading"):
+        table.add_column(heading, overflow="fold")
+    problems = []
+    for number, (name, outcome) in enumerate(zip(names, outcomes, strict=False)):
+        answer, problem = outcome["answer"], outcome["problem"]
+        if answer is None:
+            table.add_row(str(number), escape(name), "refused", "", "", "", "")
+            where = f" [field {problem['field']}]" if problem.get("field") else ""
+            problems.append(f"pair {number} ({name}): {problem.get('title', '')} {problem.get('detail', '')}{where}")
+            continue
+        pose, street, confidence = answer["pose"], answer["street"], answer["confidence"]
+        table.add_row(
+            str(number), escape(name), answer["status"], "" if confidence is None else f"{confidence:.3f}",
+            escape(street["name"]) if pose is not None and street is not None else "",
+            "" if pose is None else _metres(pose["position"]), "" if pose is None else f"{pose['heading_deg']:.1f}",
+        )  # fmt: skip
+    # A file or a pipe needs no line breaks at the width of a terminal.
+    Console(file=out.file, width=None if out.is_terminal else max(out.width, _WIDTH)).print(table)
+    for line in problems:
+        out.print(line, markup=False, soft_wrap=True)
+    localized = sum(each["answer"] is not None and each["answer"]["status"] == "LOCALIZED" for each in outcomes)
+    out.print(f"{localized} of {len(outcomes)} pairs LOCALIZED, {len(problems)} refused")
+
+
 def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     pose, street, place = answer["pose"], answer["street"], answer["map"]
     confidence = answer["confidence"]
     status = ("status", answer["status"] + ("" if confidence is None else f" (confidence {confidence:.3f})"))
+    outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.get("extrapolated", {}).items())
+    calibrated = [("calibration", f"extrapolated (standard deviations from the mean: {outside})")] if outside else []
     version = ("map", f"{place['name']}, version {place['version']}")
     told = answer.get("camera_height")  # an older service sends none
     height = [] if told is None else [("camera", _height(told))]
     if pose is None:
         return [
-            status, ("pose", "none: the answer is not LOCALIZED"), ("spread", _doubt(answer["spread"])), *height, version,
+            status, ("pose", "none: the answer is not LOCALIZED"), ("spread", _doubt(answer["spread"])), *calibrated, *height,
+            version,
         ]  # fmt: skip
     facts = [
         status,
@@ -59,7 +100,7 @@ def _facts(answer: dict[str, Any]) -> list[tuple[str, str]]:
     if answer.get("vehicle_pose"):
         vehicle = answer["vehicle_pose"]
         facts.append(("vehicle", f"{_metres(vehicle['position'])}, heading {vehicle['heading_deg']:.1f} degrees"))
-    return [*facts, *height, version]
+    return [*facts, *calibrated, *height, version]
 
 
 def _height(told: dict[str, Any]) -> str:
@@ -70,8 +111,8 @@ def _height(told: dict[str, Any]) -> str:
 
 def _focal(factor: float) -> str:
     return (
-        f"the focal length is probably off by a factor of two: fx and fy times {factor:g} fit the map better; check the "
-        "intrinsics, and whether they are of pictures of this size"
+        f"the focal length is probably off by a factor of two: fx and fy times {factor:g} fit the map better; check "
+        "the intrinsics, and whether they belong to images of this size"
     )
 
 
@@ -82,7 +123,7 @@ def _why(answer: dict[str, Any]) -> list[str]:
         found.append(_focal(factor))
     for reason in answer.get("reasons", []):  # an older service sends no reasons
         told = ", ".join(f"{name} {size:+.1f}" for name, size in reason["evidence"].items())
-        where = f" (standard deviations from what calibration saw: {told})" if told else ""
+        where = f" (standard deviations from the mean of the calibration data: {told})" if told else ""
         found.append(f"{reason['check']}{where}: {reason['remedy']}")
     if found:
         return [
@@ -90,10 +131,9 @@ def _why(answer: dict[str, Any]) -> list[str]:
             *(f"  {k}. {each}" for k, each in enumerate(found, 1)),
         ]
     if "reasons" not in answer:
-        return ["why: this service does not say"]
-    return [
-        "why: all evidence lies in the range that calibration saw; the place may be outside the map, or look like another place of it"
-    ]
+        return ["The service gives no reasons."]
+    in_range = "All confidence features are in the range of the calibration data."
+    return [f"{in_range} The place may be outside the map or a perceptual alias."]
 
 
 def _doubt(spread: dict[str, Any]) -> str:

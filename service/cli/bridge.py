@@ -77,7 +77,8 @@ def ros2(
 
     with opened(settings) as bridge, until_signalled() as over:
         typer.echo(
-            f"listening to {color_topic} and {depth_topic} on domain {domain}, publishing {pose_topic} (stop: Ctrl-C)"
+            f"listening to {color_topic} and {depth_topic} on domain {domain}, publishing {pose_topic}. Stop with "
+            "Ctrl-C."
         )
         run(bridge, over)
     typer.echo("stopped")

@@ -124,15 +124,18 @@ class Certificates:
                 f"{self._key}: the private key is encrypted; decrypt it: openssl pkey -in FILE -out PLAIN"
             ) from error
         except (OSError, ssl.SSLError) as error:
-            raise KeysError(f"{self._certificate}, {self._key}: no certificate with its key ({error})") from error
+            raise KeysError(f"{self._certificate}, {self._key}: not a certificate with its key ({error})") from error
         if self._client_ca is not None:
             try:
                 context.load_verify_locations(self._client_ca)
             except (OSError, ssl.SSLError) as error:
-                raise KeysError(f"{self._client_ca}: no certificates of authorities ({error})") from error
+                raise KeysError(f"{self._client_ca}: not certificates of authorities ({error})") from error
             context.verify_mode = ssl.CERT_REQUIRED
         if self._bytes() != before:
-            raise KeysError(f"{self._certificate}, {self._key}: they changed while they were read; they are read again")
+            raise KeysError(
+                f"{self._certificate}, {self._key}: the files changed while they were read; the service reads them "
+                "again"
+            )
         return _Loaded(context, before[0] or b"", before[1] or b"", before[2])
 
     def _bytes(self) -> tuple[bytes | None, ...]:

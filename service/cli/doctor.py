@@ -1,4 +1,4 @@
-"""``streetfix doctor``: look for what keeps a service from starting, or a query from its answer."""
+"""``streetfix doctor``: find why a service does not start, or a query gets no answer."""
 
 import json
 from dataclasses import asdict

@@ -14,7 +14,7 @@ _TIMEOUT_S = 2.0
 
 
 def command(ca: Ca = None, cert: Cert = None, key: Key = None) -> None:
-    """Ask the service on this machine whether it is ready.
+    """Check whether the service on this machine is ready.
 
     The variables STREETFIX_* describe the service. The exit code is 0 if the service is ready, otherwise 1.
 

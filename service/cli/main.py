@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _told_by_system(error: OSError) -> str:
-    """One line for a system error of a file: it is missing or unreadable, or the disk is full or fails."""
+    """Return one line for a system error: a file is missing or unreadable, or the disk is full or fails."""
     files = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
     return f"{files or 'a file'}: {error.strerror}; check the file, its folder and the disk, and start again"
 
@@ -139,7 +139,7 @@ def _global_options(
 
 
 def _not_called() -> None:
-    """Stand in the list of commands for one that is not imported."""
+    """Placeholder in the list of commands for a command that is not imported."""
 
 
 def _is_installed(point: EntryPoint) -> bool:
@@ -154,8 +154,8 @@ def _load(point: EntryPoint, extra: str | None) -> Callable[..., Any] | typer.Ty
     """
     if not _is_installed(point):
         raise ExtraMissingError(
-            f"the command {point.name!r} is not part of this installation, which is the service alone (as in its container image): "
-            f"where maps are built, {how_to_install(extra)}",
+            f"the command {point.name!r} is not part of this installation, which has only the service (as in its "
+            f"container image): to get the command, {how_to_install(extra)}",
             field=point.name,
         )
     try:
@@ -186,7 +186,7 @@ def _extra_missing(command: str, extra: str | None, error: ModuleNotFoundError) 
     # The extra of a command contains that of the server.
     if needed is not None and (extra is None or needed != "server"):
         extra = needed
-    remedy = how_to_install(extra) if extra else "install the packages it needs"
+    remedy = how_to_install(extra) if extra else "install the packages that it needs"
     if package_of(error) in _NOT_EVERYWHERE:
-        remedy = f"it is to be had {_NOT_EVERYWHERE[package_of(error)]} alone ({remedy})"
+        remedy = f"it is available only {_NOT_EVERYWHERE[package_of(error)]} ({remedy})"
     return ExtraMissingError(f"the command {command!r} needs the package {error.name!r}: {remedy}", field=command)

@@ -131,10 +131,10 @@ def check_only(settings: "Settings") -> None:
     for localizer in engine.registry:
         manifest = localizer.bundle.manifest
         typer.echo(f"map {manifest.name} {manifest.version}: opens and answers")
-    typer.echo(f"keys of {callers} callers" if callers else "no keys")
+    typer.echo(f"keys: {callers}" if callers else "no keys")
     if refused := engine.registry.refused:
         reasons = "; ".join(each.reason for each in refused)
-        raise BundleError(f"of the map bundles {len(refused)} cannot be mounted: {reasons}")
+        raise BundleError(f"{len(refused)} of the map bundles cannot be mounted: {reasons}")
     if not len(engine.registry):
         typer.echo(_no_map_yet(settings))
 
@@ -197,7 +197,10 @@ def _answer_by_workers(settings: "Settings") -> None:
                 table = SharedServingTable(memory, number)
                 if (error := reserve(counts)) is not None:
                     del os.environ[METRICS_FOLDER]
-                    told = f"worker {number} counts for itself alone until it is started again ({counts}: {error.strerror})"
+                    told = (
+                        f"worker {number} reports only its own metrics until it is started again ({counts}: "
+                        f"{error.strerror})"
+                    )
                     typer.echo(f"streetfix: {told}", err=True)
                 _answer(shared, listener, health, table=table, ready=ready, says_where=number == 0)
 
@@ -430,15 +433,15 @@ def _say_where(
         typer.echo(_no_map_yet(engine.settings))
     shown = f"[{host}]" if ":" in host else host
     if grpc_port is not None:
-        typer.echo(f"serving gRPC at {shown}:{grpc_port} (what it can do: proto/, or by reflection)")
+        typer.echo(f"serving gRPC at {shown}:{grpc_port} (API: proto/, or server reflection)")
     if health is not None:
         address, health_port = health.getsockname()[:2]
         typer.echo(f"health at http://{f'[{address}]' if ':' in address else address}:{health_port}/readyz")
     if engine.settings.console:
         typer.echo(f"console at {scheme}://{shown}:{port}/console/")
-    typer.echo(f"serving at {scheme}://{shown}:{port} (what it can do: /openapi.json; stop: Ctrl-C)")
+    typer.echo(f"serving at {scheme}://{shown}:{port} (API: /docs). Stop with Ctrl-C.")
 
 
 def _no_map_yet(settings: "Settings") -> str:
     where = ", ".join(map(str, settings.maps))
-    return f"no map yet: not ready (/readyz answers 503) until a map bundle lies in {where}"
+    return f"no map yet: not ready (/readyz answers 503) until there is a map bundle in {where}"

@@ -18,7 +18,7 @@ def main() -> None:
         if EXTRA_OF_PACKAGE.get(package_of(error)) != "server":
             raise
         sys.exit(
-            f"streetfix: the command line needs the package {package_of(error)!r}, which the client alone does not have: "
-            f"{how_to_install('server')}"
+            f"streetfix: the command line needs the package {package_of(error)!r}, which an installation of only the "
+            f"client does not have: {how_to_install('server')}"
         )
     run()

@@ -124,7 +124,7 @@ class _Supervisor:
             else:
                 if number in self._answered:
                     how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-                    typer.echo(f"streetfix: worker {number} ended by itself and is started again ({how})", err=True)
+                    typer.echo(f"streetfix: worker {number} ended unexpectedly and is started again ({how})", err=True)
                 self._not_running(number)
 
     def _not_running(self, number: int) -> None:

@@ -30,9 +30,7 @@ def check_camera_file(path: Path) -> tuple[Finding, LocalizeRequest | None]:
     try:
         document = path.read_bytes()
     except OSError as error:
-        return Finding(
-            "camera file", "problem", f"{path}: it cannot be read ({error.strerror})", "check --camera"
-        ), None
+        return Finding("camera file", "problem", f"{path}: cannot be read ({error.strerror})", "check --camera"), None
     try:
         request = parsed(document, LocalizeRequest)
     except StreetfixError as error:
@@ -60,7 +58,7 @@ def check_principal_point(camera: Camera) -> Finding:
     """
     x, y = (camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height
     text = (
-        f"({camera.cx:g}, {camera.cy:g}) lies {abs(x - 0.5):.0%} of the width and {abs(y - 0.5):.0%} of the height from the centre "
+        f"({camera.cx:g}, {camera.cy:g}) is {abs(x - 0.5):.0%} of the width and {abs(y - 0.5):.0%} of the height from the centre "
         f"of {camera.width}x{camera.height}"
     )
     if max(abs(x - 0.5), abs(y - 0.5)) <= OFF_CENTRE:
@@ -87,7 +85,7 @@ def check_field_of_view(camera: Camera) -> Finding:
     text = f"{across:.0f} degrees across and {down:.0f} degrees down"
     if LEAST_VIEW_DEG <= across <= MOST_VIEW_DEG:
         return Finding("field of view", "ok", text)
-    remedy = f"usual are {LEAST_VIEW_DEG:g} to {MOST_VIEW_DEG:g} degrees across; {_CALIBRATION}"
+    remedy = f"usual values are {LEAST_VIEW_DEG:g} to {MOST_VIEW_DEG:g} degrees across; {_CALIBRATION}"
     return Finding("field of view", "warning", text, remedy)
 
 
@@ -100,7 +98,9 @@ def check_focal_lengths(camera: Camera) -> Finding:
     text = f"fx {camera.fx:g} px, fy {camera.fy:g} px"
     if abs(camera.fx - camera.fy) <= FOCAL_DIFFERENCE * max(camera.fx, camera.fy):
         return Finding("focal lengths", "ok", text)
-    remedy = f"pixels are nearly square, so fx and fy differ little: {_CALIBRATION}, and check that no side was stretched alone"
+    remedy = (
+        f"pixels are nearly square, so fx and fy differ little: {_CALIBRATION}, and check that no side was stretched"
+    )
     return Finding("focal lengths", "warning", text, remedy)
 
 

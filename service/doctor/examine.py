@@ -116,7 +116,7 @@ def _pair(request: LocalizeRequest, rgb: Path, depth: Path) -> Generator[Finding
         encoded = encoded_of(request, rgb.read_bytes(), depth.read_bytes())
     except OSError as error:
         yield Finding(
-            "images", "problem", f"{error.filename}: it cannot be read ({error.strerror})", "check --rgb and --depth"
+            "images", "problem", f"{error.filename}: cannot be read ({error.strerror})", "check --rgb and --depth"
         )
         return None
     except StreetfixError as error:

@@ -132,8 +132,8 @@ def check_ground(ground: Ground) -> Finding:
         taken_m = USUAL_HEIGHT_M if ground.given_m is None else ground.given_m
         sent = ", and send camera.height_m and gravity" if ground.given_m is None else ", and send gravity"
         return Finding(
-            check, "warning", f"no ground is seen: {ground.share:.0%} of the pixels between {NEAR_M:g} and {REACH_M:g} m lie on one plane "
-            "below the camera",
+            check, "warning", f"no ground is visible: {ground.share:.0%} of the pixels between {NEAR_M:g} and {REACH_M:g} m lie on one "
+            "plane below the camera",
             f"the service then assumes a level camera {taken_m:g} m above the ground; let the image show the ground{sent}",
         )  # fmt: skip
     text = (
@@ -156,9 +156,14 @@ def check_ground(ground: Ground) -> Finding:
             check, "warning", f"{text}: more than {MOST_TILT_DEG:g} degrees off level",
             "mount the camera more level, and send gravity in every request (camera frame: x right, y down, z forward)",
         )  # fmt: skip
+    if ground.origin == "assumed":
+        return Finding(
+            check, "warning", f"{text}, but the service does not accept this plane as ground and assumes {ground.found_by_service_m:.2f} m",
+            "send camera.height_m and gravity in every request, or let the image show more of the ground",
+        )  # fmt: skip
     if abs(ground.height_m - ground.found_by_service_m) > AGREE_M:
         return Finding(
-            check, "warning", f"{text}, but the service takes it for {ground.found_by_service_m:.2f} m ({ground.origin})",
+            check, "warning", f"{text}, but the service uses {ground.found_by_service_m:.2f} m ({ground.origin})",
             "send camera.height_m and gravity in every request",
         )  # fmt: skip
     if ground.given_m is None and not USUAL_RANGE_M[0] <= ground.height_m <= USUAL_RANGE_M[1]:

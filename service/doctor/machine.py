@@ -79,8 +79,12 @@ def check_instructions(cpuinfo: Path = Path("/proc/cpuinfo")) -> Finding:
     except OSError:
         flags = None
     if machine != "x86_64" or flags is None:
-        return Finding("instruction set", "ok", f"{machine}; the system does not tell whether it has AVX2")
-    told = "with AVX2" if "avx2" in flags[1].split() else "without AVX2: answers are the same, and take somewhat longer"
+        return Finding("instruction set", "ok", f"{machine}; the system does not report whether it has AVX2")
+    told = (
+        "with AVX2"
+        if "avx2" in flags[1].split()
+        else "without AVX2: the answers are the same, but take somewhat longer"
+    )
     return Finding("instruction set", "ok", f"x86-64 {told}")
 
 
@@ -122,7 +126,7 @@ def _named_memory(shm: Path) -> str:
     try:
         free = shutil.disk_usage(shm).free
     except OSError:
-        return f"there is no {shm}, and the service does not use it"
+        return f"{shm} does not exist, and the service does not use it"
     return f"{shm} has {free // _MIB} MiB left, and the service does not use it"
 
 
@@ -154,7 +158,7 @@ def check_port(option: str, host: str, port: int | None, *, named: bool) -> Find
     """
     check = option.removeprefix("--").replace("-", " ")
     if port is None:
-        return Finding(check, "ok", f"not asked for ({option})")
+        return Finding(check, "ok", f"not requested ({option})")
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         socket.create_server((host, port), family=family).close()

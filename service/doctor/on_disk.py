@@ -23,7 +23,7 @@ def check_bundle(path: Path) -> tuple[Finding, MapBundle | None]:
         return Finding.of_error("map", error), None
     manifest = bundle.manifest
     text = (
-        f"{manifest.name}, version {manifest.version}: the hashes of its {len(manifest.files)} files are right; "
+        f"{manifest.name}, version {manifest.version}: the hashes of its {len(manifest.files)} files match; "
         f"{manifest.counts.places} places"
     )
     return Finding("map", "ok", text), bundle
@@ -43,9 +43,7 @@ def check_encoder(bundle: MapBundle) -> tuple[Finding, Localizer | None]:
     except StreetfixError as error:
         return Finding.of_error("encoder", error), None
     encoder = localizer.encoder
-    text = (
-        f"reads views of {encoder.rows} x {encoder.columns} cells and gives descriptors of {encoder.dimension} numbers"
-    )
+    text = f"reads views of {encoder.rows} x {encoder.columns} cells and returns descriptors of {encoder.dimension} numbers"
     return Finding("encoder", "ok", text), localizer
 
 
@@ -65,7 +63,8 @@ def check_calibration(bundle: MapBundle, false_accept_rate: float) -> Finding:
     least = calibration.least_false_accept_rate
     if false_accept_rate < least:
         return Finding(
-            "calibration", "problem", f"the setting false_accept_rate is {false_accept_rate:g}, and the map can promise {least:g}",
+            "calibration", "problem",
+            f"the setting false_accept_rate is {false_accept_rate:g}, but the calibration of the map supports {least:g} or more",
             f"set STREETFIX_FALSE_ACCEPT_RATE to {least:g} or more",
         )  # fmt: skip
     site = "not corrected for this site" if calibration.site is None else "corrected for this site"
@@ -94,7 +93,7 @@ def check_streets(bundle: MapBundle) -> Finding:
     """
     if bundle.streets is None:
         return Finding(
-            "streets", "warning", "the map has no streets: answers name none",
-            "make streets.geojson (streetfix streets) in the dataset and build the map again",
+            "streets", "warning", "the map has no streets: answers have no street",
+            "create streets.geojson (streetfix streets) in the dataset and build the map again",
         )  # fmt: skip
     return Finding("streets", "ok", f"{len(bundle.streets)} streets or sections")

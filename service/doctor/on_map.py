@@ -51,17 +51,17 @@ def check_rows(
     check = "same heights"
     if not camera_rows.any():
         return Finding(
-            check, "warning", "the camera sees no row of the map's view grid", "level the camera, and check its intrinsics"
+            check, "warning", "the camera covers no row of the view grid of the map", "level the camera, and check its intrinsics"
         )  # fmt: skip
     overlap = float(np.mean(lidar_rows[camera_rows]))
     text = (
-        f"the LiDAR of the survey saw {overlap:.0%} of the rows that the camera sees (camera {_span(camera_rows, elevations_rad)}, "
+        f"the LiDAR of the survey covers {overlap:.0%} of the rows that the camera covers (camera {_span(camera_rows, elevations_rad)}, "
         f"LiDAR {_span(lidar_rows, elevations_rad)})"
     )
     if overlap >= LEAST_OVERLAP:
         return Finding(check, "ok", text)
     return Finding(
-        check, "warning", text, "level the camera so that both see the same heights, or survey with a LiDAR that sees them"
+        check, "warning", text, "level the camera so that both cover the same heights, or survey with a LiDAR that covers them"
     )  # fmt: skip
 
 
@@ -113,10 +113,16 @@ def check_answer(pair: Pair, localizer: Localizer, false_accept_rate: float) -> 
     confidence = "no confidence" if answer.confidence is None else f"confidence {answer.confidence:.3f}"
     text = f"{answer.status} ({confidence})"
     if answer.status == "LOCALIZED":
+        if answer.extrapolated:
+            outside = ", ".join(f"{name} {size:+.1f}" for name, size in answer.extrapolated)
+            return Finding(
+                "answer", "warning", f"{text}, extrapolated: {outside} standard deviations from the mean of the calibration data",
+                "the confidence may be wrong; calibrate the map on queries like this one (streetfix calibrate)",
+            )  # fmt: skip
         return Finding("answer", "ok", text)
     reasons = "; ".join(f"{each.check}: {each.remedy}" for each in answer.reasons)
     remedy = (
         reasons
-        or "all evidence is in the range of the calibration: the place may be outside the map, or look like another one"
+        or "all confidence features are in the range of the calibration data; the place may be outside the map, or look like another place"
     )
     return Finding("answer", "warning", text, remedy)

@@ -111,7 +111,7 @@ def _size_told(check: str, rgb: Rgb, depth_m: Depth, camera: PinholeCamera) -> F
         )  # fmt: skip
     if swapped:
         image = f"the {swapped[0]} image"
-        text = f"width and height of {image} are swapped: it is rotated against the camera ({sizes})"
+        text = f"width and height of {image} are swapped: it is rotated relative to the camera ({sizes})"
         return Finding(check, "problem", text, f"rotate {image} by 90 degrees")
     return None
 
@@ -155,7 +155,7 @@ def check_depth_unit(pair: Pair) -> tuple[Finding, Pair]:
                 f"set depth.scale_m to {tried.scale_m:g}: the median is then {_plain(tried_m)} m, and the checks below use it",
             ), tried  # fmt: skip
     return Finding(
-        check, "warning", f"the median depth is {_plain(median_m)} m, and usual are {least_m:g} to {most_m:g} m",
+        check, "warning", f"the median depth is {_plain(median_m)} m, but usual values are {least_m:g} to {most_m:g} m",
         "check depth.scale_m and depth.kind (z, range or disparity)",
     ), pair  # fmt: skip
 

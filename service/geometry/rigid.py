@@ -10,6 +10,8 @@ Points = Float64[NDArray[np.float64], "N 3"]
 
 #: Rotation from the optical frame (x right, y down, z forward) to the body frame (x forward, y left, z up), REP-103.
 R_BODY_OPTICAL: NDArray[np.float64] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+#: Two positions are the same if they differ by no more than this, metres: rounding of files and of arithmetic.
+SAME_M = 1e-6
 
 
 def transform_from(rotation: Rotation, translation_m: Float64[NDArray[np.float64], "3"]) -> Transform:

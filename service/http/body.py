@@ -49,7 +49,7 @@ async def read_body(request: Request, *, max_bytes: int, hold: Hold) -> bytearra
     body = bytearray()
     async for chunk in request.stream():
         if len(body) + len(chunk) > max_bytes:
-            raise _too_large(f"over {len(body)} bytes so far", max_bytes)
+            raise _too_large(f"more than {len(body)} bytes", max_bytes)
         if len(body) + len(chunk) > hold.bytes:
             hold.grow(max(_STEP, len(chunk)))
         body += chunk
@@ -147,7 +147,7 @@ class Asking:
             async with asyncio.timeout(settings.request_timeout_s):
                 return await asyncio.wrap_future(self.engine.admission.submit(work))
         except TimeoutError as error:
-            raise DeadlineError(f"not done within {settings.request_timeout_s:g} s; try again later") from error
+            raise DeadlineError(f"not finished within {settings.request_timeout_s:g} s; try again later") from error
 
     async def __call__(self, request: Request, work: Callable[[Body], Awaitable[Response]]) -> Response:
         """Read the body and run the work on it.
@@ -163,9 +163,7 @@ class Asking:
         """
         settings = self.engine.settings
         if self._bodies.locked():
-            raise BusyError(
-                f"{self.engine.admission.capacity} requests are coming in or wait already; try again in a second"
-            )
+            raise BusyError(f"the queue is full ({self.engine.admission.capacity} requests); try again in a second")
         try:
             with self.engine.memory.hold() as hold:
                 async with asyncio.timeout(settings.request_timeout_s), self._bodies:
@@ -203,7 +201,7 @@ def split_multipart(body: bytearray, content_type: str, *, max_parts: int) -> di
         end = _next(body, delimiter, after_line)
         name, content = _part(body, after_line, end)
         if name in parts:
-            raise RequestError(f"the part {name!r} comes twice; send each part once", field=name)
+            raise RequestError(f"the part {name!r} occurs twice; send each part once", field=name)
         parts[name] = content
         start = end + len(delimiter)
     return parts
@@ -237,9 +235,7 @@ def document_of(parts: dict[str, bytes]) -> bytes:
         RequestError: the part is missing.
     """
     if "request" not in parts:
-        raise RequestError(
-            "the part 'request' is missing; send the JSON that says what the pictures are", field="request"
-        )
+        raise RequestError("the part 'request' is missing; send it as JSON that describes the images", field="request")
     return parts["request"]
 
 
@@ -282,7 +278,7 @@ async def _gone(request: Request) -> None:
 
 def _too_large(what: str, max_bytes: int) -> TooLargeError:
     return TooLargeError(
-        f"the body has {what}; this service takes {max_bytes}: send smaller or better compressed pictures"
+        f"the body has {what}, but the limit is {max_bytes} bytes; send smaller or more compressed images"
     )
 
 
@@ -295,7 +291,7 @@ def _boundary_of(content_type: str) -> bytes:
         )
     boundary = header.get_param("boundary")
     if not isinstance(boundary, str) or not _BOUNDARY.fullmatch(boundary):
-        raise _malformed("its content type names no valid boundary")
+        raise _malformed("the content type has no valid boundary")
     return boundary.encode("ascii")
 
 
@@ -326,9 +322,9 @@ def _name_from(disposition: str) -> str:
 def _next(body: bytearray, token: bytes, start: int, *, at_most: int | None = None) -> int:
     found = body.find(token, start, None if at_most is None else start + at_most)
     if found < 0:
-        raise _malformed("it ends before its last boundary")
+        raise _malformed("the body ends before its last boundary")
     return found
 
 
 def _malformed(what: str) -> RequestError:
-    return RequestError(f"the body is no well-formed multipart/form-data: {what}; let an HTTP library build it")
+    return RequestError(f"the body is not valid multipart/form-data: {what}; build it with an HTTP library")

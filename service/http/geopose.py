@@ -19,11 +19,11 @@ def sure_geopose(answer: LocalizeAnswer) -> GeoPose:
     """
     if answer.status != "LOCALIZED":
         raise NoPoseError(
-            f"the answer is {answer.status} (confidence {answer.confidence or 0:.3f}), and GeoPose cannot say so; ask for "
-            "application/json to see its hypotheses, send a prior or more frames, or look another way"
+            f"the answer is {answer.status} (confidence {answer.confidence or 0:.3f}), and GeoPose cannot express uncertainty; request "
+            "application/json to see the hypotheses, send a prior or more frames, or turn the camera"
         )
     if answer.geopose is None:
         raise NotGeoreferencedError(
-            f"the map {answer.map.name!r} is not georeferenced, so its poses have no place on the Earth; ask for application/json"
+            f"the map {answer.map.name!r} is not georeferenced; request application/json, or build the map with a georeference"
         )
     return answer.geopose

@@ -4,7 +4,6 @@
 """
 
 import re
-import uuid
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -15,6 +14,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.contract.request_id import REQUEST_ID, request_id_of
 from service.errors import ForbiddenError, ForbiddenHostError, ForbiddenOriginError, StreetfixError, UnauthorizedError
 from service.http.problems import internal_error, problem_of, problem_response
 from service.runtime.keys import Caller, KeyRing, presented_key
@@ -22,10 +22,8 @@ from service.runtime.logs import log_request
 from service.runtime.settings import Settings, is_loopback
 from service.runtime.tracing import NO_SPAN, Tracing
 
-HEADER = "X-Request-Id"
 #: Status in metrics and log if the client disconnects before the answer, as nginx uses it.
 _CLIENT_CLOSED = 499
-_ACCEPTABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 #: Paths for an orchestrator, which has no key and asks under any name.
 _OPEN = frozenset({"/livez", "/readyz"})
@@ -64,8 +62,7 @@ class RequestIdMiddleware:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        given = headers.get(HEADER, "")
-        request_id = given if _ACCEPTABLE.fullmatch(given) else uuid.uuid4().hex
+        request_id = request_id_of(headers.get(REQUEST_ID, ""))
         span = NO_SPAN if self._tracing is None else self._tracing.begin("rest", headers.get("traceparent"))
         scope.setdefault("state", {}).update(request_id=request_id, span=span)
         started, began, status = False, perf_counter(), 0
@@ -74,7 +71,7 @@ class RequestIdMiddleware:
             nonlocal started, status
             if message["type"] == "http.response.start":
                 started, status = True, message["status"]
-                MutableHeaders(scope=message)[HEADER] = request_id
+                MutableHeaders(scope=message)[REQUEST_ID] = request_id
             await send(message)
 
         try:
@@ -227,16 +224,16 @@ class HostMiddleware:
         hosts = [value.decode("latin-1") for name, value in headers if name == b"host"]
         if len(hosts) != 1 or not self._hosts.allows(hosts[0]):
             raise ForbiddenHostError(
-                f"the header Host is {_shown(hosts)}, which is no name of this service; ask by its address or by localhost, or "
-                "let its operator add the name to STREETFIX_ALLOWED_HOSTS"
+                f"the header Host is {_shown(hosts)}, which is not allowed; use an IP address or localhost, or let the operator "
+                "add the name to STREETFIX_ALLOWED_HOSTS"
             )
         origins = [value.decode("latin-1") for name, value in headers if name == b"origin"]
         if method in _SAFE or not origins:
             return
         if len(origins) > 1 or not self._hosts.allows_origin(origins[0], hosts[0]):
             raise ForbiddenOriginError(
-                f"the header Origin is {_shown(origins)}, another origin than {_shown(hosts)}; send this from the service's own "
-                "page or from a program, or let its operator add the page's host to STREETFIX_ALLOWED_HOSTS"
+                f"the header Origin is {_shown(origins)}, but the host is {_shown(hosts)}; send the request from the service's own "
+                "page or from a program, or let the operator add the host of the page to STREETFIX_ALLOWED_HOSTS"
             )
 
 
@@ -279,7 +276,7 @@ def require_operator(request: Request, settings: Settings) -> None:
     caller: Caller | None = getattr(request.state, "caller", None)
     allowed = is_loopback(settings.host) if caller is None else caller.operator
     if not allowed:
-        raise ForbiddenError("this is for operators: use a key that streetfix keys --operator made")
+        raise ForbiddenError("this request needs operator rights; use a key made with streetfix keys --operator")
 
 
 def _needs_no_key(path: str) -> bool:

@@ -35,7 +35,7 @@ def main(arguments: list[str]) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     elif not path.exists() or path.read_text() != text:
-        sys.stderr.write(f"{path} is not what the code says; run: python -m service.http.openapi\n")
+        sys.stderr.write(f"{path} does not match the code; run: python -m service.http.openapi\n")
         return 1
     return 0
 

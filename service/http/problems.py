@@ -44,10 +44,10 @@ class Problem(BaseModel):
             "examples": [
                 {
                     "type": "/problems/image-size",
-                    "title": "A picture's size or aspect does not fit the camera's intrinsics.",
+                    "title": "The image size does not match the camera intrinsics.",
                     "status": 422,
-                    "detail": "The picture `depth` has 640x360 pixels, which is not the camera's 640x480 at any scale; "
-                    "send the whole picture, or the intrinsics of the picture sent.",
+                    "detail": "The image `depth` has 640x360 pixels, but the camera has 640x480, so the aspect ratios differ; "
+                    "send the whole image, or the intrinsics of the image that you sent.",
                     "code": "image-size",
                     "field": "depth",
                     "request_id": "4f0c8f4c0d5e4c0f9b4a3a1d4b7f9e21",
@@ -56,12 +56,12 @@ class Problem(BaseModel):
         }
     )
 
-    type: str = Field(description="a relative URI; docs/problems.md has a section for each")
+    type: str = Field(description="a relative URI; docs/problems.md lists all problems")
     title: str
     status: int
-    detail: str = Field(description="what happened, the offending value, what to do")
+    detail: str = Field(description="what happened, the wrong value, and what to do")
     code: str = Field(description="the last part of the type; stable")
-    field: str | None = Field(description="dotted path of the field at fault")
+    field: str | None = Field(description="dotted path of the invalid field")
     request_id: str
 
 
@@ -119,7 +119,8 @@ def internal_error(error: Exception, request_id: str) -> Response:
     error.__traceback__ = None
     problem = Problem(
         type="/problems/internal", title="Internal error.", status=500,
-        detail="The service failed on this request; tell its operator the request id.", code="internal", field=None, request_id=request_id,
+        detail="The service failed on this request; report the request id to its operator.",
+        code="internal", field=None, request_id=request_id,
     )  # fmt: skip
     return problem_response(problem)
 
@@ -143,7 +144,7 @@ async def _on_http(request: Request, error: Exception) -> Response:
     code = CODE_OF_STATUS.get(error.status_code, "bad-request")
     problem = Problem(
         type=f"/problems/{code}", title=HTTPStatus(error.status_code).phrase + ".", status=error.status_code,
-        detail=f"{request.method} {path}: {error.detail}; the API is described at /openapi.json",
+        detail=f"{request.method} {path}: {error.detail}; see the API at /openapi.json",
         code=code, field=None, request_id=request.state.request_id,
     )  # fmt: skip
     return problem_response(problem, error.headers)

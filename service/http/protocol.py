@@ -95,7 +95,7 @@ class BoundedHttp(HttpToolsProtocol):
         """
         if len(self.pipeline) >= PIPELINED:
             # httptools turns this into a parser error, which gets status 400.
-            raise ValueError(f"more than {PIPELINED} requests sent ahead")
+            raise ValueError(f"more than {PIPELINED} pipelined requests")
         self._in_head = False
         self._head_came()
         super().on_headers_complete()
@@ -122,7 +122,7 @@ class BoundedHttp(HttpToolsProtocol):
     def _refuse(self) -> None:
         _log.info("head_too_large")
         if self.cycle is None or self.cycle.response_complete:
-            self.send_400_response("The head of the request is too large.")
+            self.send_400_response("The request header is too large.")
         else:  # an answer may already be in transfer
             self.transport.close()
 

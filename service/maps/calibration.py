@@ -12,7 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from service.errors import BundleError
 
 #: Limit of a normalised feature, standard deviations. It stops extrapolation beyond the calibration data.
-_CLIP = 4.0
+CLIP = 4.0
+#: Largest distance of a right answer from the ground truth, metres on the ground. Confidence is the probability of a right answer.
+RIGHT_M = 1.0
 
 
 class _Frozen(BaseModel):
@@ -59,7 +61,7 @@ def expanded(
         mean: mean of each feature.
         spread: standard deviation of each feature.
     """
-    z = np.clip((evidence - np.array(mean)) / np.array(spread), -_CLIP, _CLIP)
+    z = np.clip((evidence - np.array(mean)) / np.array(spread), -CLIP, CLIP)
     one, other = np.triu_indices(z.shape[-1])
     wide: Float64[NDArray[np.float64], "*n T"] = np.concatenate([z, z[..., one] * z[..., other]], axis=-1)
     return wide
@@ -136,7 +138,7 @@ class Calibration(_Frozen):
                 raise ValueError(f"{name}: mean and spread need {count} numbers, weights {len(terms(count))}")
         rates = [threshold.false_accept_rate for threshold in self.thresholds]
         if rates != sorted(rates):
-            raise ValueError("thresholds must come by rising false-accept rate")
+            raise ValueError("thresholds must be sorted by rising false-accept rate")
         return self
 
     def confidence(self, evidence: Float64[NDArray[np.float64], "*n F"]) -> Float64[NDArray[np.float64], "*n"]:
@@ -188,9 +190,9 @@ def read_calibration(document: bytes, *, path: str) -> Calibration | None:
     try:
         content = json.loads(document)
     except (ValueError, RecursionError) as error:
-        raise _defect(path, "it is no JSON") from error
+        raise _defect(path, "not valid JSON") from error
     if not isinstance(content, dict) or not isinstance(content.get("calibrated"), bool):
-        raise _defect(path, "it does not say whether the map is calibrated")
+        raise _defect(path, "the field calibrated is missing or not a boolean")
     if not content["calibrated"]:
         return None
     try:

@@ -20,7 +20,7 @@ STATISTICS_FILE = "voxels.npy"
 
 #: Largest coordinate of a pose (m). Largest error of an entry of R R^T, which allows for rounded numbers.
 MOST_AWAY_M, _SKEW = 1e7, 1e-3
-NO_POSE = f"a pose is not finite, stretches, mirrors, or lies more than {MOST_AWAY_M:g} m from the origin"
+NO_POSE = f"a pose is not finite, scales, mirrors, or is more than {MOST_AWAY_M:g} m from the origin"
 
 #: Content of ``calibration.json`` for a map without calibration.
 UNCALIBRATED = {"calibrated": False, "why": "nobody calibrated it; answers carry confidence null"}

@@ -105,12 +105,12 @@ class ViewIndex:
         try:
             index = faiss.read_index(str(path), faiss.IO_FLAG_MMAP_IFC)
         except RuntimeError as error:
-            raise BundleError(f"{path}: this is no FAISS index; copy or build the bundle again", field=FILE) from error
+            raise BundleError(f"{path}: not a FAISS index; copy or build the bundle again", field=FILE) from error
         # A downcast index refers to the original index and must not outlive it. So only its type is kept.
         kind = type(faiss.downcast_index(index))
         if not issubclass(kind, faiss.IndexFlat) or index.metric_type != faiss.METRIC_INNER_PRODUCT:
             raise BundleError(
-                f"{path}: the index is a {kind.__name__}, not a flat index of inner products; build the bundle again",
+                f"{path}: the index is a {kind.__name__}, not a flat inner-product index; build the bundle again",
                 field=FILE,
             )
         found = cls(index)

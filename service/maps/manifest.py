@@ -159,9 +159,10 @@ def read_manifest(directory: Path) -> Manifest:
     try:
         data = path.read_bytes()
     except OSError as error:
+        missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        why = "is missing" if missing else f"cannot be read ({error.strerror})"
         raise dataset_error(directory) or BundleError(
-            f"{path}: there is no readable manifest ({error.strerror}): give the folder that build-map wrote",
-            field=FILE,
+            f"{directory}: not a map bundle: {FILE} {why}; give the folder that build-map wrote", field=FILE
         ) from error
     _require_format(path, data)
     try:
@@ -186,7 +187,7 @@ def dataset_error(directory: Path) -> BundleError | None:
     except OSError:  # a folder that nobody may read; the caller reports it
         return None
     return BundleError(
-        f"{directory} is a dataset, not a map bundle: run `streetfix build-map {directory} --out BUNDLE`, and give BUNDLE",
+        f"{directory}: a dataset, not a map bundle; run `streetfix build-map {directory} --out BUNDLE`, and give BUNDLE",
         field=FILE,
     )
 
@@ -196,11 +197,11 @@ def _require_format(path: Path, data: bytes) -> None:
         document = json.loads(data)
         found = document["format"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise BundleError(f"{path}: this is not a manifest; copy or build the bundle again", field=FILE) from error
+        raise BundleError(f"{path}: not a valid manifest; copy or build the bundle again", field=FILE) from error
     if found != FORMAT:
         raise BundleError(
-            f"{path}: format {found!r}, but this program reads format {FORMAT}: build the map with this release, "
-            "or serve it with the one that made it",
+            f"{path}: format {found!r}, but this release reads format {FORMAT}; build the map with this release, "
+            "or serve it with the release that built it",
             field=FILE,
         )
 
@@ -208,17 +209,17 @@ def _require_format(path: Path, data: bytes) -> None:
 def _require_consistent(path: Path, manifest: Manifest) -> None:
     grid = manifest.grid
     if manifest.version != manifest.expected_version():
-        what = f"version {manifest.version} is not that of its content ({manifest.expected_version()})"
+        what = f"version {manifest.version} does not match the content ({manifest.expected_version()})"
     elif len(manifest.rows_seen) != grid.rows:
         what = f"rows_seen has {len(manifest.rows_seen)} entries for {grid.rows} rows of the view grid"
     elif grid.elevation_bottom_deg >= grid.elevation_top_deg or grid.min_range_m >= grid.max_range_m:
-        what = "the limits of the view grid are the wrong way round"
+        what = "the limits of the view grid are reversed"
     elif "lidar_height_m" not in manifest.parameters:
-        what = "parameters lacks lidar_height_m"
+        what = "parameters.lidar_height_m is missing"
     elif wrong := not_on_earth(manifest.georeference):
         what = f"georeference: {wrong}"
     elif bad := [name for name in manifest.files if not is_confined(name)]:
-        what = f"the file {bad[0]!r} would lie outside the bundle"
+        what = f"the file {bad[0]!r} is outside the bundle"
     else:
         return
     raise BundleError(f"{path}: {what}; copy or build the bundle again", field=FILE)

@@ -147,38 +147,38 @@ class MapBundle:
 def _require_files(path: Path, manifest: Manifest, *, verify: bool) -> None:
     for name in _NEEDED:
         if name not in manifest.files:
-            raise _defect(path / name, "the manifest does not list it")
+            raise _defect(path / name, "not listed in the manifest")
     for name, entry in manifest.files.items():
         file = path / name
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
-            raise _defect(file, "it is missing, or lies outside the bundle")
+            raise _defect(file, "missing, or outside the bundle")
         try:
             size = file.stat().st_size
             found = sha256_of(file) if verify and size == entry.size else entry.sha256
         except OSError as error:  # for example, somebody removes the bundle meanwhile
-            raise _defect(file, f"it cannot be read ({error.strerror})") from error
+            raise _defect(file, f"cannot be read ({error.strerror})") from error
         if size != entry.size:
-            raise _defect(file, f"it has {size} bytes instead of {entry.size}")
+            raise _defect(file, f"{size} bytes instead of {entry.size}")
         if found != entry.sha256:
-            raise _defect(file, "its content is not what the manifest says")
+            raise _defect(file, "the hash does not match the manifest")
     if manifest.files[parts.ENCODER_FILE].sha256 != manifest.encoder_sha256:
-        raise _defect(path / parts.ENCODER_FILE, "it is not the encoder that made the descriptors")
+        raise _defect(path / parts.ENCODER_FILE, "not the encoder that computed the descriptors")
 
 
 def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:  # for example, somebody removes the bundle meanwhile
-        raise _defect(path, f"it cannot be read ({error.strerror})") from error
+        raise _defect(path, f"cannot be read ({error.strerror})") from error
 
 
 def _load(path: Path, *, expected: np.dtype[Any] | None) -> NDArray[Any]:
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, *NPY_HEADER_ERRORS) as error:
-        raise _defect(path, f"it is no array of ours ({error})") from error
+        raise _defect(path, f"not a valid NPY array ({error})") from error
     if expected is not None and (array.dtype != expected or array.ndim != 1):
-        raise _defect(path, f"it holds {array.dtype} in {array.ndim} dimensions")
+        raise _defect(path, f"{array.dtype} in {array.ndim} dimensions instead of {expected} in 1")
     return array  # type: ignore[no-any-return]  # np.load is not typed for one array
 
 
@@ -186,9 +186,9 @@ def _json_object(content: bytes, path: Path) -> dict[str, Any]:
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise _defect(path, "it is no JSON") from error
+        raise _defect(path, "not valid JSON") from error
     if not isinstance(document, dict):
-        raise _defect(path, "it is no JSON object")
+        raise _defect(path, "not a JSON object")
     return document
 
 
@@ -216,15 +216,18 @@ def _require_consistent(bundle: MapBundle) -> None:
     }
     for name, (has, expected, what) in found.items():
         if has != expected:
-            raise _defect(path / name, f"it holds {has} {what} instead of {expected}")
+            raise _defect(path / name, f"{has} {what} instead of {expected}")
     if bundle.view_index.dimension != counts.descriptor_size:
-        raise _defect(path / index.FILE, f"descriptors of {bundle.view_index.dimension}, not {counts.descriptor_size}")
+        raise _defect(
+            path / index.FILE,
+            f"descriptors of {bundle.view_index.dimension} numbers instead of {counts.descriptor_size}",
+        )
     if bundle.view_place.min() < 0 or bundle.view_place.max() >= counts.places:
-        raise _defect(path / parts.VIEWS_FILE, "a view belongs to a place that is not there")
+        raise _defect(path / parts.VIEWS_FILE, "a view refers to a missing place")
     if bundle.place_street.min() < -1 or bundle.place_street.max() >= streets_found:
-        raise _defect(path / parts.PLACES_FILE, "a place lies in a street that is not there")
+        raise _defect(path / parts.PLACES_FILE, "a place refers to a missing street")
     if not np.array_equal(bundle.view_place, np.repeat(np.arange(counts.places), bundle.manifest.headings)):
-        raise _defect(path / parts.VIEWS_FILE, "views do not lie place by place, a fan each")
+        raise _defect(path / parts.VIEWS_FILE, "the views are not sorted by place, with all headings of each place")
     if not np.isfinite(bundle.view_heading_rad).all():
         raise _defect(path / parts.VIEWS_FILE, "a heading is not finite")
     if not parts.are_poses(bundle.T_map_place):

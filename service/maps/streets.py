@@ -73,10 +73,10 @@ class Streets:
             BundleError: the document is no FeatureCollection, or a feature is invalid. The message names the feature's index.
         """
         if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
-            raise _defect("it is not a GeoJSON FeatureCollection")
+            raise _defect("not a GeoJSON FeatureCollection")
         features = document.get("features")
         if not isinstance(features, list):
-            raise _defect("it has no list of features")
+            raise _defect("the list of features is missing")
         return cls(tuple(_street_from(feature, number) for number, feature in enumerate(features)))
 
     def index_at(self, position: Float64[NDArray[np.float64], "2"]) -> int:
@@ -109,7 +109,7 @@ def _street_from(feature: Any, number: int) -> Street:
         raise _defect(f"feature {number} has the section {section!r}, not beginning, end or null")
     if not all(isinstance(text, str) for text in (identity, street, name)) or type(class_index) is not int:
         raise _defect(
-            f"feature {number} has an id, street or name that is no text, or a class_index that is no integer"
+            f"feature {number} has an id, street or name that is not text, or a class_index that is not an integer"
         )
     if kind not in ("Polygon", "MultiPolygon"):
         raise _defect(f"feature {number} is a {kind}, not a Polygon or MultiPolygon")
@@ -117,7 +117,7 @@ def _street_from(feature: Any, number: int) -> Street:
     try:
         rings = tuple(tuple(np.array(ring, np.float64)[:, :2].copy() for ring in rings) for rings in polygons)
     except (TypeError, ValueError, IndexError) as error:
-        raise _defect(f"the coordinates of feature {number} are no rings of points") from error
+        raise _defect(f"the coordinates of feature {number} are not rings of points") from error
     if any(len(ring) < 4 or not np.isfinite(ring).all() for polygon in rings for ring in polygon):
         raise _defect(f"a ring of feature {number} has fewer than four points, or one that is not finite")
     return Street(identity, street, section, name, class_index, rings)

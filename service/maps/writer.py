@@ -38,7 +38,7 @@ def write_bundle(out: Path, content: BundleContent, *, overwrite: bool = False) 
         BundleError: the path exists, the content is inconsistent, or the file system reports an error.
     """
     if out.exists() and not overwrite:
-        raise BundleError(f"{out}: there is something of that name already; choose another, or overwrite it")
+        raise BundleError(f"{out}: already exists; choose another --out or pass --overwrite")
     _require_valid(content)
     partial: Path | None = None
     try:
@@ -50,7 +50,7 @@ def write_bundle(out: Path, content: BundleContent, *, overwrite: bool = False) 
         _put_in_place(partial, out)
     except OSError as error:
         raise BundleError(
-            f"{out}: the bundle cannot be written ({error.strerror}); make room or choose another folder"
+            f"{out}: the bundle cannot be written ({error.strerror}); free disk space or choose another folder"
         ) from error
     finally:
         if partial is not None and partial.exists():
@@ -120,7 +120,9 @@ def _manifest_of(folder: Path, content: BundleContent, names: list[str]) -> Mani
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise BundleError(f"the map cannot be described: {where}: {first['msg']}", field=where) from error
+        raise BundleError(
+            f"the manifest is invalid: {where}: {first['msg']}; correct this value of the map", field=where
+        ) from error
 
 
 def _counts_of(content: BundleContent) -> Counts:
@@ -143,11 +145,11 @@ def _require_valid(content: BundleContent) -> None:
     if content.rows_seen.shape != (content.grid.rows,):
         what = f"rows_seen has {len(content.rows_seen)} entries for {content.grid.rows} rows"
     elif len(content.T_map_place) == 0 or len(content.view_place) == 0:
-        what = "it has no place or no view"
+        what = "there are no places or no views"
     elif content.view_place.min() < 0 or content.view_place.max() >= len(content.T_map_place):
-        what = "a view belongs to a place that is not there"
+        what = "a view refers to a missing place"
     elif content.place_street.min() < -1 or content.place_street.max() >= named:
-        what = f"a place lies in a street that is not among the {named} of streets.geojson"
+        what = f"a place refers to a street that is not among the {named} of streets.geojson"
     elif not np.isfinite(content.descriptors).all():
         what = "a descriptor is not finite"
     elif not parts.are_poses(content.T_map_place):
@@ -155,12 +157,12 @@ def _require_valid(content: BundleContent) -> None:
     elif wrong := manifest.not_on_earth(content.georeference):
         what = f"georeference: {wrong}"
     elif "lidar_height_m" not in content.parameters:
-        what = "parameters lacks lidar_height_m"
+        what = "parameters.lidar_height_m is missing"
     else:
         if content.cloud is not None:
             content.cloud.require_consistent()
         return
-    raise BundleError(f"the map {content.name!r} contradicts itself: {what}; mend what builds it")
+    raise BundleError(f"the map {content.name!r} is inconsistent: {what}; fix the program that builds it")
 
 
 def sha256_of(path: Path) -> str:

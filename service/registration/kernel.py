@@ -354,7 +354,9 @@ def agree(
         or any(len(each) != count for each in (z, sigma, q))
         or not 0 <= pixel.min() <= pixel.max() < drawn.size
     ):
-        raise ValueError(f"{count} points do not lie on a picture of {drawn.shape}")
+        raise ValueError(
+            f"{count} points: expected at least one, arrays of equal length, and pixels inside the image {drawn.shape}"
+        )
     arrays = [np.ascontiguousarray(*given) for given in (
         (drawn, np.float32), (pixel, np.int32), (z, np.float64), (sigma, np.float64), (q, np.float32),
     )]  # fmt: skip

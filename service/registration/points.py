@@ -33,6 +33,8 @@ LEAST_NOISE = 1e-6
 #: Least standard deviation of a stereo rig's disparity, px. Errors of rectification and of whole-pixel matching are equal over a whole
 #: surface, so no image shows them. SGBM on KITTI against the scans: 0.45 to 0.85 px (decision 0131).
 MATCHING_PX = 0.5
+#: Focal length (px) times baseline (m) of the stereo camera that is assumed where none is known. Simulation and training model it too.
+FOCAL_BASELINE_PX_M = 80.0
 
 
 class _Blocks(Structure):
@@ -83,7 +85,7 @@ class PointSettings:
             ValueError: ``ground_share`` is out of range.
         """
         if not 0 <= self.ground_share < 1:
-            raise ValueError(f"ground_share: {self.ground_share:g} is not at least 0 and less than 1")
+            raise ValueError(f"ground_share: {self.ground_share:g} must be at least 0 and less than 1")
 
 
 class DepthNoise(NamedTuple):
@@ -109,10 +111,10 @@ def inverse_depth_noise(
             total. None if the depth has no disparity.
 
     Returns:
-        The noise, at least ``LEAST_NOISE``. An image with too few measurements gets a quarter of a pixel at 80 px m.
+        The noise, at least ``LEAST_NOISE``. An image with too few measurements gets a quarter of a pixel at ``FOCAL_BASELINE_PX_M``.
     """
     near, far = (_noise_between(depth_m, step) for step in NOISE_STEPS)
-    near = near or far or 0.25 / 80.0
+    near = near or far or 0.25 / FOCAL_BASELINE_PX_M
     total = max(near, far)
     if focal_baseline_px_m is not None:
         total = float(np.hypot(total, MATCHING_PX / focal_baseline_px_m))
@@ -180,7 +182,7 @@ def blocks_of(
 
 def points_of(
     depth_m: Float32[NDArray[np.float32], "H W"], camera: PinholeCamera, R_level_camera: Rotation, height_m: float,
-    settings: PointSettings, *, noise: float | None = None, focal_baseline_px_m: float = 80.0,
+    settings: PointSettings, *, noise: float | None = None, focal_baseline_px_m: float = FOCAL_BASELINE_PX_M,
 ) -> QueryPoints:  # fmt: skip
     """Thin a depth image to points in its level frame.
 

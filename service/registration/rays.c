@@ -1,4 +1,4 @@
-/* Casts the rays of a small image on the map's surfels, and sums the normal equations of its inverse depths; see sight.py and rays.py.
+/* Casts the rays of a small image on the map's surfels, and sums the normal equations of its inverse depths; see visibility.py and rays.py.
  *
  * Plain C without global state, so several threads may call it at once. Python checks sizes and pointers. */
 #include <math.h>

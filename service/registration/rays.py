@@ -76,7 +76,7 @@ class RaySettings(DiscSettings):
             ValueError: ``patch`` is out of range.
         """
         if not 1 <= self.patch <= MOST_PATCH:
-            raise ValueError(f"patch: {self.patch} is not from 1 to {MOST_PATCH}")
+            raise ValueError(f"patch: {self.patch} must be 1 to {MOST_PATCH}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

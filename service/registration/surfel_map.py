@@ -96,14 +96,18 @@ class SurfelMap:
         """
         for name, (dtype, shape) in _EXPECTED.items():
             if name not in arrays:
-                raise _defect(name, "it is missing")
+                raise _defect(name, "missing")
             array = arrays[name]
             fits = len(shape) == array.ndim and all(w in (-1, has) for w, has in zip(shape, array.shape, strict=True))
             if array.dtype != dtype or not fits or not array.flags["C_CONTIGUOUS"]:
-                raise _defect(name, f"it holds {array.dtype} of shape {array.shape}")
+                raise _defect(
+                    name, f"{array.dtype} of shape {array.shape} instead of {dtype} of shape {shape} (-1: any)"
+                )
         brightness = arrays.get(BRIGHTNESS)
         if brightness is not None and (brightness.dtype, brightness.shape) != (_BRIGHT, arrays["surfels"].shape):
-            raise _defect(BRIGHTNESS, f"it holds {brightness.dtype} of shape {brightness.shape}")
+            raise _defect(
+                BRIGHTNESS, f"{brightness.dtype} of shape {brightness.shape} instead of one {_BRIGHT} per surfel"
+            )
         frame = np.array(arrays["grid_frame"])
         grid = NearestGrid(frame[:3], float(frame[3]), arrays["grid_block"], arrays["grid_nearest"])
         found = cls(np.array(arrays["origin"]), arrays["surfels"], np.array(arrays["tiles"]), grid, brightness)
@@ -118,12 +122,12 @@ class SurfelMap:
             BundleError: an index refers outside its array, or a number is not finite or otherwise invalid. The error names the array.
         """
         if not np.isfinite(self.grid.origin_m).all() or not self.grid.cell_m > 0:
-            raise _defect("grid_frame", "it is no frame")
+            raise _defect("grid_frame", "the origin is not finite, or the cell size is not positive")
         _require_indices("grid_block", self.grid.block, len(self.grid.nearest))
         _require_indices("grid_nearest", self.grid.nearest, len(self.surfels))
         first, count = self.tiles[:, 2], self.tiles[:, 3]
         if not np.isfinite(self.tiles).all() or (first < 0).any() or (count < 0).any():
-            raise _defect("tiles", "a number makes no sense")
+            raise _defect("tiles", "a number is not finite, or an index is negative")
         if len(self.tiles) and (first + count).max() > len(self.surfels):
             raise _defect("tiles", "a tile ends beyond the surfels")
         if not np.isfinite(self.origin_m).all():
@@ -137,7 +141,7 @@ class SurfelMap:
 
 def _require_indices(name: str, indices: NDArray[np.int32], count: int) -> None:
     if indices.size and (int(indices.min()) < -1 or int(indices.max()) >= count):
-        raise _defect(name, f"it points outside the {count} there are")
+        raise _defect(name, f"an index is outside the {count} entries")
 
 
 def _defect(name: str, what: str) -> BundleError:

@@ -75,7 +75,7 @@ class Admission:
         """
         with self._lock:
             if self._taken == self.capacity:
-                raise BusyError(f"{self.capacity} requests are being worked on or wait already; try again in a second")
+                raise BusyError(f"the queue is full ({self.capacity} requests); try again in a second")
             self._taken += 1
             self._tell()
         # The cell is emptied when the task is over. A cancelled future stays in the pool's queue until a worker takes it, and must
@@ -85,7 +85,7 @@ class Admission:
             future = self._pool.submit(self._run, cell)
         except RuntimeError as error:
             self._give_back()
-            raise BusyError("the service is shutting down; try another instance") from error
+            raise BusyError("the service is stopping; use another instance") from error
         del task
 
         def over(_: Future[T]) -> None:
@@ -253,11 +253,11 @@ class Hold:
         needed, limit = self.bytes + count, self._budget.limit
         if needed > limit:
             raise TooLargeError(
-                f"the request needs {in_mib(needed)} of memory, more than the {in_mib(limit)} that this service has for requests; send "
-                "smaller pictures or fewer at once, or let its operator give it more (STREETFIX_REQUEST_MEMORY_MIB)"
+                f"the request needs {in_mib(needed)} of memory, but this service has {in_mib(limit)} for requests; send "
+                "smaller or fewer images, or let the operator raise STREETFIX_REQUEST_MEMORY_MIB"
             )
         raise BusyError(
-            f"the memory for requests is taken (this one needs {in_mib(needed)} of {in_mib(limit)}); try again in a second"
+            f"the memory for requests is full (this request needs {in_mib(needed)} of {in_mib(limit)}); try again in a second"
         )
 
     def shrink_to(self, count: int) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +35,7 @@ from service.runtime.serving_table import ServingTable
 from service.runtime.settings import Settings
 from service.runtime.threads import limit_pools, usable_cores
 from service.runtime.tracing import Tracing
+from service.timing import StageTimer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -180,51 +180,45 @@ class Engine:
             StreetfixError: as for ``localize``; with several pairs its field is under ``frames.K``.
         """
         localizer = self.registry.get(encoded[0].map_name)
-        frames, decode_ms = [], 0.0
+        frames, timer = [], StageTimer()
         for number, (each, T) in enumerate(zip(encoded, T_reference_camera, strict=True)):
             try:
-                frame, ms = self.look_up(localizer, each)
+                frame = self.look_up(localizer, each, timer)
             except StreetfixError as error:
                 if len(encoded) > 1:
                     error.field = f"frames.{number}.{error.field}" if error.field else f"frames.{number}"
                 raise
             frames.append(replace(frame, T_reference_camera=T))
-            decode_ms += ms
-        return self.answer(localizer, tuple(frames), decode_ms)
+        return self.answer(localizer, tuple(frames), timer)
 
-    def answer(self, localizer: Localizer, frames: tuple[Frame, ...], decode_ms: float) -> Located:
+    def answer(self, localizer: Localizer, frames: tuple[Frame, ...], timer: StageTimer) -> Located:
         """Answer frames that were looked up, and count the answer in the metrics.
 
         Args:
             localizer: of the map in which the frames were looked up.
             frames: the reference first.
-            decode_ms: duration of decoding all frames.
+            timer: of the request.
         """
-        answer = localizer.answer(frames)
-        timings = replace(answer.timings, decode_ms=decode_ms, total_ms=answer.timings.total_ms + decode_ms)
-        timed = replace(answer, timings=timings)
-        self.metrics.answered(timed, localizer.bundle, frames=len(frames))
+        answer = localizer.answer(frames, timer)
+        self.metrics.answered(answer, localizer.bundle, frames=len(frames))
         if self.settings.console:  # only the console reads them
-            self.last_answers.add(timed, localizer.bundle, frames=len(frames))
-        return Located(timed, localizer.bundle)
+            self.last_answers.add(answer, localizer.bundle, frames=len(frames))
+        return Located(answer, localizer.bundle)
 
-    def look_up(self, localizer: Localizer, encoded: EncodedQuery) -> tuple[Frame, float]:
+    def look_up(self, localizer: Localizer, encoded: EncodedQuery, timer: StageTimer) -> Frame:
         """Decode an image pair and retrieve its most similar places.
 
         Args:
             localizer: of the map to search.
             encoded: the pair.
-
-        Returns:
-            The frame, and the duration of decoding in milliseconds.
+            timer: of the request.
 
         Raises:
             StreetfixError: as for ``localize``.
         """
-        started = perf_counter()
-        query = replace(self._decode(encoded, localizer.bundle.grid), prior=prior_in(encoded, localizer.bundle))
-        decoded = perf_counter()
-        return localizer.look_up(query), 1e3 * (decoded - started)
+        with timer.stage("decode"):
+            query = replace(self._decode(encoded, localizer.bundle.grid), prior=prior_in(encoded, localizer.bundle))
+        return localizer.look_up(query, timer)
 
     def close(self) -> None:
         """Wait for running requests and drop waiting ones."""
@@ -276,8 +270,8 @@ def warm_up(false_accept_rate: float, localizer: Localizer) -> None:
     bundle = localizer.bundle
     if bundle.calibration is not None and false_accept_rate < (least := bundle.calibration.least_false_accept_rate):
         raise BundleError(
-            f"{bundle.path}: the setting false_accept_rate is {false_accept_rate:g}, less than the {least:g} that this map's "
-            f"calibration can promise, so every request would be refused; set STREETFIX_FALSE_ACCEPT_RATE to {least:g} or more",
+            f"{bundle.path}: the setting false_accept_rate is {false_accept_rate:g}, but the calibration of this map "
+            f"supports {least:g} or more, so the service would refuse every request; set STREETFIX_FALSE_ACCEPT_RATE to {least:g} or more",
             field="false_accept_rate",
         )
     camera = PinholeCamera(64, 48, 32.0, 32.0, 31.5, 23.5)
@@ -302,7 +296,7 @@ def prior_in(encoded: EncodedQuery, bundle: MapBundle) -> Prior | None:
     earth = bundle.earth
     if earth is None:
         raise RequestError(
-            f"prior.wgs84: the map {bundle.name!r} is not georeferenced; send prior.position in its own frame", field="prior.wgs84"
+            f"prior.wgs84: the map {bundle.name!r} is not georeferenced; send prior.position in the map frame", field="prior.wgs84"
         )  # fmt: skip
     latitude_deg, longitude_deg = encoded.prior_wgs84
     return replace(encoded.prior, position_m=earth.to_map(latitude_deg, longitude_deg, earth.height_m)[:2])

@@ -63,7 +63,7 @@ def require_known(environment: Mapping[str, str], settings: type[BaseModel]) -> 
     if unknown:
         told = ", ".join(f"{name}{did_you_mean(name.upper(), known)}" for name in unknown)
         raise RequestError(
-            f"no setting of the service: {told}; docs/serving.md lists the settings. Variables of other programs may begin "
+            f"unknown setting: {told}; docs/serving.md lists the settings. Variables of other programs may begin "
             f"with {CLIENT_PREFIX}",
             field=unknown[0],
         )

@@ -58,12 +58,12 @@ class KeyRing:
             text = content.decode("utf-8")
         except OSError as error:
             raise KeysError(
-                f"{path}: the file of API keys cannot be read ({why_unreadable(path, error)}); streetfix keys makes its lines"
+                f"{path}: the key file cannot be read ({why_unreadable(path, error)}); streetfix keys creates its lines"
             ) from error
         except UnicodeDecodeError as error:
-            raise KeysError(f"{path}: no file of API keys ({error}); streetfix keys makes its lines") from error
+            raise KeysError(f"{path}: not a key file ({error}); streetfix keys creates its lines") from error
         if len(content) > _MOST_BYTES:
-            raise KeysError(f"{path}: over {_MOST_BYTES} bytes is no file of API keys")
+            raise KeysError(f"{path}: the key file exceeds {_MOST_BYTES // 2**20} MiB; remove unused keys")
         found: dict[str, Caller] = {}
         for number, line in enumerate(text.splitlines(), 1):
             words = line.split("#", 1)[0].split()
@@ -72,13 +72,15 @@ class KeyRing:
             right = words[2:] in ([], ["operator"]) and len(words) > 1
             if not right or not _NAME.fullmatch(words[0]) or not _HASH.fullmatch(words[1]):
                 raise KeysError(
-                    f"{path}: line {number} is not NAME SHA256 (64 hexadecimal digits); streetfix keys makes such a line"
+                    f"{path}: line {number} is not NAME SHA256 (64 hexadecimal digits); create it with streetfix keys"
                 )
             if words[1] in found or words[0] in [caller.name for caller in found.values()]:
-                raise KeysError(f"{path}: line {number} has the name or the key of a line before it; keep one of them")
+                raise KeysError(
+                    f"{path}: line {number} repeats the name or the key of an earlier line; keep one of them"
+                )
             found[words[1]] = Caller(words[0], operator=len(words) == 3)
         if not found:
-            raise KeysError(f"{path}: there is no key in it, so nobody could ask; streetfix keys NAME >> {path}")
+            raise KeysError(f"{path}: the key file is empty; add a key with streetfix keys NAME >> {path}")
         return cls(found, path)
 
     def reload(self) -> None:
@@ -101,13 +103,13 @@ class KeyRing:
         """
         if not presented:
             raise UnauthorizedError(
-                "this service asks for an API key; send it as Authorization: Bearer KEY, or as X-Api-Key"
+                "this service requires an API key; send it as Authorization: Bearer KEY, or as X-Api-Key"
             )
         digest = hash_of(presented[:_MOST_KEY])
         for known, caller in self.caller_of.items():
             if hmac.compare_digest(known, digest):
                 return caller
-        raise UnauthorizedError("the API key is none of this service's; ask its operator for one")
+        raise UnauthorizedError("the API key is unknown to this service; request one from its operator")
 
 
 def presented_key(authorization: str | None, api_key: str | None) -> str | None:

@@ -17,7 +17,7 @@ from service.runtime.serving_table import Key, MapVersion, ServingTable, Table
 _log = logging.getLogger("streetfix.maps")
 #: Maximum number of refused bundles that an answer names. The log names all of them.
 MOST_REFUSED = 20
-NO_MAP = "no map is mounted; put a map bundle into the maps folder, or ask again when the operator has done so"
+NO_MAP = "no map is mounted; add a map bundle to the maps folder, or try again when the operator has added one"
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class MapRegistry:
         if not bundles:
             where = ", ".join(map(str, paths))
             raise BundleError(
-                f"{where}: {_NO_MANIFEST}" if paths else "there is no map to serve: give a folder that build-map wrote"
+                f"{where}: {_NO_MANIFEST}" if paths else "no map bundle given; give a folder that build-map wrote"
             )
         return cls([Localizer.open(MapBundle.open(path), provider=provider) for path in bundles], provider=provider)
 
@@ -141,9 +141,9 @@ class MapRegistry:
                     return localizer
         mounted = ", ".join(maps)
         what = (
-            "several maps are mounted and the request names none" if name is None else f"there is no map {name[:100]!r}"
+            "several maps are mounted, and the request names none" if name is None else f"map {name[:100]!r} not found"
         )
-        raise UnknownMapError(f"{what}; mounted: {mounted}", field="map")
+        raise UnknownMapError(f"{what}; mounted maps: {mounted}", field="map")
 
     def versions(self, name: str) -> tuple[Localizer, ...]:
         """Return every mounted version of a map, the newest first; empty for an unknown map.
@@ -266,7 +266,7 @@ def twin_error(path: Path, other: Path, manifest: Manifest) -> BundleError:
         manifest: of either.
     """
     return BundleError(
-        f"{path} and {other} are both version {manifest.version} of {manifest.name!r}: mount one of them"
+        f"{path} and {other} have the same version {manifest.version} of {manifest.name!r}; mount only one of them"
     )
 
 
@@ -291,16 +291,16 @@ def bundle_paths(path: Path) -> list[Path]:
         inside = sorted(child for child in path.iterdir() if not child.name.startswith("."))
         files = [child for child in inside if child.is_file()]
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise BundleError(f"{path}: there is no such folder; give a map bundle that build-map wrote") from error
+        raise BundleError(f"{path}: folder not found; give a map bundle that build-map wrote") from error
     except OSError as error:
-        raise BundleError(f"{path}: it cannot be read ({error.strerror}); let the service read it") from error
+        raise BundleError(f"{path}: cannot be read ({error.strerror}); give the service read permission") from error
     found = [child for child in inside if _has_manifest(child)]
     if files and not found:
         raise dataset_error(path) or BundleError(f"{path}: {_NO_MANIFEST}")
     return found
 
 
-_NO_MANIFEST = f"there is no {MANIFEST_FILE} in it: it is no map bundle, or its build was cut off"
+_NO_MANIFEST = f"not a map bundle: {MANIFEST_FILE} is missing; build the map again, or copy the whole bundle"
 
 
 def _has_manifest(folder: Path) -> bool:

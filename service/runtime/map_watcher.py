@@ -194,7 +194,7 @@ class MapWatcher:
             return self._refuse(bundle.path, bundle.stamp, error)
         except Exception as error:  # any defect refuses only this bundle; the others are still processed
             _log.exception("map_failed path=%s", bundle.path)
-            what = f"{bundle.path}: it cannot be opened ({type(error).__name__}); the service's log says more"
+            what = f"{bundle.path}: cannot be opened ({type(error).__name__}); see the log of the service"
             return self._refuse(bundle.path, bundle.stamp, BundleError(what))
         self._failed.pop(bundle.path, None)
         return None
@@ -286,7 +286,9 @@ class MapWatcher:
         if strict:
             self._require_no_twins()
             if not self._registry.has_open:
-                raise BundleError(f"there is no map bundle in {', '.join(map(str, self._paths))}; build-map writes one")
+                raise BundleError(
+                    f"no map bundle found in {', '.join(map(str, self._paths))}; build one with build-map"
+                )
 
     def _require_no_twins(self) -> None:
         seen: dict[Key, Path] = {}

@@ -65,8 +65,8 @@ def budget_of(settings: "Settings", *, threads: int) -> MemoryBudget:
     least = max(LEAST_BYTES, 3 * body)
     if left < least:
         raise RequestError(
-            f"{of} {in_mib(max(0, left))} for the requests of each of {settings.workers} processes with {threads} threads, and "
-            f"{in_mib(least)} is the least (three of the largest requests); give it more memory, fewer workers or threads, or a smaller "
+            f"{of} {in_mib(max(0, left))} for the requests of each of {settings.workers} processes with {threads} threads, but "
+            f"{in_mib(least)} are needed (three of the largest requests); set more memory, fewer workers or threads, or a smaller "
             "limits.max_request_bytes",
             field="request_memory_mib",
         )

@@ -19,12 +19,12 @@ from service.localization.answer import Answer, Timings
 from service.maps.reader import MapBundle
 from service.runtime.admission import Admission, MemoryBudget
 from service.runtime.map_registry import MOST_REFUSED, MapRegistry
+from service.timing import STAGES
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512, 1.0, 2.0, 5.0, 10.0, 30.0)
 _SHARES = (0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 _FOLDER = "PROMETHEUS_MULTIPROC_DIR"
-_STAGES = ("decode", "fuse", "encode", "search", "register")
 
 
 class Metrics:
@@ -70,6 +70,12 @@ class Metrics:
             "streetfix_stage_seconds", "Stages of an answer.", ["stage"], buckets=_SECONDS, registry=self._registry
         )
         self._answers = Counter("streetfix_answers", "Answers by status.", ["map", "status"], registry=self._registry)
+        self._extrapolated = Counter(
+            "streetfix_extrapolated",
+            "Answers with a confidence feature outside the range of the calibration data, by feature.",
+            ["map", "feature"],
+            registry=self._registry,
+        )
         self._confidence = Histogram(
             "streetfix_confidence",
             "Confidence of calibrated answers.",
@@ -79,7 +85,7 @@ class Metrics:
         )
         self._frames = Histogram(
             "streetfix_frames",
-            "Picture pairs that an answer rests on.",
+            "Image pairs that an answer uses.",
             buckets=(1, 2, 3, 4, 5, 8, 16),
             registry=self._registry,
         )
@@ -102,9 +108,11 @@ class Metrics:
         """
         self._answers.labels(bundle.name, answer.status).inc()
         self._frames.observe(frames)
+        for feature, _ in answer.extrapolated:
+            self._extrapolated.labels(bundle.name, feature).inc()
         if answer.confidence is not None:
             self._confidence.labels(bundle.name).observe(answer.confidence)
-        for stage in _STAGES:
+        for stage in STAGES:
             self._stage_seconds.labels(stage).observe(_milliseconds(answer.timings, stage) / 1e3)
 
     def batched(self, requests: int) -> None:

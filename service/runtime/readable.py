@@ -21,7 +21,7 @@ def why_unreadable(path: Path, error: OSError) -> str:
     try:
         found = path.stat()
     except OSError:
-        return f"permission denied: {who}, and may not enter a folder of its path; chmod the folder to 755, or chown it to {user}"
+        return f"permission denied: {who}, and has no access to a folder of the path; chmod the folder to 755, or chown it to {user}"
     mode = f"{stat.S_IMODE(found.st_mode):o}"
     return (
         f"permission denied: {who}, and the file belongs to user {found.st_uid} and group {found.st_gid} with mode {mode}; "

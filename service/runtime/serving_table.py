@@ -182,11 +182,13 @@ class ServingTable:
             known = table.maps.get(name)
             if known is None:
                 raise UnknownMapError(
-                    f"there is no map {name[:100]!r}; mounted: {', '.join(table.maps) or 'none'}", field="map"
+                    f"map {name[:100]!r} not found; mounted maps: {', '.join(table.maps) or 'none'}", field="map"
                 )
             if not table.is_mounted((name, version)):
                 there = ", ".join(each.version for each in known.versions)
-                raise UnknownMapError(f"there is no version {version!r} of {name!r}; open: {there}", field="version")
+                raise UnknownMapError(
+                    f"version {version!r} of {name!r} not found; mounted versions: {there}", field="version"
+                )
             return replace(table, maps={**table.maps, name: replace(known, serving=version)})
 
         self._change(change)
@@ -305,8 +307,8 @@ class SharedMemory:
         content = _to_json(table)
         if len(content) > _MOST_BYTES:
             raise BundleError(
-                f"{len(table.maps)} maps are too many for several workers to agree on (their list has {len(content)} bytes); "
-                "serve some of them by another service"
+                f"{len(table.maps)} maps are too many for several workers (their list has {len(content)} bytes); "
+                "serve some of them with another service"
             )
         at = self._slot(count)
         self._memory[at : at + len(content)] = content

@@ -12,6 +12,7 @@ from service.geometry.rigid import Transform, inverse
 from service.localization.localizer import Localizer
 from service.retrieval.frame import Frame
 from service.runtime.engine import EncodedQuery, Engine, Located
+from service.timing import StageTimer
 
 #: Maximum number of frames that an answer uses. Five frames resolve a street of repeating blocks (decision log).
 MOST_FRAMES = 5
@@ -52,12 +53,13 @@ class Stream:
             localizer is not last
         ):  # the first frame, or another map version serves now: the kept frames were retrieved from the old one
             before.clear()
-        frame, decode_ms = self._engine.look_up(localizer, encoded)
+        timer = StageTimer()
+        frame = self._engine.look_up(localizer, encoded, timer)
         kept: list[Frame] = []
         if T_previous_camera is not None:
             back = inverse(T_previous_camera)
             kept = [replace(each, T_reference_camera=_closed(back @ each.T_reference_camera)) for each in before]
-        located = self._engine.answer(localizer, (frame, *kept), decode_ms)
+        located = self._engine.answer(localizer, (frame, *kept), timer)
         self._frames.extend([frame, *kept])
         return located, 1 + len(kept)
 
@@ -70,7 +72,7 @@ class Stream:
             self._name = encoded.map_name
         elif encoded.map_name not in (None, self._name, self._localizer.bundle.name):
             raise RequestError(
-                f"map: this stream asks {self._localizer.bundle.name!r} since its first frame, not {encoded.map_name!r}; "
+                f"map: this stream uses {self._localizer.bundle.name!r} since its first frame, not {encoded.map_name!r}; "
                 "open another stream for another map", field="map",
             )  # fmt: skip
         self._localizer = self._engine.registry.get(self._name)

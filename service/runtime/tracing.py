@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 
 from service.errors import ExtraMissingError, how_to_install
 from service.localization.answer import Timings
+from service.timing import STAGES
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace.export import SpanExporter
     from opentelemetry.trace import Span, Tracer
-
-_STAGES = ("decode", "fuse", "encode", "search", "register")
 
 
 class RequestSpan:
@@ -43,7 +42,7 @@ class RequestSpan:
         from opentelemetry.trace import set_span_in_context
 
         inside, at_ns = set_span_in_context(self._span), time.time_ns() - int(1e6 * timings.total_ms)
-        for stage in _STAGES:
+        for stage in STAGES:
             ms = float(getattr(timings, f"{stage}_ms"))
             child = self._tracer.start_span(stage, context=inside, start_time=at_ns)
             at_ns += int(1e6 * ms)
@@ -102,7 +101,7 @@ class Tracing:
             from opentelemetry.sdk.trace.sampling import ParentBased, TraceIdRatioBased
         except ImportError as error:
             raise ExtraMissingError(
-                f"traces_endpoint needs OpenTelemetry: {how_to_install('otel')}, or leave it out"
+                f"traces_endpoint needs OpenTelemetry; {how_to_install('otel')}, or omit the setting"
             ) from error
         provider = TracerProvider(
             resource=Resource.create({"service.name": "streetfix"}), sampler=ParentBased(TraceIdRatioBased(share))

@@ -20,6 +20,28 @@ def files_of(demo_map: Demo, name: str) -> list[str]:
     return [str(next((demo_map.samples / name).glob(f"{part}.*"))) for part in ("rgb", "depth", "request", "truth")]
 
 
+#: A wide spread of positions, as an answer without a pose has it.
+SPREAD = {
+    "mean": {"x": 0, "y": 0, "z": 0},
+    "covariance": [900.0, 0, 0, 0, 900.0, 0, 0, 0, 1],
+    "heading_std_deg": 40,
+    "hypotheses_weight": 0.2,
+}
+
+
+def refuse(page: Any, status: str, reasons: list[dict[str, Any]]) -> None:
+    """Let the service's answers come without a pose."""
+
+    def refused(route: Any) -> None:
+        response = route.fetch()
+        content = response.json()
+        without = {"status": status, "pose": None, "street": None, "spread": SPREAD, "reasons": reasons}
+        content["answer"] |= without
+        route.fulfill(response=response, json=content)
+
+    page.route("**/v1/explain", refused)
+
+
 def test_a_sample_pair_is_asked_with_one_click(url: str, page_of: Pages, shoot: Shoot) -> None:
     page = page_of()
     open_console(page, url)
@@ -53,29 +75,10 @@ def test_an_answer_that_is_refused_says_what_to_check(url: str, page_of: Pages, 
         {"check": "intrinsics", "evidence": {"similarity": -4.25}, "remedy": "compare fx and fy"},
         {"check": "baseline", "evidence": {"log_noise": 3.5, "points": -6.0}, "remedy": "check the stereo baseline"},
     ]
-    spread = {
-        "mean": {"x": 0, "y": 0, "z": 0},
-        "covariance": [900.0, 0, 0, 0, 900.0, 0, 0, 0, 1],
-        "heading_std_deg": 40,
-        "hypotheses_weight": 0.2,
-    }
     page = page_of()
     open_console(page, url)
     for number, told in (("01", reasons), ("02", [])):
-
-        def refused(route: Any, told: list[dict[str, Any]] = told) -> None:
-            response = route.fetch()
-            content = response.json()
-            content["answer"] |= {
-                "status": "OUT_OF_MAP",
-                "pose": None,
-                "street": None,
-                "spread": spread,
-                "reasons": told,
-            }
-            route.fulfill(response=response, json=content)
-
-        page.route("**/v1/explain", refused)
+        refuse(page, "OUT_OF_MAP", told)
         click_sample(page, number)
         page.unroute("**/v1/explain")
         assert page.inner_text(".verdict .status").upper() == "OUT OF MAP"
@@ -107,19 +110,64 @@ def test_a_wrong_file_is_told_with_what_to_do(url: str, demo_map: Demo, page_of:
     shoot(page, "wrong_file")
 
 
-def test_an_ambiguous_answer_shows_its_hypotheses(url: str, demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
+def test_an_ambiguous_answer_shows_its_hypotheses(url: str, page_of: Pages, shoot: Shoot) -> None:
+    """The hypotheses are those of the service, the status is put in its place."""
     page = page_of()
     open_console(page, url)
-    rgb, depth, request, _ = files_of(demo_map, "07")
-    page.set_input_files("#files", [rgb, depth])
-    # Whoever cannot live with one false answer in a million is not told LOCALIZED where two streets look alike.
-    asked = json.loads(Path(request).read_text()) | {"options": {"false_accept_rate": 1e-6, "neighbours": 8}}
-    page.fill("#request", json.dumps(asked))
-    page.click("button.primary")
-    page.wait_for_selector(".verdict.ambiguous", timeout=ANSWER_MS)
+    refuse(page, "AMBIGUOUS", [])
+    click_sample(page, "07")
+    assert page.locator(".verdict.ambiguous").count() == 1
     assert page.locator("section:has(h2:text('Hypotheses')) tbody tr").count() >= 2
     assert page.locator(".why").count() == 1
     shoot(page, "ambiguous")
+    page.unroute_all()
+
+
+def ask_with_other_focal_length(page: Any, demo_map: Demo, factor: float) -> None:
+    """Send sample 05 with fx and fy times the factor, and wait for the answer."""
+    rgb, depth, request, _ = files_of(demo_map, "05")
+    page.set_input_files("#files", [rgb, depth])
+    asked = json.loads(Path(request).read_text())
+    asked["camera"] |= {name: factor * asked["camera"][name] for name in ("fx", "fy")}
+    page.fill("#request", json.dumps(asked))
+    page.click("button.primary")
+    page.wait_for_selector(".verdict", timeout=ANSWER_MS)
+
+
+def test_a_focal_length_off_by_a_factor_of_two_is_named(
+    url: str, demo_map: Demo, page_of: Pages, shoot: Shoot
+) -> None:
+    page = page_of()
+    sent: list[str] = []
+    page.on("request", lambda request: sent.append(request.url))
+    open_console(page, url)
+    click_sample(page, "05")
+    page.wait_for_timeout(1000)
+    assert page.inner_text(".check") == ""  # the right camera: no further query
+    assert not any(each.endswith("/v1/localize") for each in sent)
+    page.evaluate("document.querySelector('.verdict').remove()")
+    ask_with_other_focal_length(page, demo_map, 2.0)
+    page.wait_for_selector(".check.found", timeout=ANSWER_MS)
+    assert page.inner_text(".check").startswith("With fx and fy halved, the ")
+    assert "Check the focal length" in page.inner_text(".check")
+    assert sum(each.endswith("/v1/localize") for each in sent) == 2
+    shoot(page, "focal_length")
+
+
+def test_a_check_of_the_focal_length_that_fails_keeps_the_answer(url: str, demo_map: Demo, page_of: Pages) -> None:
+    page = page_of()
+    open_console(page, url)
+    busy = {"title": "Too many requests.", "code": "busy", "status": 429, "detail": "Send it again later."}
+    page.route(
+        "**/v1/localize",
+        lambda route: route.fulfill(status=429, content_type="application/problem+json", body=json.dumps(busy)),
+    )
+    ask_with_other_focal_length(page, demo_map, 2.0)
+    page.wait_for_selector(".check:has-text('doubled failed: Too many requests.')", timeout=ANSWER_MS)
+    assert "the images" not in page.inner_text(".check")
+    assert page.locator(".check.found, .problem").count() == 0
+    assert page.locator(".verdict").count() == 1
+    page.unroute_all()
 
 
 def test_a_service_that_is_down_is_told_and_found_again(demo_map: Demo, page_of: Pages, shoot: Shoot) -> None:
@@ -135,7 +183,13 @@ def test_a_service_that_is_down_is_told_and_found_again(demo_map: Demo, page_of:
         assert page.inner_text(".state") == "does not answer"
         shoot(page, "service_down")
     with serving(demo_map.bundle, "--samples", demo_map.samples) as (other, _):
-        page.route(f"{url}/**", lambda route: route.continue_(url=route.request.url.replace(url, other)))
+
+        def elsewhere(route: Any) -> None:
+            """The service runs again, but at another port. It serves its own page only, so the origin changes as well."""
+            headers = route.request.headers | {"origin": other}
+            route.continue_(url=route.request.url.replace(url, other), headers=headers)
+
+        page.route(f"{url}/**", elsewhere)
         page.click("[data-sample='02']")
         page.wait_for_selector(".verdict", timeout=ANSWER_MS)
         assert page.inner_text(".state") == "serving"

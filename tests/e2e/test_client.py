@@ -117,7 +117,7 @@ def test_a_refusal_says_the_same_through_both(served: Served, pictures: Any, kin
         with pytest.raises(RefusedError) as caught:
             client.localize(*pictures, map="west")
         assert caught.value.problem == "unknown-map"
-        assert "mounted: tiny" in caught.value.detail
+        assert "mounted maps: tiny" in caught.value.detail
 
 
 @pytest.mark.parametrize("kind", ["rest", "grpc"])

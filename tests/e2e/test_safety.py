@@ -77,7 +77,7 @@ def test_with_keys_both_faces_ask_for_one_and_health_stays_open(start: Start, tm
     asked = [*COMMAND, "localize", "--url", rest, *files, "--camera", str(tmp_path / "request")]
     for environment, told in (({}, "unauthorized"), ({"STREETFIX_API_KEY": key}, "LOCALIZED")):
         done = subprocess.run(asked, env={"PATH": "", **environment}, capture_output=True, text=True, check=False)
-        assert told in done.stdout or "asks for an API key" in done.stderr
+        assert told in done.stdout or "requires an API key" in done.stderr
         assert (done.returncode == 0) == (told == "LOCALIZED")
     with grpc.insecure_channel(grpc_address) as channel:
         stub = LocalizationServiceStub(channel)
@@ -123,7 +123,7 @@ def test_bad_files_are_named_before_anything_listens(bundle_path: Path, tmp_path
     assert "line 1" in refused(bundle_path, api_keys=tmp_path / "bad")
     assert "nowhere" in refused(bundle_path, api_keys=tmp_path / "nowhere")
     assert "tls_certificate and tls_key go together" in refused(bundle_path, tls_certificate=tmp_path / "bad")
-    assert "no certificate with its key" in refused(
+    assert "not a certificate with its key" in refused(
         bundle_path, tls_certificate=tmp_path / "bad", tls_key=tmp_path / "bad"
     )
 

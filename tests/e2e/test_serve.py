@@ -72,7 +72,7 @@ def test_the_answer_is_printed_for_programs_as_the_service_gave_it(url: str, fil
 def test_a_problem_is_printed_and_the_command_fails(url: str, files: list[str]) -> None:
     done = localize(url, *files, "--map", "west")
     assert done.returncode == 1
-    assert "mounted: tiny [field map]" in done.stderr
+    assert "mounted maps: tiny [field map]" in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -101,4 +101,4 @@ def test_a_corrupt_bundle_stops_the_start_with_a_clear_message(bundle_copy: Path
     )
     assert (done.returncode, done.stdout) == (1, "")
     told = done.stderr.splitlines()[-1]  # the log above it names every bundle that is refused
-    assert re.fullmatch(r"streetfix: \S+places\.npy: its content is not what the manifest says; .*", told)
+    assert re.fullmatch(r"streetfix: \S+places\.npy: the hash does not match the manifest; .*", told)

@@ -33,11 +33,11 @@ def scene() -> tuple[np.ndarray, np.ndarray]:
 def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     rgb, depth_mm = scene()
-    fused = fuse(rgb, depth_mm.astype(np.float32) / np.float32(1000))
+    planes = fuse(rgb, depth_mm.astype(np.float32) / np.float32(1000)).planes
     cv2.imwrite(str(FOLDER / "rgb.png"), rgb[..., ::-1])
     cv2.imwrite(str(FOLDER / "depth.png"), depth_mm)
-    np.save(FOLDER / "fused.npy", fused, allow_pickle=False)
-    cv2.imwrite(str(FOLDER / "picture.png"), picture_of(fused, MAX_RANGE_M)[..., ::-1])
+    np.save(FOLDER / "fused.npy", planes, allow_pickle=False)
+    cv2.imwrite(str(FOLDER / "picture.png"), picture_of(planes, MAX_RANGE_M)[..., ::-1])
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from service.registration.kernel import STATE, SURFEL, QueryPoints, SolverOption
 from service.registration.register import Registered
 from service.registration.surfel_map import SurfelMap
 from service.scoring.candidates import Candidate
-from service.scoring.rendered_depth import Agreement
 
 Floats = NDArray[np.float64]
 
@@ -186,6 +185,7 @@ def candidate():
         R = rotation_z(np.deg2rad(heading_deg))
         registered = Registered(R, np.array(xyz, np.float64), scale, 0.0, 0.7, np.eye(8), 0)
         T_map_camera = transform_from(R @ R_BODY_OPTICAL, np.array(xyz, np.float64))
-        return Candidate(T_map_camera, registered, 0.8, 1.5, Agreement(-1.5, 0.02, 0.2, 0.1), support)
+        scores = {"similarity": 0.8, "place_m": 1.5, "likelihood": -1.5, "through": 0.02, "front": 0.2, "unmapped": 0.1}
+        return Candidate(T_map_camera, registered, scores, support)
 
     return made

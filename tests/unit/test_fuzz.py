@@ -1,4 +1,4 @@
-"""A short run over all that takes bytes from outside; ``make fuzz`` is the long one, with feedback of coverage."""
+"""A short fuzz run over every parser of untrusted input. ``make fuzz`` is the long run, guided by coverage."""
 
 import random
 from pathlib import Path

@@ -15,6 +15,7 @@ from benchmarks.serving.peers.hosts import Host, ask
 from benchmarks.serving.peers.venvs import REQUIREMENTS, PeerError, python_of
 from benchmarks.serving.ratios import MANY, Site
 from model_training.loadtest.payloads import Payload
+from service.geometry.rigid import SAME_M
 
 PEERS = tuple(REQUIREMENTS)
 OWN = "streetfix"
@@ -24,7 +25,7 @@ BARS = {"retrieval": 1.2, "full": 1.02}
 #: Share of the slowest server's saturating rate. At this rate all servers are still on the flat part of their latency
 #: curve.
 SHARE = 0.7
-SAME_M, COMPARED = 1e-6, 5
+COMPARED = 5
 
 
 @dataclass

@@ -30,7 +30,7 @@ def router_for() -> APIRouter:
     async def get_console_file(name: str, request: Request) -> Response:
         file = files.get(name or INDEX)
         if file is None:
-            raise HTTPException(404, "the console has no such file")
+            raise HTTPException(404, "console file not found")
         return _file_response(file, request)
 
     return router

@@ -39,7 +39,7 @@ def router_for(engine: Engine, version: str) -> APIRouter:
         """
         refused = engine.registry.refused[:MOST_REFUSED]
         if engine.is_draining:
-            raise NotReadyError("the service is leaving; ask another one")
+            raise NotReadyError("the service is stopping; use another instance")
         if not engine.is_ready:
             reasons = "".join(f"; {each.bundle} is not mounted: {each.reason}" for each in refused)
             raise NotReadyError(f"{NO_MAP}{reasons}")

@@ -86,5 +86,5 @@ def _require_version(accept: str) -> None:
     if found is None and "vnd.oscp" not in accept.lower():
         return
     if found is None or found[1].split(".")[0] != "2":
-        said = "none" if found is None else found[1]
-        raise HTTPException(400, f"the protocol's version is {said}; send Accept: {MEDIA_TYPE}")
+        said = "missing" if found is None else found[1]
+        raise HTTPException(400, f"the protocol version in Accept is {said}; send Accept: {MEDIA_TYPE}")

@@ -72,8 +72,8 @@ def test_a_grey_image_has_three_equal_channels():
 
 def test_a_prior_is_off_by_its_standard_deviation():
     rng = np.random.default_rng(0)
-    off = [prior_at(np.eye(4), rng).position_m for _ in range(4000)]
-    np.testing.assert_allclose(np.std(off, axis=0), [PRIOR_M, PRIOR_M], rtol=0.05)
+    off = np.array([prior_at(np.eye(4), rng).position_m for _ in range(4000)], np.float64)
+    np.testing.assert_allclose(off.std(axis=0), np.full(2, PRIOR_M), rtol=0.05)
 
 
 def test_drives_are_pooled_by_their_queries_and_ours_must_be_higher(tmp_path):

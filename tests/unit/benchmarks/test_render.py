@@ -3,6 +3,7 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from benchmarks import render
+from benchmarks.kitti.published import NOTE
 
 RUN = {
     "commit": "c" * 40,
@@ -82,3 +83,40 @@ def test_a_reason_for_another_value_is_not_shown():
     )
     assert "- `a`: of 3 minutes; a wall" in lines
     assert "- `b`: reason outdated, value changed (it explained 1.5)" in lines
+
+
+def test_published_figures_stand_beside_ours_and_missing_recordings_are_listed():
+    report = {
+        "stale_as_of": "f" * 40,
+        "runs": {"r": RUN},
+        "rows": [
+            {"id": "kitti.published.02.recall_at_1_10m", "run": "r", "unit": "share", "value": 0.915},
+            {"id": "kitti.published.2011_drive.recall_at_1_10m", "run": "r", "unit": "share", "value": 0.5},
+            {"id": "kitti.published.05.recall_at_1_10m", "run": "r", "unit": "share", "value": None},
+            {"id": "kitti.loops.06.recall_at_1_10m", "run": "r", "unit": "share", "value": 0.25},
+        ],
+        "notes": {
+            NOTE: {"weak": [1, 2, 3, 4, 5, 6], "strong": [91, 92, 93, 94, 95, 96.5]},
+            "missing": ["odometry sequence 00", "raw drive"],
+        },
+    }
+    lines = render._section("kitti", report)
+    start = lines.index("| recording | ours | strong | weak |")
+    assert lines[start + 2 : start + 10] == [
+        "| 00 | not measured | 91 | 1 |",
+        "| 02 | 92 | 92 | 2 |",
+        "| 05 | not measured | 93 | 3 |",
+        "| 06 | not measured | 94 | 4 |",
+        "| 07 | not measured | 95 | 5 |",
+        "| 08 | not measured | 96.5 | 6 |",
+        "| 2011_drive | 50 |  |  |",
+        "",
+    ]
+    assert any("arXiv 2502.11742" in line for line in lines[:start])
+    missing = lines.index("The machine of the last run lacks these recordings:")
+    assert lines[missing + 2 : missing + 4] == ["- odometry sequence 00", "- raw drive"]
+
+
+def test_a_report_without_these_notes_has_neither():
+    text = "\n".join(section({"id": "a"}))
+    assert "recording" not in text

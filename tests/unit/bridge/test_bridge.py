@@ -148,7 +148,9 @@ def test_a_picture_that_is_none_is_told_with_its_topic(robot: Robot) -> None:
     robot.see(bridge, 1 * S, encoding="bayer_rggb8")
     published = bridge.step()
     assert published is not None
-    assert published.diagnosis.message.startswith("/camera/color/image_raw: pictures come as 'bayer_rggb8'")
+    assert published.diagnosis.message.startswith(
+        "/camera/color/image_raw: the encoding 'bayer_rggb8' is not supported"
+    )
     assert robot.asked == []
 
 
@@ -157,7 +159,7 @@ def test_silence_names_the_topics_that_bring_nothing(robot: Robot, info_of: Make
     bridge.pairs.info(info_of(0))
     told = bridge.idle()
     assert told.level == Level.WARN
-    assert "color (/camera/color/image_raw), depth (/camera/aligned_depth_to_color/image_raw); do" in told.message
+    assert "color (/camera/color/image_raw), depth (/camera/aligned_depth_to_color/image_raw); check" in told.message
     bridge.pairs.color(image_of(RGB, "rgb8", 0))
     bridge.pairs.depth(image_of(DEPTH, "16UC1", S))
     assert "--tolerance" in bridge.idle().message

@@ -42,17 +42,17 @@ def test_a_map_answers_without_a_service(bundle_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"rate": -1.0}, "--rate: -1.0 is no rate"),
-        ({"min_confidence": 2.0}, "--min-confidence: 2.0 is no probability"),
-        ({"tolerance": -1.0}, "tolerance: -1.0 is no time"),
-        ({"mount": "1,2"}, "--mount: '1,2' is not X,Y,Z"),
-        ({"queue": -1}, "--queue: -1 is no number of images; give 1 or more, or 0 to keep all"),
-        ({"url": "nowhere"}, "url: 'nowhere' is no address"),
-        ({"camera_height_m": 40.0}, "--camera-height-m: 40 m is no height of a camera; give 0.05 to 30 m"),
+        ({"rate": -1.0}, "--rate: -1.0 is not a valid rate"),
+        ({"min_confidence": 2.0}, "--min-confidence: 2.0 is not a valid probability"),
+        ({"tolerance": -1.0}, "tolerance: -1.0 is not a valid time"),
+        ({"mount": "1,2"}, "--mount: '1,2' is invalid; give X,Y,Z"),
+        ({"queue": -1}, "--queue: -1 is not a valid number of images; give 1 or more, or 0 to keep all"),
+        ({"url": "nowhere"}, "url: 'nowhere' is not a URL"),
+        ({"camera_height_m": 40.0}, "--camera-height-m: 40 m is not a valid camera height; give 0.05 to 30 m"),
         ({"base_on_ground": True}, "--base-on-ground: .* give --mount, or --camera-height-m"),
         ({"base_on_ground": True, "mount": "0,0,0,0,0,0,1"}, "--mount: with --base-on-ground, its Z of 0 m"),
-        ({"map": Path("m"), "map_name": "n"}, "--map has one map alone"),
-        ({"map": Path("m"), "cert": Path("c")}, "--cert is for a service"),
+        ({"map": Path("m"), "map_name": "n"}, "--map gives one map"),
+        ({"map": Path("m"), "cert": Path("c")}, "--cert: it is only for a service"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_refused(changed: dict[str, object], words: str) -> None:

@@ -71,15 +71,15 @@ def test_data_may_be_what_either_library_gives(image_of: Image, kind: Callable[[
     [{"step": 8}, {"height": 3}, {"width": 4}, {"data": b""}, {"height": 0}, {"width": 0}, {"data": b"1234567"}],
 )
 def test_sizes_that_contradict_each_other_name_the_topic(image_of: Image, wrong: dict[str, Any]) -> None:
-    with pytest.raises(RequestError, match=r"^/c: .* are no picture of .*; mend the publisher") as caught:
+    with pytest.raises(RequestError, match=r"^/c: .* are not an image of .*; fix the publisher") as caught:
         rgb_from(image_of(RGB, "rgb8", **wrong), "/c")
     assert caught.value.field == "/c"
 
 
 def test_other_encodings_are_refused_with_what_is_read(image_of: Image) -> None:
-    with pytest.raises(RequestError, match=r"/c: pictures come as 'yuv422', .*publish one of rgb8, bgr8"):
+    with pytest.raises(RequestError, match=r"/c: the encoding 'yuv422' is not supported; publish one of rgb8, bgr8"):
         rgb_from(image_of(RGB, "yuv422"), "/c")
-    with pytest.raises(RequestError, match=r"/d: pictures come as 'rgb8', .*16UC1, mono16, 32FC1"):
+    with pytest.raises(RequestError, match=r"/d: the encoding 'rgb8' is not supported; .*16UC1, mono16, 32FC1"):
         depth_from(image_of(RGB, "rgb8"), "/d")
 
 

@@ -178,7 +178,7 @@ def test_a_parameter_that_makes_no_sense_ends_the_node_with_the_remedy(ros: Any,
     assert node["main"]() == 1
     ((level, text),) = ros.logged
     assert level == "fatal"
-    assert text.startswith("--mount: '1,2' is not X,Y,Z,QX,QY,QZ,QW")
+    assert text.startswith("--mount: '1,2' is invalid; give X,Y,Z,QX,QY,QZ,QW")
     assert ros.ended == ["node", "shutdown"]
 
 

@@ -53,12 +53,12 @@ def test_rclpy_without_ros_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--rate", "-1"], "--rate: -1.0 is no rate"),
-        (["--min-confidence", "2"], "--min-confidence: 2.0 is no probability"),
-        (["--tolerance", "-1"], "tolerance: -1.0 is no time"),
-        (["--mount", "1,2"], "--mount: '1,2' is not X,Y,Z,QX,QY,QZ,QW"),
-        (["--url", "nowhere"], "url: 'nowhere' is no address"),
-        (["--map", "m", "--map-name", "n"], "--map has one map alone"),
+        (["--rate", "-1"], "--rate: -1.0 is not a valid rate"),
+        (["--min-confidence", "2"], "--min-confidence: 2.0 is not a valid probability"),
+        (["--tolerance", "-1"], "tolerance: -1.0 is not a valid time"),
+        (["--mount", "1,2"], "--mount: '1,2' is invalid; give X,Y,Z,QX,QY,QZ,QW"),
+        (["--url", "nowhere"], "url: 'nowhere' is not a URL"),
+        (["--map", "m", "--map-name", "n"], "--map gives one map"),
     ],
 )
 def test_bad_options_are_told_with_what_to_write(

@@ -50,12 +50,12 @@ def test_without_data_and_map_the_page_says_so_and_is_written(
         (run / "run.json").write_text(json.dumps(settings))
     command(moved, own, out=tmp_path / "out", json_file=None, dataset=None)
     told = capsys.readouterr().out
-    assert "the page has no pictures" in told
+    assert "the page has no images" in told
     assert "the page has no map" in told
     page = page_of((tmp_path / "out" / "index.html").read_text())
     assert [image.get("class") for image in page.of("img")] == ["plot", "plot"]
 
 
 def test_a_dataset_that_was_named_must_be_one(saved_run: Path, moved: Path, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="no finished dataset"):
+    with pytest.raises(DatasetError, match="not a complete dataset"):
         command(moved, saved_run, out=tmp_path / "out", json_file=None, dataset=tmp_path)

@@ -98,7 +98,7 @@ def test_an_answer_without_a_pose_is_neither_right_nor_wrong_and_its_guess_is_ca
     text = printed([outcome_of(), refused])
     assert "no pose" in text
     assert "(forced 2.00 m)" in text
-    assert "1 of 1 streets right\n1 of 2 answers accepted (LOCALIZED), the others have no pose" in text
+    assert "1 of 1 streets right\n1 of 2 answers accepted (LOCALIZED); the others have no pose" in text
     assert "accepted answers: position off by 5.00 m (median), 5.00 m (largest); 1 of 1 over 1 m" in text
     assert "forced, whatever the status: position off by 3.50 m (median), 5.00 m (largest); 2 of 2 over 1 m" in text
 

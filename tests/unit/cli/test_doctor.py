@@ -87,9 +87,7 @@ def test_a_camera_file_that_is_none_ends_the_checks_that_need_it(capsys, files):
 def test_a_missing_image_is_a_problem(capsys, files):
     files["depth"].unlink()
     assert run(*options_of(files)) == 1
-    assert (
-        f"problem  images: {files['depth']}: it cannot be read (No such file or directory)" in capsys.readouterr().out
-    )
+    assert f"problem  images: {files['depth']}: cannot be read (No such file or directory)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("names", [("rgb",), ("depth", "camera"), ("rgb", "depth")])

@@ -53,9 +53,12 @@ def test_import_says_what_came_in_and_what_did_not(scans, tmp_path, capsys):
     assert run("import", "clouds", scans, "--out", tmp_path / "out", "--hold-out", "2") == 0
     told = capsys.readouterr().out
     assert "4 scans (.bin)" in told
-    assert "2 scans (1 held out), 0 picture pairs" in told
-    assert "left out: 1 points that are no numbers" in told
-    assert "left out: 1 scan: its bytes are no rows of four float32: truncated (first: 3.bin)" in told
+    assert "2 scans (1 held out), 0 image pairs" in told
+    assert "left out: 1 points that are not finite" in told
+    assert (
+        "left out: 1 scan: its size is not a multiple of 16 bytes (rows of four float32): truncated (first: 3.bin)"
+        in told
+    )
     assert len(Dataset(tmp_path / "out").survey_poses()) == 2
 
 
@@ -67,12 +70,12 @@ def test_help_says_which_options_need_an_extra(capsys):
 
 
 def test_lines_about_pictures_are_told_only_where_pictures_are_wanted(scans, tmp_path, capsys, monkeypatch):
-    lines = Notes(("a list",), {"path": "scans"}, ("no picture has stored depth",))
+    lines = Notes(("a list",), {"path": "scans"}, ("no image has stored depth",))
     monkeypatch.setattr(Clouds, "notes", lines)
     assert run("import", "clouds", scans, "--out", tmp_path / "with") == 0
-    assert "a list\nno picture has stored depth\n" in capsys.readouterr().out
+    assert "a list\nno image has stored depth\n" in capsys.readouterr().out
     assert run("import", "clouds", scans, "--no-pictures", "--out", tmp_path / "without") == 0
-    assert "no picture has stored depth" not in capsys.readouterr().out
+    assert "no image has stored depth" not in capsys.readouterr().out
 
 
 def test_import_takes_poses_of_another_file(scans, tmp_path):
@@ -84,7 +87,7 @@ def test_import_takes_poses_of_another_file(scans, tmp_path):
 def test_import_without_poses_says_where_they_may_come_from(scans, tmp_path, capsys):
     (scans / "poses.txt").unlink()
     assert run("import", "clouds", scans, "--out", tmp_path / "out") == 1
-    assert "has no poses; name a TUM file with --poses, or find them with --odometry" in capsys.readouterr().err
+    assert "has no poses; give a TUM file with --poses, or find them with --odometry" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -92,14 +95,17 @@ def test_import_without_poses_says_where_they_may_come_from(scans, tmp_path, cap
     ("options", "message"),
     [
         (("--topic", "scan"), "topic: 'scan' is not ROLE=NAME"),
-        (("--topic", "scan=/x"), "topic: clouds has no use for it"),
-        (("--sync", "guess"), "sync: 'guess' is neither"),
+        (("--topic", "scan=/x"), "topic: clouds does not support this option"),
+        (("--sync", "guess"), "sync: 'guess' is not valid; choose interpolate or nearest"),
         (("--depth", "sgbm"), "clouds has no 'sgbm' depth"),
         (("--hold-out", "1"), "hold_out: 1 would leave no survey"),
-        (("--extrinsics", "nowhere.json"), "nowhere.json: no JSON"),
-        (("--camera", "nowhere.json"), "nowhere.json: no camera"),
+        (("--extrinsics", "nowhere.json"), "nowhere.json: cannot be read as JSON"),
+        (("--camera", "nowhere.json"), "nowhere.json: not a valid camera"),
         (("--poses", "nowhere.txt"), "nowhere.txt is missing"),
-        (("--poses", "x.txt", "--odometry"), "--odometry finds them; give one of the two"),
+        (
+            ("--poses", "x.txt", "--odometry"),
+            "--odometry finds the poses, so --poses has no effect; give one of the two",
+        ),
     ],
 )
 def test_import_refuses_an_option_by_name(scans, tmp_path, capsys, options, message):
@@ -111,7 +117,7 @@ def test_import_refuses_an_option_by_name(scans, tmp_path, capsys, options, mess
 def test_convert_and_import_go_round(scans, tmp_path, capsys):
     run("import", "clouds", scans, "--out", tmp_path / "first")
     assert run("convert", tmp_path / "first", "--to", "mcap", "--out", tmp_path / "drive") == 0
-    assert "3 moments, pictures of: no query set" in capsys.readouterr().out
+    assert "3 moments, images of: no query set" in capsys.readouterr().out
     assert run("import", "rosbag", tmp_path / "drive", "--topic", "scan=/points", "--out", tmp_path / "second") == 0
     told = capsys.readouterr().out
     assert "scan: /points, 3 x PointCloud2\n" in told
@@ -126,7 +132,7 @@ def test_convert_refuses_what_it_does_not_know(scans, tmp_path, capsys):
     run("import", "clouds", scans, "--out", tmp_path / "first")
     capsys.readouterr()
     for options, message in (
-        (("--to", "ros3"), "to: 'ros3' is not known; there is: mcap, sqlite3, bag, kitti-raw"),
+        (("--to", "ros3"), "to: 'ros3' is not valid; choose one of: mcap, sqlite3, bag, kitti-raw"),
         (("--to", "mcap", "--queries", "evening"), "no query set 'evening'"),
     ):
         assert run("convert", tmp_path / "first", *options, "--out", tmp_path / "drive") == 1
@@ -136,7 +142,7 @@ def test_convert_refuses_what_it_does_not_know(scans, tmp_path, capsys):
 
 def test_record_refuses_what_it_cannot_record_from(tmp_path, capsys):
     assert run("record", "gazebo", "--out", tmp_path / "out") == 1
-    assert "kind: 'gazebo' is not known; there is: carla" in capsys.readouterr().err
+    assert "kind: 'gazebo' is not a known simulator; choose: carla" in capsys.readouterr().err
 
 
 def test_record_says_what_comes_next(tmp_path, capsys, monkeypatch):

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from service.cli.answer_text import print_answer
-from service.cli.localize import localize
 from service.cli.main import main
+from service.cli.send import localize
 from service.contract.schema import Prior
 from service.errors import RefusedError, RequestError, UnreachableError
 
@@ -145,7 +145,7 @@ def test_something_else_at_the_address_is_told_so(
     files: dict[str, Any], answering: Callable[..., Any], response: httpx.Response
 ) -> None:
     answering(response)
-    with pytest.raises(UnreachableError, match="no Streetfix"):
+    with pytest.raises(UnreachableError, match="not Streetfix"):
         localize("http://x", **files)
 
 
@@ -158,13 +158,13 @@ def test_nobody_at_the_address_is_told_with_the_remedy(files: dict[str, Any]) ->
 
 @pytest.mark.parametrize("url", ["", "localhost:8000", "http://[", "ftp://x"])
 def test_an_address_that_is_none_is_told_so(files: dict[str, Any], url: str) -> None:
-    with pytest.raises(RequestError, match="give http://HOST:PORT"):
+    with pytest.raises(RequestError, match="pass http://HOST:PORT"):
         localize(url, **files)
 
 
 def test_a_file_that_is_missing_is_named(files: dict[str, Any]) -> None:
     files["depth"].unlink()
-    with pytest.raises(RequestError, match=r"depth: it cannot be read .*check --depth"):
+    with pytest.raises(RequestError, match=r"depth: cannot be read .*check --depth"):
         localize("http://x", **files)
 
 
@@ -297,7 +297,7 @@ def test_people_read_why_and_what_to_do() -> None:
     start = lines.index("why it may not be LOCALIZED, the likeliest cause first")
     told = " ".join(" ".join(lines[start + 1 : start + 4]).split())
     assert told.startswith(
-        "1. baseline (standard deviations from what calibration saw: log_noise +4.2, points -3.5): check the stereo baseline "
+        "1. baseline (standard deviations from the mean of the calibration data: log_noise +4.2, points -3.5): check the stereo baseline "
         "2. depth: check [depth.scale_m]"
     )
 
@@ -305,7 +305,7 @@ def test_people_read_why_and_what_to_do() -> None:
 def test_people_read_that_all_evidence_is_in_range() -> None:
     told = " ".join(text_of(**REFUSED | {"reasons": []}).split())
     assert (
-        "why: all evidence lies in the range that calibration saw; the place may be outside the map, or look like another"
+        "All confidence features are in the range of the calibration data. The place may be outside the map or a perceptual alias."
         in told
     )
 
@@ -314,7 +314,7 @@ def test_an_earlier_service_gives_no_reasons() -> None:
     answer = {name: value for name, value in (ANSWER | REFUSED).items() if name != "reasons"}
     stream = io.StringIO()
     print_answer(answer, Console(file=stream, width=120))
-    assert "why: this service does not say" in stream.getvalue()
+    assert "The service gives no reasons." in stream.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -382,7 +382,7 @@ def test_an_answer_of_an_older_service_that_has_a_pose_in_doubt_is_refused(
     files: dict[str, Any], answering: Callable[..., Any]
 ) -> None:
     answering(httpx.Response(200, json=ANSWER | {"status": "OUT_OF_MAP"}))
-    with pytest.raises(UnreachableError, match="of another contract"):
+    with pytest.raises(UnreachableError, match="has another contract"):
         localize("http://x", **files)
 
 
@@ -405,9 +405,9 @@ def test_a_folder_given_as_the_name_of_a_map_is_named(
     (other := tmp_path / "other").mkdir()
     answering(httpx.Response(404, json=problem))
     for folder, message in {
-        bundle_path: f"{bundle_path} is the folder of a map bundle: give the map's name: --map tiny",
-        dataset: f"{dataset} is a dataset, not a map: give the name of a map that the service has",
-        other: f"{other} is a folder: give the name of a map that the service has",
+        bundle_path: f"{bundle_path} is the folder of a map bundle; give the name of the map: --map tiny",
+        dataset: f"{dataset} is a dataset, not a map; give the name of a map of the service",
+        other: f"{other} is a folder; give the name of a map of the service",
     }.items():
         with pytest.raises(RequestError) as caught:
             localize("http://x", **files, map_name=str(folder))
@@ -436,7 +436,15 @@ def test_the_camera_height_of_the_options_overrides_the_file(
 
 def test_a_deviation_without_a_height_is_refused(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*given, "--camera-height-std", "0.02") == 1
-    assert "--camera-height-std: there is no height that it belongs to" in capsys.readouterr().err
+    assert "--camera-height-std: it needs a height" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rest", [{}, REFUSED])
+@pytest.mark.parametrize(("outside", "shown"), [({}, False), ({"front": 5.2}, True)])
+def test_an_extrapolated_confidence_is_printed_with_its_features(rest: Any, outside: Any, shown: bool) -> None:
+    out = io.StringIO()
+    print_answer(ANSWER | rest | {"extrapolated": outside}, Console(file=out, width=200))
+    assert ("extrapolated (standard deviations from the mean: front +5.2)" in out.getvalue()) is shown
 
 
 @pytest.mark.parametrize("rest", [{}, REFUSED])

@@ -2,11 +2,11 @@ import re
 import sys
 import tomllib
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.machinery import ModuleSpec
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import pytest
 import typer
@@ -207,7 +207,7 @@ def test_a_command_beside_the_service_says_where_it_is_to_be_had(
 ) -> None:
     assert run(command, "--help") == 1
     told = capsys.readouterr().err
-    assert f"the command '{command}' is not part of this installation, which is the service alone" in told
+    assert f"the command '{command}' is not part of this installation, which has only the service" in told
     assert f'pip install ".[{extra}]"' in told
 
 
@@ -228,7 +228,7 @@ def test_a_package_that_is_not_to_be_had_everywhere_is_said_to_be_so(
     mount(simulate=simulate)
     assert run("simulate") == 1
     told = capsys.readouterr().err
-    assert f"needs the package {package!r}: it is to be had for" in told
+    assert f"needs the package {package!r}: it is available only for" in told
     assert "pip install" in told
 
 
@@ -240,3 +240,43 @@ def test_what_is_not_to_be_had_everywhere_is_what_has_a_marker() -> None:
         re.split(r"[><=;]", each)[0].replace("-", "_") for extra in extras.values() for each in extra if ";" in each
     }
     assert marked == set(command_line._NOT_EVERYWHERE)
+
+
+def names_of_commands(app: typer.Typer) -> Iterator[list[str]]:
+    """The command, and all commands below it, each as the words that call it."""
+
+    def below(command: Any, words: list[str]) -> Iterator[list[str]]:
+        yield words
+        for name, child in getattr(command, "commands", {}).items():
+            yield from below(child, [*words, name])
+
+    return below(typer.main.get_command(app), [])
+
+
+@pytest.mark.parametrize("called", [None, *sorted(point.name for point in entry_points(group="streetfix.commands"))])
+def test_no_help_shows_a_path_of_this_installation(called: str | None, capsys: pytest.CaptureFixture[str]) -> None:
+    app = command_line.app_for([] if called is None else [called])
+    own = [words for words in names_of_commands(app) if called is None or words[:1] == [called]]
+    assert own
+    for words in own:
+        assert run(*words, "--help") == 0
+        page = "".join(capsys.readouterr().out.split())  # a long path is broken into lines
+        assert page.startswith("Usage:streetfix")
+        assert str(Path(command_line.__file__).parents[2]) not in page, words
+
+
+@pytest.mark.parametrize(
+    ("called", "defaults"),
+    [
+        ("build-map", ["the stock encoder", "the calibration of the stock encoder"]),
+        ("calibrate", ["the stock encoder", "beside the stock encoder"]),
+        ("demo", ["the stock encoder"]),
+    ],
+)
+def test_help_names_the_files_of_the_installation_in_words(
+    called: str, defaults: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(called, "--help") == 0
+    page = " ".join(capsys.readouterr().out.split())
+    for default in defaults:
+        assert f"[default: {default}]" in page

@@ -90,14 +90,14 @@ def test_simulate_replaces_single_numbers_of_the_sensors(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["radar.power=1"], "radar.power: there is no sensor 'radar'; there are: lidar, rgb, depth"),
-        (["lidar.beams=64"], "lidar.beams: lidar has no number 'beams'; it has: channels, columns"),
+        (["radar.power=1"], "radar.power: unknown sensor 'radar'; choose one of: lidar, rgb, depth"),
+        (["lidar.beams=64"], "lidar.beams: lidar has no parameter 'beams'; it has: channels, columns"),
         (["depth.noise_px"], "set: 'depth.noise_px' is not SENSOR.NUMBER=VALUE"),
         (["channels=64"], "set: 'channels=64' is not SENSOR.NUMBER=VALUE"),
         (["lidar.channels=8"], "lidar.channels: Input should be greater than or equal to 16 (given: '8')"),
         (["depth.noise_px=much"], "depth.noise_px: Input should be a valid number"),
         (["depth.bleeding=nan"], "depth.bleeding: "),
-        (["lidar.channels=16", "lidar.channels=32"], "lidar.channels: it is set twice"),
+        (["lidar.channels=16", "lidar.channels=32"], "lidar.channels: set twice"),
         (["lidar.top_deg=-20"], "lidar.top_deg: -20 is not above lidar.bottom_deg, -15"),
         (["depth.min_range_m=5", "depth.max_range_m=4"], "depth.max_range_m: 4 is not beyond depth.min_range_m, 5"),
     ],
@@ -114,24 +114,27 @@ def test_simulate_refuses_a_number_that_no_sensor_can_take(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--city", "paris"), "'paris' is none of paper, city and mixed"),
+        (("--city", "paris"), "'paris' is not valid; choose paper, city or mixed"),
         (("--size", "300"), "size: '300' is not two numbers"),
         (("--camera", "axb"), "camera: 'axb' is not two numbers"),
         (("--camera", "nanx480"), "camera: nan in 'nanx480' is not between 48 and 4096"),
         (("--size", "0x400"), "size: 0 in '0x400' is not between 30 and 10000"),
         (("--size", "300xinf"), "size: inf in '300xinf' is not between"),
-        (("--lidar", "none"), "lidar: 'none' is no preset"),
-        (("--queries", "0", "--rgb", "small"), "rgb: without queries nothing takes pictures"),
-        (("--queries", "0", "--sun-azimuth", "0"), "sun-azimuth: without queries nothing takes pictures"),
-        (("--rgb", "none"), "rgb: 'none' is no preset; there are: automatic, small, fixed"),
+        (("--lidar", "none"), "lidar: 'none' is not a valid preset"),
+        (("--queries", "0", "--rgb", "small"), "rgb: this option has no effect without queries"),
+        (("--queries", "0", "--sun-azimuth", "0"), "sun-azimuth: this option has no effect without queries"),
+        (("--rgb", "none"), "rgb: 'none' is not a valid preset; choose one of: automatic, small, fixed"),
         (
             ("--condition", "fog", "--sun-azimuth", "90"),
-            "sun_azimuth_deg: 90 would do nothing, since 'drive1' has no sun",
+            "sun_azimuth_deg: 90 has no effect with 'drive1', whose condition",
         ),
         (("--table1",), "--city paper"),
-        (("--city", "paper", "--size", "300x400"), "size: the paper's city has its own"),
-        (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 would do nothing"),
-        (("--queries", "0", "--set", "depth.noise_px=1"), "without queries nothing takes pictures or measures depth"),
+        (("--city", "paper", "--size", "300x400"), "size: the paper's city has a fixed size"),
+        (("--queries", "0", "--on-track", "5", "--aside", "1"), "aside_m: 1 has no effect with 'survey_drive'"),
+        (
+            ("--queries", "0", "--set", "depth.noise_px=1"),
+            "without queries only parameters of lidar and survey have an effect",
+        ),
     ],
 )
 def test_simulate_says_what_is_wrong_and_writes_nothing(
@@ -225,7 +228,7 @@ def test_build_map_with_a_calibration_that_is_missing_says_what_makes_one(
     given = ("--encoder", encoder_file, "--calibration", tmp_path / "no.json", "--spacing", "20", "--headings", "2")
     assert run("build-map", simulated, "--out", tmp_path / "map", *given) == 1
     assert (
-        "no.json cannot be read (No such file or directory); make it with streetfix calibrate"
+        "no.json cannot be read (No such file or directory); create it with streetfix calibrate"
         in capsys.readouterr().err
     )
     assert not (tmp_path / "map").exists()
@@ -241,8 +244,8 @@ def test_build_map_of_no_dataset_says_what_makes_one(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("ros", "x"), "kind: 'ros' is not known"),
-        (("kitti-object", "x", "--depth", "radar"), "depth: 'radar' is none of"),
+        (("ros", "x"), "kind: 'ros' is not a known format"),
+        (("kitti-object", "x", "--depth", "radar"), "depth: 'radar' is not valid; choose one of"),
     ],
 )
 def test_import_says_what_there_is(

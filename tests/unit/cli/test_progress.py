@@ -39,10 +39,10 @@ def test_a_stage_tells_its_beginning_a_line_a_minute_and_its_end(told, clock):
         told("places", done, 1800)
     told.close()
     assert told.written == [
-        "places: 1 of 1,800 (0 %), begins",
-        "places: 481 of 1,800 (27 %), 8 a second, 60 s so far, about 3 min left",
-        "places: 961 of 1,800 (53 %), 8 a second, 2 min so far, about 2 min left",
-        "places: 1,441 of 1,800 (80 %), 8 a second, 3 min so far, about 45 s left",
+        "places: 1 of 1,800 (0 %), started",
+        "places: 481 of 1,800 (27 %), 8 per second, 60 s elapsed, about 3 min left",
+        "places: 961 of 1,800 (53 %), 8 per second, 2 min elapsed, about 2 min left",
+        "places: 1,441 of 1,800 (80 %), 8 per second, 3 min elapsed, about 45 s left",
         "places: 1,800 done in 4 min",
     ]
 
@@ -56,14 +56,14 @@ def test_a_stage_that_reports_nothing_for_long_is_told_all_the_same(told, clock)
     told.tick()
     clock.now += 30
     told.tick()
-    assert told.written[1:] == ["merge: 1 of 4 (25 %), 60 s so far"]
+    assert told.written[1:] == ["merge: 1 of 4 (25 %), 60 s elapsed"]
 
 
 def test_what_was_done_before_a_build_went_on_is_not_in_its_rate(told, clock):
     told("places", 900, 1000)
     clock.now += 60
     told("places", 910, 1000)
-    assert told.written[-1] == "places: 910 of 1,000 (91 %), 10 a minute, 60 s so far, about 9 min left"
+    assert told.written[-1] == "places: 910 of 1,000 (91 %), 10 per minute, 60 s elapsed, about 9 min left"
 
 
 def test_a_stage_ends_where_the_next_one_begins(told, clock):
@@ -71,14 +71,14 @@ def test_a_stage_ends_where_the_next_one_begins(told, clock):
     clock.now += 5
     told("survey", 2, 2)
     told("places", 0, 7)
-    assert told.written == ["survey: 1 of 2 (50 %), begins", "survey: 2 done in 5 s", "places: 0 of 7 (0 %), begins"]
+    assert told.written == ["survey: 1 of 2 (50 %), started", "survey: 2 done in 5 s", "places: 0 of 7 (0 %), started"]
 
 
 def test_a_total_that_grows_with_what_is_done_makes_no_line_each_time(told, clock):
     for done in range(1, 500):
         told("frames", done, done)
     told.close()
-    assert told.written == ["frames: 1, begins", "frames: 499 done in 0 s"]
+    assert told.written == ["frames: 1, started", "frames: 499 done in 0 s"]
 
 
 def test_the_same_stage_on_something_else_begins_anew(told, clock):
@@ -88,7 +88,7 @@ def test_the_same_stage_on_something_else_begins_anew(told, clock):
     clock.now += 60
     told("places", 4, 7)
     assert told.written[-2:] == [
-        "places: 1 of 7 (14 %), begins", "places: 4 of 7 (57 %), 3 a minute, 60 s so far, about 60 s left",
+        "places: 1 of 7 (14 %), started", "places: 4 of 7 (57 %), 3 per minute, 60 s elapsed, about 60 s left",
     ]  # fmt: skip
 
 
@@ -97,21 +97,21 @@ def test_a_text_of_the_stage_stands_in_its_lines(told, clock):
     told.describe("training", "loss 2.31")
     clock.now += 60
     told("training", 3, 10)
-    assert "training: 3 of 10 (30 %), loss 2.31, 2 a minute" in told.written[-1]
+    assert "training: 3 of 10 (30 %), loss 2.31, 2 per minute" in told.written[-1]
 
 
 def test_long_spans_are_told_in_hours(told, clock):
     told("training", 0, 1000)
     clock.now += 8000
     told("training", 500, 1000)
-    assert told.written[-1].endswith("2 h 13 min so far, about 2 h 13 min left")
+    assert told.written[-1].endswith("2 h 13 min elapsed, about 2 h 13 min left")
 
 
 def test_the_watching_thread_tells_while_the_work_is_silent_and_ends_with_it():
     seen = threading.Event()
 
     def write(line):
-        if "so far" in line:
+        if "elapsed" in line:
             seen.set()
 
     with lines(write, every_s=0.001) as report:
@@ -132,7 +132,7 @@ with bars() as report:
 def test_into_a_pipe_go_lines_without_control_characters():
     environment = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "TTY_COMPATIBLE")}
     done = subprocess.run([sys.executable, "-c", _PROGRAM], capture_output=True, text=True, check=True, env=environment)
-    assert done.stderr.splitlines()[0] == "places: 1 of 3 (33 %), begins"
+    assert done.stderr.splitlines()[0] == "places: 1 of 3 (33 %), started"
     assert "places: 3 done in" in done.stderr
     assert "\x1b" not in done.stderr
     assert done.stdout == ""

@@ -83,7 +83,7 @@ def test_a_scan_that_becomes_shorter_between_two_looks_is_refused(dataset, monke
     path = scan_path(dataset.folder, 3)
     size = path.stat().st_size
     path.write_bytes(path.read_bytes()[:160])
-    with pytest.raises(DatasetError, match=f"it had {size} bytes and then 160"):
+    with pytest.raises(DatasetError, match=rf"the file changed while it was read \(from {size} to 160 bytes\)"):
         read_rows(path, size)
     monkeypatch.setattr("model_training.datasets.dataset.size_of", lambda _: size)
     with pytest.raises(DatasetError, match=r"000003\.bin"):
@@ -93,9 +93,9 @@ def test_a_scan_that_becomes_shorter_between_two_looks_is_refused(dataset, monke
 def test_what_the_system_says_is_told_with_the_file(tmp_path):
     path = tmp_path / "a.bin"
     for read in (read_bytes, size_of):
-        with pytest.raises(DatasetError, match=r"a\.bin: it is missing, or vanished"):
+        with pytest.raises(DatasetError, match=r"a\.bin: the file is missing, or was removed"):
             read(path)
-    with pytest.raises(DatasetError, match=r"a\.bin: it cannot be read \(Input/output error\)"), reading(path):
+    with pytest.raises(DatasetError, match=r"a\.bin: the file cannot be read \(Input/output error\)"), reading(path):
         raise OSError(5, "Input/output error")
     assert files.unreadable(path, PermissionError(13, "Permission denied")).field == "a.bin"
 
@@ -113,5 +113,5 @@ def test_arrays_that_were_written_in_part_are_named_with_the_remedy(tmp_path, su
             found = np.load(file, allow_pickle=False)
             return found if suffix == ".npy" else found["a"]
 
-    with pytest.raises(DatasetError, match=rf"a\{suffix}: it is damaged .*; make it anew"):
+    with pytest.raises(DatasetError, match=rf"a\{suffix}: the file is damaged .*; make it anew"):
         read_arrays(path, read, remedy="make it anew")

@@ -56,7 +56,18 @@ def test_gravity_is_believed():
 
 def test_a_wall_shows_no_ground():
     found = check_ground(ground_of(np.full((120, 160), 5.0, np.float32), CAMERA, None))
-    assert (found.level, found.text.startswith("no ground is seen")) == ("warning", True)
+    assert (found.level, found.text.startswith("no ground is visible")) == ("warning", True)
+
+
+def test_a_plane_that_the_service_does_not_accept_as_ground_is_a_warning():
+    z = plane(1.5)
+    z[70:, :20] = plane(2.5)[70:, :20]  # a pit: too many points lie below the plane for the service
+    found = ground_of(z, CAMERA, None)
+    assert (found.origin, found.share > 0.8) == ("assumed", True)
+    assert found.height_m == pytest.approx(found.found_by_service_m)
+    told = check_ground(found)
+    assert (told.level, "assumes 1.50 m" in told.text) == ("warning", True)
+    assert "send camera.height_m" in told.remedy
 
 
 def test_no_depth_shows_no_ground():
@@ -71,9 +82,10 @@ def ground(**changed):
 @pytest.mark.parametrize(
     ("changed", "text", "remedy"),
     [
-        ({"share": 0.05}, "no ground is seen: 5% of the pixels", "let the image show the ground, and send camera.height_m"),
-        ({"share": 0.05, "origin": "given", "given_m": 0.4}, "no ground is seen", "level camera 0.4 m above the ground"),
-        ({"height_m": 0.5, "found_by_service_m": 1.5, "origin": "assumed"}, "but the service takes it for 1.50 m (assumed)",
+        ({"share": 0.05}, "no ground is visible: 5% of the pixels", "let the image show the ground, and send camera.height_m"),
+        ({"share": 0.05, "origin": "given", "given_m": 0.4}, "no ground is visible", "level camera 0.4 m above the ground"),
+        ({"height_m": 0.5, "found_by_service_m": 1.5, "origin": "assumed"},
+         "but the service does not accept this plane as ground and assumes 1.50 m",
          "send camera.height_m and gravity"),
         ({"height_m": 0.1, "found_by_service_m": 0.15}, "0.10 m above the ground", "send camera.height_m; if the camera is not mounted so"),
         ({"height_m": 4.5}, "4.50 m above the ground", "depth.scale_m or fy is wrong"),

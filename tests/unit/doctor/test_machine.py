@@ -42,7 +42,7 @@ def test_a_quota_limits_the_cores(monkeypatch, tmp_path):
     ("kind", "flags", "told"),
     [
         ("x86_64", "fpu avx avx2 bmi1", "x86-64 with AVX2"),
-        ("x86_64", "fpu avx", "x86-64 without AVX2: answers are the same, and take somewhat longer"),
+        ("x86_64", "fpu avx", "x86-64 without AVX2: the answers are the same, but take somewhat longer"),
         ("aarch64", "", "64-bit ARM"),
         ("arm64", "", "64-bit ARM"),
     ],
@@ -57,7 +57,7 @@ def test_the_instruction_set_is_information(monkeypatch, tmp_path, kind, flags, 
 def test_without_a_description_of_the_processor_avx2_is_unknown(monkeypatch, tmp_path):
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     found = machine.check_instructions(tmp_path / "missing")
-    assert (found.level, found.text) == ("ok", "x86_64; the system does not tell whether it has AVX2")
+    assert (found.level, found.text) == ("ok", "x86_64; the system does not report whether it has AVX2")
 
 
 def free_of(monkeypatch, mib: dict[str, int]) -> None:
@@ -75,7 +75,7 @@ def test_shared_memory_is_ok_even_without_dev_shm(monkeypatch):
     free_of(monkeypatch, {"/t": 48})
     found = machine.check_shared_memory(Path("/none"), temporary=Path("/t"))
     assert found.level == "ok"
-    assert found.text.endswith("there is no /none, and the service does not use it")
+    assert found.text.endswith("/none does not exist, and the service does not use it")
 
 
 def test_the_free_space_of_dev_shm_is_told(monkeypatch):
@@ -141,7 +141,7 @@ def test_a_port_that_is_taken_is_a_problem_where_the_user_named_it(named, level)
 
 def test_a_port_that_nobody_has_is_free():
     assert machine.check_port("--port", "127.0.0.1", 0, named=True).level == "ok"
-    assert machine.check_port("--grpc-port", "127.0.0.1", None, named=False).text == "not asked for (--grpc-port)"
+    assert machine.check_port("--grpc-port", "127.0.0.1", None, named=False).text == "not requested (--grpc-port)"
 
 
 def test_an_address_of_another_machine_is_a_problem(monkeypatch):

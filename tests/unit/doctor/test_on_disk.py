@@ -12,7 +12,7 @@ def test_a_good_bundle_opens_and_its_parts_are_told(bundle_path):
     assert told.text.endswith("12 places")
     assert bundle is not None
     encoder, localizer = on_disk.check_encoder(bundle)
-    assert encoder.text == "reads views of 8 x 16 cells and gives descriptors of 16 numbers"
+    assert encoder.text == "reads views of 8 x 16 cells and returns descriptors of 16 numbers"
     assert localizer is not None
     assert localizer.bundle is bundle
     assert on_disk.check_streets(bundle).text == "3 streets or sections"
@@ -31,21 +31,21 @@ def test_a_changed_byte_is_a_problem_with_the_name_of_the_file(bundle_copy):
     told, bundle = on_disk.check_bundle(bundle_copy)
     assert bundle is None
     assert (told.level, told.text, told.remedy) == (
-        "problem", f"{file}: its content is not what the manifest says", "copy or build the bundle again",
+        "problem", f"{file}: the hash does not match the manifest", "copy or build the bundle again",
     )  # fmt: skip
 
 
 def test_a_folder_without_a_map_is_a_problem(tmp_path):
     told, bundle = on_disk.check_bundle(tmp_path)
     assert (told.level, bundle) == ("problem", None)
-    assert "there is no readable manifest" in told.text
+    assert "not a map bundle: manifest.json is missing" in told.text
 
 
 def test_an_encoder_that_does_not_run_is_a_problem(content_of, tmp_path):
     write_bundle(tmp_path / "own", content_of(encoder=b"no network"))
     told, localizer = on_disk.check_encoder(MapBundle.open(tmp_path / "own"))
     assert (told.level, localizer) == ("problem", None)
-    assert told.text.startswith("the encoder is no ONNX model that runs here")
+    assert told.text.startswith("ONNX Runtime cannot load the encoder")
 
 
 @pytest.mark.parametrize(("rate", "level"), [(0.001, "ok"), (0.0005, "problem")])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from service.contract.schema import LocalizeRequest
+from service.doctor import on_map
 from service.doctor.on_map import answer_of, check_answer, check_rows, rows_of_camera
 from service.doctor.pair import check_images, encoded_of
 from service.localization.localizer import Localizer
@@ -48,13 +49,13 @@ def test_a_narrow_camera_sees_fewer_rows(pair, localizer):
 def test_the_lidar_must_see_half_of_the_cameras_rows(camera, lidar, level, share):
     found = check_rows(np.array(camera, bool), np.array(lidar, bool), ELEVATIONS_RAD)
     assert found.level == level
-    assert found.text.startswith(f"the LiDAR of the survey saw {share} of the rows that the camera sees (camera ")
+    assert found.text.startswith(f"the LiDAR of the survey covers {share} of the rows that the camera covers (camera ")
     assert found.text.endswith("LiDAR -15 to -5 degrees)")
 
 
 def test_a_camera_that_sees_nothing_of_the_grid_is_a_warning():
     found = check_rows(np.zeros(4, bool), np.ones(4, bool), ELEVATIONS_RAD)
-    assert (found.level, found.text) == ("warning", "the camera sees no row of the map's view grid")
+    assert (found.level, found.text) == ("warning", "the camera covers no row of the view grid of the map")
 
 
 def test_the_answer_is_that_of_the_service(pair, localizer, bundle_path):
@@ -80,10 +81,18 @@ def test_an_answer_that_is_not_localized_is_a_warning_with_its_reasons(pair, con
     assert all(each.remedy in told.remedy for each in answer.reasons)
 
 
+def test_a_confidence_that_is_extrapolated_is_a_warning(pair, localizer, monkeypatch):
+    answer = replace(answer_of(pair, localizer, 0.02), confidence=0.95, extrapolated=(("front", 5.04),))
+    monkeypatch.setattr(on_map, "answer_of", lambda *_: answer)
+    told = check_answer(pair, localizer, 0.02)
+    assert (told.level, "front +5.0 standard deviations" in told.text) == ("warning", True)
+    assert "calibrate" in told.remedy
+
+
 def test_a_query_that_the_service_refuses_is_a_problem(pair, localizer):
     wgs84 = replace(pair, encoded=replace(pair.encoded, prior_wgs84=(52.5, 13.4), prior=_prior()))
     told = check_answer(wgs84, localizer, 0.02)
-    assert (told.level, told.remedy) == ("problem", "send prior.position in its own frame")
+    assert (told.level, told.remedy) == ("problem", "send prior.position in the map frame")
 
 
 def _prior():

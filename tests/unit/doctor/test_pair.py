@@ -77,7 +77,7 @@ def test_one_image_that_is_rotated_is_named(encoded, depth_m):
 
 def test_a_cropped_image_gets_the_message_of_the_service(encoded, depth_m):
     told, _ = check_images(encoded(depth=npy(depth_m[:40])))
-    assert "has 64x40 pixels, which is not the camera's 64x48 at any scale" in told.text
+    assert "has 64x40 pixels, but the camera has 64x48, so the aspect ratios differ" in told.text
 
 
 def test_millimetres_in_floats_are_named_and_tried(encoded, depth_m):
@@ -123,7 +123,7 @@ def test_a_depth_that_no_unit_explains_is_a_warning(encoded, depth_m):
     pair = pair_of(encoded(depth=npy(np.full((48, 64), 0.25, np.float32))))
     told, same = check_depth_unit(pair)
     assert (told.level, same) == ("warning", pair)
-    assert told.text == "the median depth is 0.25 m, and usual are 0.3 to 60 m"
+    assert told.text == "the median depth is 0.25 m, but usual values are 0.3 to 60 m"
 
 
 def test_a_disparity_is_tried_in_its_own_unit(encoded, depth_m):

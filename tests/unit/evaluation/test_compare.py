@@ -41,9 +41,9 @@ def judged(answers_of, errors_m, accepted):
 def test_few_changes_are_called_chance_and_many_are_not(run_of, answers_of):
     none = judged(answers_of, [9] * 20, [0] * 20)
     five, six = (judged(answers_of, [0.1] * n + [9] * (20 - n), [1] * n + [0] * (20 - n)) for n in (5, 6))
-    assert compare(run_of("a", x=none), run_of("b", x=five)).verdict.startswith("No difference can be told from chance")
-    assert compare(run_of("a", x=none), run_of("b", x=six)).verdict.startswith("B is better than A")
-    assert compare(run_of("a", x=six), run_of("b", x=none)).verdict.startswith("B is worse than A")
+    assert compare(run_of("a", x=none), run_of("b", x=five)).verdict.startswith("No significant difference")
+    assert compare(run_of("a", x=none), run_of("b", x=six)).verdict.startswith("B is significantly better than A")
+    assert compare(run_of("a", x=six), run_of("b", x=none)).verdict.startswith("B is significantly worse than A")
     assert compare(run_of("a", x=none), run_of("b", x=none)).verdict.startswith(
         "No difference: A and B are right about the same"
     )
@@ -65,8 +65,8 @@ def test_more_wrong_answers_accepted_make_a_run_worse_and_fewer_make_it_better(r
     errors = [0.1] * 10 + [9] * 10
     careful = judged(answers_of, errors, [1] * 10 + [0] * 10)
     rash = judged(answers_of, errors, [1] * 20)
-    assert compare(run_of("a", x=careful), run_of("b", x=rash)).verdict.startswith("B is worse than A")
-    assert compare(run_of("a", x=rash), run_of("b", x=careful)).verdict.startswith("B is better than A")
+    assert compare(run_of("a", x=careful), run_of("b", x=rash)).verdict.startswith("B is significantly worse than A")
+    assert compare(run_of("a", x=rash), run_of("b", x=careful)).verdict.startswith("B is significantly better than A")
 
 
 def test_forced_errors_accepted_right_and_accepted_wrong_are_each_paired(run_of, answers_of):
@@ -94,5 +94,5 @@ def test_runs_of_other_sets_are_refused_with_their_names(run_of, answers_of):
 @pytest.mark.parametrize("other", [{"errors": (1, 1)}, {"errors": (1,), "first_x": 0.01}])
 def test_runs_over_other_queries_are_refused(run_of, answers_of, other):
     errors = other.pop("errors")
-    with pytest.raises(DatasetError, match=r"query set 'x': a .* asked other queries"):
+    with pytest.raises(DatasetError, match=r"query set 'x': a .* have different queries"):
         compare(run_of("a", x=answered(answers_of, 1)), run_of("b", x=answered(answers_of, *errors, **other)))

@@ -3,7 +3,8 @@ import pytest
 
 from model_training.evaluation import raw_range
 from model_training.evaluation.raw_range import COMPARED, GAP_PENALTY, SETTINGS, raw_best_views, similarities
-from model_training.mapping.build import BuildSettings, view_ranges
+from model_training.mapping.settings import BuildSettings
+from model_training.mapping.survey import view_ranges
 from service.maps.reader import MapBundle
 
 

@@ -57,12 +57,12 @@ def cut_off(path):
 @pytest.mark.parametrize(
     ("broken", "told"),
     [
-        (lambda run: (run / "run.json").unlink(), "no saved run: run.json is missing"),
+        (lambda run: (run / "run.json").unlink(), "not a saved run: run.json is missing"),
         (lambda run: (run / "run.json").write_text("{}"), "map: Field required"),
-        (lambda run: (run / "answers" / f"{SET}.npz").write_bytes(b"PK"), "no answers of ours"),
-        (lambda run: (run / "answers" / f"{SET}.npz").unlink(), "no answers of ours"),
-        (lambda run: cut_off(run / "answers" / f"{SET}.npz"), "no answers of ours"),
-        (lambda run: rewrite(run, queries=6), "5 answers, run.json says 6"),
+        (lambda run: (run / "answers" / f"{SET}.npz").write_bytes(b"PK"), "not an answer file of Streetfix"),
+        (lambda run: (run / "answers" / f"{SET}.npz").unlink(), "not an answer file of Streetfix"),
+        (lambda run: cut_off(run / "answers" / f"{SET}.npz"), "not an answer file of Streetfix"),
+        (lambda run: rewrite(run, queries=6), "5 answers, but run.json says 6"),
         (lambda run: rewrite(run, name="../../etc"), "should match pattern"),
     ],
 )

@@ -97,7 +97,7 @@ def test_what_is_there_already_is_left_alone(dataset, tmp_path):
     (tmp_path / "mine" / "file").write_text("keep")
     for write in (lambda: write_bag(dataset, None, tmp_path / "mine", kind="mcap", report=quiet),
                   lambda: write_kitti_raw(dataset, None, tmp_path / "mine", report=quiet)):  # fmt: skip
-        with pytest.raises(DatasetError, match="name another"):
+        with pytest.raises(DatasetError, match="choose another"):
             write()
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["file"]
 
@@ -128,5 +128,5 @@ def test_pictures_of_several_cameras_are_refused_by_name(dataset, tmp_path):
     sensors = described.sensors.model_copy(update={"cameras": [*described.sensors.cameras, rear]})
     (dataset.folder / "dataset.json").write_text(described.model_copy(update={"sensors": sensors}).model_dump_json())
     (dataset.folder / "queries" / "drive" / "cameras.txt").write_text("front\nrear\nfront\n")
-    with pytest.raises(DatasetError, match=r"pictures of 2 cameras \(front, rear\)"):
+    with pytest.raises(DatasetError, match=r"images of 2 cameras \(front, rear\)"):
         the_camera(Dataset(dataset.folder), "drive")

@@ -70,7 +70,7 @@ def test_a_content_type_without_a_valid_boundary_is_refused(content_type: str) -
         (b"--XX\r\nContent-Disposition: form-data\r\n\r\n1\r\n--XX--", "no name"),
         (b'--XX\r\nContent-Disposition: attachment; name="a"\r\n\r\n1\r\n--XX--', "no name"),
         (b"--XX\r\nX: " + b"x" * 5000 + b"\r\n\r\n1\r\n--XX--", "no headers"),
-        (part("a", b"1") + part("a", b"2") + b"--XX--", "comes twice"),
+        (part("a", b"1") + part("a", b"2") + b"--XX--", "occurs twice"),
     ],
 )
 def test_a_malformed_body_is_refused(body: bytes, message: str) -> None:

@@ -174,7 +174,7 @@ def test_another_content_type_is_refused(client: httpx.Client) -> None:
 
 def test_an_unknown_map_is_refused_with_the_mounted_ones(client: httpx.Client, parts_of: Parts) -> None:
     problem = require_problem(post(client, parts_of(map="west")), 404, "unknown-map", "map")
-    assert "mounted: tiny" in problem["detail"]
+    assert "mounted maps: tiny" in problem["detail"]
 
 
 @pytest.mark.parametrize("name", sorted(set(Limits.model_fields) - {"max_message_bytes"}))
@@ -199,8 +199,8 @@ def test_no_depth_is_a_problem_of_its_own(client: httpx.Client, parts_of: Parts)
 @pytest.mark.parametrize(
     ("factor", "told"),
     [
-        (1000.0, "which looks like millimetres: send scale_m 0.001"),
-        (0.001, "which looks like metres that were taken for millimetres: send scale_m 1"),
+        (1000.0, "which looks like millimetres; send depth.scale_m = 0.001"),
+        (0.001, "which looks like metres that were read as millimetres; send depth.scale_m = 1"),
     ],
 )
 def test_a_depth_in_another_unit_is_told_with_its_scale(

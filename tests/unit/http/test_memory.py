@@ -85,7 +85,7 @@ def test_what_does_not_fit_is_refused_before_it_is_read(engine: Engine, app_clie
             "/v1/localize", content=bytes(3 * MIB), headers={"content-type": "multipart/form-data; boundary=b"}
         )
         assert (refused.status_code, refused.json()["code"], refused.headers["retry-after"]) == (503, "busy", "1")
-        assert "memory for requests is taken" in refused.json()["detail"]
+        assert "memory for requests is full" in refused.json()["detail"]
     assert engine.memory.held == 0
     allowed = client.post(
         "/v1/localize", content=bytes(3 * MIB), headers={"content-type": "multipart/form-data; boundary=b"}

@@ -10,7 +10,8 @@ import pytest
 from model_training.datasets.dataset import Dataset
 from model_training.evaluation.evaluate import evaluate
 from model_training.loadtest.payloads import payloads
-from model_training.mapping.build import BuildSettings, build_map
+from model_training.mapping.build import build_map
+from model_training.mapping.settings import BuildSettings
 from service.geometry.rigid import quaternion_xyzw_from
 from service.maps.reader import MapBundle
 from service.retrieval.encoder import Encoder

@@ -337,7 +337,7 @@ def test_what_is_written_is_read(codec):
 def test_an_lz4_frame_that_does_not_say_how_long_it_is_is_read_no_further_than_it_should():
     endless = lz4_sfd1(np.zeros((4000, 4000), np.uint16), store_size=False)
     data = b"SFD1" + struct.pack("<II", 6, 4) + endless[12:]
-    with pytest.raises(DecodeError, match="49 bytes where 6x4 pixels need 48"):
+    with pytest.raises(DecodeError, match="49 bytes, but 6x4 pixels need 48"):
         decode_depth(data, camera=CAMERA)
 
 

@@ -32,11 +32,11 @@ def test_a_factor_is_found_only_where_the_depth_makes_no_sense_as_metres(values,
 
 def test_the_hint_names_the_median_and_the_scale():
     assert unit_hint(np.array([[4000.0, 5000.0, 9000.0, 0.0]], np.float32)) == (
-        "the median depth is 5000 m, which looks like millimetres: send scale_m 0.001 in depth, or 0.001 times the scale that was sent; "
-        "if the depth is a disparity, divide the scale by 0.001 instead"
+        "the median depth is 5000 m, which looks like millimetres; send depth.scale_m = 0.001, or multiply the scale that you sent by "
+        "0.001 (for disparity, divide it by 0.001)"
     )
     assert unit_hint(np.array([[0.004, 0.005, 0.009]], np.float32)) == (
-        "the median depth is 0.005 m, which looks like metres that were taken for millimetres: send scale_m 1 in depth, "
-        "or 1000 times the scale that was sent; if the depth is a disparity, divide the scale by 1000 instead"
+        "the median depth is 0.005 m, which looks like metres that were read as millimetres; send depth.scale_m = 1, or multiply the "
+        "scale that you sent by 1000 (for disparity, divide it by 1000)"
     )
     assert unit_hint(np.array([[4.0]], np.float32)) is None

@@ -145,13 +145,13 @@ def test_a_picture_without_a_usable_depth_is_refused_with_the_limits(depth_m):
 @pytest.mark.parametrize(
     ("depth_m", "why"),
     [
-        (5000.0, "the median depth is 5000 m, which looks like millimetres: send scale_m 0.001 in depth"),
+        (5000.0, "the median depth is 5000 m, which looks like millimetres; send depth.scale_m = 0.001"),
         (
             0.005,
-            "the median depth is 0.005 m, which looks like metres that were taken for millimetres: send scale_m 1 in depth",
+            "the median depth is 0.005 m, which looks like metres that were read as millimetres; send depth.scale_m = 1",
         ),
-        (70.0, "check scale, kind and the camera's intrinsics"),
-        (0.0, "no pixel has a depth: check the depth picture, and max_range_m in depth if it was sent"),
+        (70.0, "check depth.scale_m, depth.kind and the camera intrinsics"),
+        (0.0, "no pixel has a depth: check the depth image, and depth.max_range_m if you sent it"),
     ],
 )
 def test_a_refused_depth_says_which_unit_it_looks_like(depth_m, why):

@@ -82,14 +82,14 @@ GOOD = rvl(np.arange(1, 13, dtype=np.uint16).reshape(3, 4))
 @pytest.mark.parametrize(
     ("data", "says"),
     [
-        (b"123", "header ends early"),
-        (message(b"\x00\x00"), "size ends early"),
-        (message(struct.pack("<ii", -4, 3)), "says -4x3 pixels"),
+        (b"123", "header is cut off"),
+        (message(b"\x00\x00"), "size is cut off"),
+        (message(struct.pack("<ii", -4, 3)), "is -4x3 pixels"),
         (message(GOOD[:8]), "after 0 of 12 pixels"),
         (message(GOOD[:12]), "after . of 12 pixels"),
-        (message(GOOD[:8] + b"\xff" * 40), "make no sense, after 0 of 12"),
-        (message(GOOD[:8] + bytes(40)), "make no sense, after 0 of 12"),  # runs of nothing, for ever
-        (message(GOOD, a=float("nan")), "compressedDepth header says"),
+        (message(GOOD[:8] + b"\xff" * 40), "cut off or invalid after 0 of 12"),
+        (message(GOOD[:8] + bytes(40)), "cut off or invalid after 0 of 12"),  # runs of nothing, for ever
+        (message(GOOD, a=float("nan")), "compressedDepth header states"),
         (message(cv2.imencode(".png", np.zeros((3, 4), np.uint8))[1].tobytes()), "not 16-bit grey"),
         (message(b"\x89PNG\r\n\x1a\n" + bytes(30)), "PNG"),
     ],

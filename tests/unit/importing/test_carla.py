@@ -136,16 +136,16 @@ def test_frames_whose_files_are_missing_or_cut_off_are_counted(recorded):
     (recorded / "rgb" / "00000102.png").unlink()
     bad = [event for event in open_carla(recorded).events() if isinstance(event, Unusable)]
     assert [(b.kind, b.name) for b in bad] == [
-        ("scan", "00000100.ply"), ("scan", "00000101.ply"), ("picture", "00000101.png"), ("picture", "00000102.png")
+        ("scan", "00000100.ply"), ("scan", "00000101.ply"), ("image", "00000101.png"), ("image", "00000102.png")
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("file", "text", "why"),
     [
-        ("recording.json", None, "recording.json cannot be read .*where sensors are mounted"),
+        ("recording.json", None, "recording.json cannot be read .*the mounting of the sensors"),
         ("recording.json", '{"lidar": {"channels": "many"}}', r"recording.json: lidar\.channels"),
-        ("poses.csv", None, "poses.csv is missing: frame, timestamp"),
+        ("poses.csv", None, "poses.csv is missing; it has one line per frame: frame, timestamp"),
         (
             "poses.csv",
             "frame,timestamp,x,y,z,roll,pitch,yaw\n1,0,0,0,0,0,0,0\n../2,1,0,0,0,0,0,0\n",
@@ -320,14 +320,14 @@ def test_ctrl_c_keeps_what_was_recorded_and_puts_all_back(serve, tmp_path):
 
 def test_a_server_that_stops_is_told_with_what_was_kept(serve, tmp_path):
     world = serve(FakeWorld(fails_at=3, failure=RuntimeError("time-out of 20000ms")))
-    with pytest.raises(DatasetError, match=r"host:2000 does not do its part .*time-out.*; 2 frames are in"):
+    with pytest.raises(DatasetError, match=r"host:2000 failed .*time-out.*; 2 frames are in"):
         run(tmp_path / "out", frames=9)
     assert_put_back(world)
 
 
 def test_a_sensor_that_says_nothing_is_told(serve, tmp_path):
     world = serve(FakeWorld(silent=(42,)))
-    with pytest.raises(DatasetError, match=r"a sensor gave nothing for 0\.01 s"):
+    with pytest.raises(DatasetError, match=r"a sensor sent no data for 0\.01 s"):
         run(tmp_path / "out")
     assert_put_back(world)
 
@@ -344,7 +344,7 @@ def test_no_server_is_told_with_the_remedy_and_nothing_is_written(serve, tmp_pat
         raise RuntimeError("time-out")
 
     serve(FakeWorld(), connects=refuse)
-    with pytest.raises(DatasetError, match=r"CARLA at host:2000 .*time-out.*start it, or name another --host"):
+    with pytest.raises(DatasetError, match=r"CARLA at host:2000 .*time-out.*start it, or choose another --host"):
         run(tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -354,7 +354,7 @@ def test_a_full_map_and_an_unknown_weather_are_refused(serve, tmp_path):
     with pytest.raises(DatasetError, match="no free place for a vehicle"):
         run(tmp_path / "out")
     assert world.settings.synchronous_mode is False
-    with pytest.raises(DatasetError, match="weather: CARLA has none called 'Frogs'"):
+    with pytest.raises(DatasetError, match="weather: CARLA has no preset 'Frogs'"):
         run(tmp_path / "out", weather="Frogs")
     assert not (tmp_path / "out").exists()
 

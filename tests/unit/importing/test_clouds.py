@@ -67,7 +67,7 @@ def test_more_points_than_allowed_are_refused(tmp_path, suffix):
 
 def test_a_cloud_in_a_maps_coordinates_is_no_scan(tmp_path):
     write_las(tmp_path / "0.las", POINTS.astype(np.float64) + [458_000, 5_428_000, 100, 0])
-    assert "in its LiDAR's frame, not in a map's" in read_cloud(tmp_path / "0.las")
+    assert "in the frame of its LiDAR, not of a map" in read_cloud(tmp_path / "0.las")
 
 
 def test_a_cloud_without_a_coordinate_names_it(tmp_path):
@@ -118,18 +118,21 @@ def test_a_broken_scan_is_counted_and_the_others_come(tmp_path):
     (tmp_path / "1.bin").write_bytes(b"123")
     events: list[Any] = list(open_clouds(tmp_path).events())
     assert [type(event) for event in events] == [RecordedScan, Unusable, RecordedScan]
-    assert (events[1].name, events[1].why) == ("1.bin", "its bytes are no rows of four float32: truncated")
+    assert (events[1].name, events[1].why) == (
+        "1.bin",
+        "its size is not a multiple of 16 bytes (rows of four float32): truncated",
+    )
 
 
 def test_as_many_poses_as_scans_are_wanted(tmp_path):
     write_bin(tmp_path / "0.bin")
     (tmp_path / "poses.txt").write_text(poses_text([0.0, 1.0]))
-    with pytest.raises(DatasetError, match=r"poses\.txt has 2 poses for 1 scans; a line a scan"):
+    with pytest.raises(DatasetError, match=r"poses\.txt has 2 poses for 1 scans; expected one line per scan"):
         open_clouds(tmp_path)
 
 
 def test_a_folder_without_scans_is_refused(tmp_path):
-    with pytest.raises(DatasetError, match=r"a folder of scans is wanted \(\.bin, \.pcd"):
+    with pytest.raises(DatasetError, match=r"no scans found; give a folder of scans \(\.bin, \.pcd"):
         open_clouds(tmp_path)
 
 
@@ -141,5 +144,5 @@ def test_a_scan_that_vanishes_during_an_import_is_an_error_that_names_it(tmp_pat
     events = open_clouds(tmp_path).events()
     assert isinstance(next(events), RecordedScan)
     (tmp_path / f"1{suffix}").unlink()
-    with pytest.raises(DatasetError, match=rf"1\{suffix}: it is missing, or vanished"):
+    with pytest.raises(DatasetError, match=rf"1\{suffix}: the file is missing, or was removed"):
         next(events)

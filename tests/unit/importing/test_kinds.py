@@ -10,25 +10,35 @@ from service.geometry.camera import PinholeCamera
 
 
 def test_an_unknown_format_is_refused_with_those_there_are(tmp_path):
-    with pytest.raises(DatasetError, match="'ros3' is not known; there is: carla, clouds, kitti-360, kitti-odometry"):
+    with pytest.raises(
+        DatasetError, match="'ros3' is not a known format; choose one of: carla, clouds, kitti-360, kitti-odometry"
+    ):
         open_recording("ros3", tmp_path, OpenSettings())
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_at_the_name_is_refused(tmp_path, kind):
-    with pytest.raises(DatasetError, match="there is nothing of that name"):
+    with pytest.raises(DatasetError, match="file or folder not found"):
         open_recording(kind, tmp_path / "nowhere", OpenSettings())
 
 
 @pytest.mark.parametrize(
     ("kind", "settings", "why"),
     [
-        ("clouds", OpenSettings(depth="sgbm"), "clouds has no 'sgbm' depth; there is: recorded"),
-        ("rosbag", OpenSettings(depth="stored"), "rosbag has no 'stored' depth; there is: recorded, lidar"),
-        ("kitti-raw", OpenSettings(topics={"scan": "/x"}), "topic: kitti-raw has no use for it"),
-        ("carla", OpenSettings(camera=PinholeCamera(8, 6, 8.0, 8.0, 3.5, 2.5)), "camera: carla has no use for it"),
-        ("tum-rgbd", OpenSettings(rectified=False), "rectified: tum-rgbd has no use"),
-        ("clouds", OpenSettings(extrinsics=Extrinsics(T_vehicle_lidar=np.eye(4))), "extrinsics: clouds has no use"),
+        ("clouds", OpenSettings(depth="sgbm"), "clouds has no 'sgbm' depth; choose one of: recorded"),
+        ("rosbag", OpenSettings(depth="stored"), "rosbag has no 'stored' depth; choose one of: recorded, lidar"),
+        ("kitti-raw", OpenSettings(topics={"scan": "/x"}), "topic: kitti-raw does not support this option"),
+        (
+            "carla",
+            OpenSettings(camera=PinholeCamera(8, 6, 8.0, 8.0, 3.5, 2.5)),
+            "camera: carla does not support this option",
+        ),
+        ("tum-rgbd", OpenSettings(rectified=False), "rectified: tum-rgbd does not support this option"),
+        (
+            "clouds",
+            OpenSettings(extrinsics=Extrinsics(T_vehicle_lidar=np.eye(4))),
+            "extrinsics: clouds does not support this option",
+        ),
     ],
 )
 def test_an_option_that_would_do_nothing_is_refused(tmp_path, kind, settings, why):
@@ -47,13 +57,13 @@ def test_mountings_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("{", "no JSON that can be read"),
+        ("{", "cannot be read as JSON"),
         ("[]", "an object with T_vehicle_lidar and T_vehicle_camera"),
         ('{"T_lidar": 1}', "an object with"),
-        ('{"T_vehicle_lidar": "here"}', "T_vehicle_lidar is no matrix of numbers"),
+        ('{"T_vehicle_lidar": "here"}', "T_vehicle_lidar is not a matrix of numbers"),
         ('{"T_vehicle_lidar": [[1, 0], [0, 1]]}', "is not 4 rows of 4 numbers"),
-        ('{"T_vehicle_lidar": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "turns by no rotation"),
-        ('{"T_vehicle_lidar": [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]}', "turns by no rotation"),
+        ('{"T_vehicle_lidar": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "has no valid rotation"),
+        ('{"T_vehicle_lidar": [[1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]}', "has no valid rotation"),
     ],
 )
 def test_mountings_that_are_none_are_refused_with_the_file(tmp_path, text, why):

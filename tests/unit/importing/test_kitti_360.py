@@ -112,9 +112,9 @@ def test_a_drive_becomes_a_dataset_without_the_frames_that_have_no_pose(root, tm
     [
         ("calibration/calib_cam_to_velo.txt", "1 2 3", "12 numbers"),
         ("calibration/calib_cam_to_pose.txt", "image_03: 1 2", "image_00 is missing"),
-        ("calibration/calib_cam_to_pose.txt", "image_00: " + "1 " * 12, "no rotation"),
-        ("calibration/calib_cam_to_velo.txt", "1 " * 12, "no rotation"),
-        (f"data_poses/{NAME}/poses.txt", "1 " + "2 " * 12, "line 1: no rotation"),
+        ("calibration/calib_cam_to_pose.txt", "image_00: " + "1 " * 12, "not a rotation"),
+        ("calibration/calib_cam_to_velo.txt", "1 " * 12, "not a rotation"),
+        (f"data_poses/{NAME}/poses.txt", "1 " + "2 " * 12, "line 1: not a rotation"),
         ("calibration/perspective.txt", "P_rect_00: 1", "P_rect_00"),
         (f"data_poses/{NAME}/poses.txt", "1 2 3\n", "line 1"),
         (f"data_poses/{NAME}/poses.txt", "x " + "0 " * 12, "line 1"),
@@ -137,7 +137,7 @@ def test_without_scans_or_poses(root):
 
 def test_the_root_or_a_tree_names_the_drives(root):
     drive = root / "data_3d_raw" / NAME
-    wanted = "a drive's folder in data_3d_raw, data_2d_raw, data_poses is wanted; give"
+    wanted = "expected the folder of one drive in data_3d_raw, data_2d_raw, data_poses; give"
     for source in (root, root / "data_3d_raw", root / "data_poses", drive / "velodyne_points" / "data"):
         with pytest.raises(DatasetError) as caught:
             open_recording("kitti-360", source, OpenSettings())
@@ -193,5 +193,5 @@ def test_a_scan_without_a_time_is_named(root):
     path = root / f"data_3d_raw/{NAME}/velodyne_points/timestamps.txt"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:2], "", *lines[3:]]) + "\n")
-    with pytest.raises(DatasetError, match=r"timestamps.txt, line 3: no time"):
+    with pytest.raises(DatasetError, match=r"timestamps.txt, line 3: not a time"):
         opened(root)

@@ -71,10 +71,10 @@ def test_tums_truth_is_of_the_optical_frame_and_becomes_that_of_the_body(tum):
     ("file", "text", "why"),
     [
         ("rgb.txt", None, "rgb.txt is missing"),
-        ("depth.txt", "# nothing\n", "depth.txt lists no picture"),
+        ("depth.txt", "# nothing\n", "depth.txt lists no image"),
         ("rgb.txt", "0.0\n", "rgb.txt, line 1"),
-        ("depth.txt", "99 depth/0.png\n", "no colour picture has a depth within 0.02 s"),
-        ("rgb.txt", "0 ../../etc/passwd\n", "outside of the recording"),
+        ("depth.txt", "99 depth/0.png\n", "no depth image within 0.02 s of any colour image"),
+        ("rgb.txt", "0 ../../etc/passwd\n", "outside the recording"),
         ("groundtruth.txt", "0 0 0\n", "groundtruth.txt, line 1"),
     ],
 )
@@ -114,7 +114,7 @@ def test_a_pose_of_open3d_that_is_none_is_named(open3d, row):
 
 def test_open3ds_camera_may_be_given_and_must_be_somewhere(open3d):
     (open3d / "camera_intrinsic.json").write_text("{}")
-    with pytest.raises(DatasetError, match=r"camera_intrinsic\.json: no camera"):
+    with pytest.raises(DatasetError, match=r"camera_intrinsic\.json: not a camera file of Open3D"):
         open_open3d(open3d, None)
     (open3d / "camera_intrinsic.json").unlink()
     with pytest.raises(DatasetError, match="add it, or give --camera FILE"):
@@ -124,7 +124,7 @@ def test_open3ds_camera_may_be_given_and_must_be_somewhere(open3d):
 
 def test_as_much_depth_as_colour_is_wanted(open3d):
     (open3d / "depth" / "00001.png").unlink()
-    with pytest.raises(DatasetError, match="there are 2 and 1"):
+    with pytest.raises(DatasetError, match="they have 2 and 1"):
         open_open3d(open3d, None)
 
 
@@ -147,4 +147,4 @@ def test_a_picture_without_any_depth_gives_no_scan(open3d):
     write_pair(open3d / "color" / "00000.jpg", open3d / "depth" / "00000.png", 0)
     first = next(open_open3d(open3d, None).events())
     assert isinstance(first, Unusable)
-    assert (first.kind, first.why) == ("scan", "no depth in it")
+    assert (first.kind, first.why) == ("scan", "the image has no depth")

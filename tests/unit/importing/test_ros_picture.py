@@ -68,7 +68,7 @@ def test_depth_of_both_encodings_comes_as_it_is(encoding, values, big, padding):
 @pytest.mark.parametrize(
     ("changed", "why"),
     [({"encoding": "bayer_rggb8"}, "unknown encoding 'bayer_rggb8' (known:"), ({"height": 4}, "truncated"), ({"step": 2}, "truncated"),
-     ({"width": 0}, "is none, or over the limit"), ({"height": 10**6, "width": 10**6}, "over the limit")],
+     ({"width": 0}, "is 0, or over the limit"), ({"height": 10**6, "width": 10**6}, "over the limit")],
 )  # fmt: skip
 def test_a_picture_that_cannot_be_read_says_why(reader, changed, why):
     good = image(RGB, "rgb8") if reader is colour_of else image(np.ones((3, 5), np.uint16), "16UC1")
@@ -122,7 +122,7 @@ def test_a_fisheye_is_known_by_its_model():
         ({"k": [0.0] * 9}, "not calibrated"),
         ({"distortion_model": "omni"}, "unknown distortion_model 'omni'"),
         ({"d": [0.1, 0.2]}, "2 coefficients"),
-        ({"distortion_model": "equidistant"}, "has 5 coefficients; 4 finite ones"),
+        ({"distortion_model": "equidistant"}, "has 5 coefficients; expected 4 finite ones"),
         ({"d": [np.nan, 1, 0, 0]}, "finite"),
     ],
 )

@@ -59,9 +59,12 @@ def test_what_is_told_is_not_guessed_and_lines_say_which():
 @pytest.mark.parametrize(
     ("told", "why"),
     [
-        ({"colour": "/a"}, "'colour' is no role; there are: scan, color"),
+        ({"colour": "/a"}, "'colour' is not a valid role; choose one of: scan, color"),
         ({"scan": "/velodyne"}, "drive.mcap has no topic '/velodyne'; it has: /a, /points"),
-        ({"scan": "/a"}, "topic '/a' is sensor_msgs/msg/Image; for scan one is wanted of: sensor_msgs/msg/PointCloud2"),
+        (
+            {"scan": "/a"},
+            "topic '/a' is sensor_msgs/msg/Image; for scan the type must be one of: sensor_msgs/msg/PointCloud2",
+        ),
     ],
 )
 def test_a_topic_that_does_not_fit_is_refused_with_those_there_are(told, why):

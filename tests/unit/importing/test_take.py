@@ -54,16 +54,16 @@ def test_what_cannot_be_used_is_counted_by_reason_with_the_first_name(taken, sca
     summary, dataset = taken(events)
     assert (summary.scans, summary.pictures) == (2, 0)
     assert summary.dropped[:2] == (
-        "3 scans: its time is not after the scan's before it (first: scan at 0.4)",
+        "3 scans: its time is not later than that of the scan before (first: scan at 0.4)",
         "2 scans: truncated (first: a.bin)",
     )
     assert set(summary.dropped[2:]) == {
         "1 scan: no finite points (first: scan at 0.6)",
-        "1 scan: it lies after the last pose (first: scan at 99)",
-        "1 picture: no depth in the recording; --depth lidar takes it from the scans (first: picture at 0.7)",
-        "1 picture: its depth is empty (first: picture at 0.8)",
-        "1 picture: sizes differ: colour (6, 8), depth (3, 4), camera (6, 8) (first: picture at 0.9)",
-        "1 picture: it lies after the last pose (first: picture at 99)",
+        "1 scan: after the last pose (first: scan at 99)",
+        "1 image: no depth in the recording; --depth lidar takes it from the scans (first: picture at 0.7)",
+        "1 image: its depth is empty (first: picture at 0.8)",
+        "1 image: sizes differ: colour (6, 8), depth (3, 4), camera (6, 8) (first: picture at 0.9)",
+        "1 image: after the last pose (first: picture at 99)",
     }
     assert dataset.description.source["dropped"] == list(summary.dropped)
 
@@ -99,7 +99,7 @@ def test_every_third_scan_is_held_out_with_the_pictures_nearest_to_it(taken, sca
     np.testing.assert_allclose(dataset.survey_trajectory()[0], [0.5, 1.0, 2.0, 2.5, 3.5])
     assert [query.stamp_s for query in dataset.queries("recorded")] == [1.6, 3.1]
     assert summary.dropped == (
-        "4 pictures: the scan nearest to it is in the survey (--hold-out) (first: picture at 0.6)",
+        "4 images: the scan nearest to it is in the survey (--hold-out) (first: picture at 0.6)",
     )
 
 
@@ -148,7 +148,7 @@ def test_depth_of_a_lidar_is_where_the_vehicle_is_at_the_picture(taken, scan_at,
     (query,) = dataset.queries("recorded")
     depth = query.depth_m()[4:20, 4:28]
     np.testing.assert_allclose(depth, 5.92, atol=0.001)
-    assert summary.dropped == ("1 picture: no scan within 0.1 s (first: picture at 3)",)
+    assert summary.dropped == ("1 image: no scan within 0.1 s (first: picture at 3)",)
 
 
 def test_a_bent_picture_is_rectified_on_the_way_in(taken, scan_at, picture_at):
@@ -174,11 +174,9 @@ def test_depth_too_far_for_sixteen_bits_is_no_depth(taken, scan_at, picture_at):
 
 def test_no_usable_scan_is_an_error_with_the_reasons_and_leaves_nothing(recording_of, straight, scan_at, tmp_path):
     events = [scan_at(99.0), Unusable("scan", "a.bin", "truncated")]
-    with pytest.raises(
-        DatasetError, match=r"list: no scan can be used \(1 scan: it lies after the last pose .*truncated"
-    ):
+    with pytest.raises(DatasetError, match=r"list: no scan is usable \(1 scan: after the last pose .*truncated"):
         take(recording_of(events), straight(), tmp_path / "out", TakeSettings())
-    with pytest.raises(DatasetError, match="there is none"):
+    with pytest.raises(DatasetError, match="the recording has none"):
         take(recording_of([]), straight(), tmp_path / "out", TakeSettings())
     assert list(tmp_path.iterdir()) == []
 
@@ -222,7 +220,7 @@ def test_millimetres_as_floats_are_left_out_with_the_unit(taken, scan_at, pictur
     assert summary.pictures == 1
     (line,) = summary.dropped
     assert line == (
-        "1 picture: its floating-point depth looks like millimetres, and metres are wanted: divide it by 1000, or record "
+        "1 image: its floating-point depth looks like millimetres, but metres are expected: divide it by 1000, or record "
         "16-bit integers (first: picture at 0.5)"
     )
 

@@ -88,7 +88,7 @@ def test_time_that_does_not_rise_is_refused_naming_the_pose(stamps):
 
 
 def test_no_poses_and_poses_that_are_no_numbers_are_refused():
-    with pytest.raises(DatasetError, match="no pose in it"):
+    with pytest.raises(DatasetError, match="the file has no pose"):
         Trajectory(np.zeros(0), np.zeros((0, 4, 4)), "empty")
     with pytest.raises(DatasetError, match=r"turning, pose 2: .*finite"):
         turning([0, 1], [0, 0], [0, np.nan])

@@ -85,7 +85,7 @@ def test_latency_counts_from_when_a_request_was_due():
     assert min(late) > 0.09
     found = summarise(shots, PAYLOADS, load, None, None)
     assert found.late_ms["max"] > 200  # told apart: it was not the target that was slow to answer
-    assert "was itself late" in str(table_of([found]).caption)
+    assert "the load generator sent requests late" in str(table_of([found]).caption)
 
 
 def test_a_generator_that_keeps_up_says_nothing_of_itself():

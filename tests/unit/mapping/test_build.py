@@ -339,7 +339,7 @@ def test_a_survey_with_poses_of_two_frames_is_refused_before_the_work(small_data
             return poses
 
     told = []
-    with pytest.raises(DatasetError, match=r"survey/poses\.txt: scan 7 lies .* km from the middle of the map"):
+    with pytest.raises(DatasetError, match=r"survey/poses\.txt: scan 7 is .* km from the middle of the map"):
         build_map(
             OneInUtm(small_dataset.folder),
             encoder_file,

@@ -78,7 +78,7 @@ def test_a_whole_bundle_is_whole(run, small_map, bundle_path):
     assert damage_of(small_map) == []
     assert damage_of(bundle_path) == []
     code, out, _ = run("verify", small_map)
-    assert (code, out) == (0, f"{small_map}: whole\n")
+    assert (code, out) == (0, f"{small_map}: no defects\n")
 
 
 def test_every_damaged_file_is_named(run, own):
@@ -90,9 +90,9 @@ def test_every_damaged_file_is_named(run, own):
     code, out, _ = run("verify", own)
     assert code == 1
     assert out.splitlines() == [
-        f"{own}/cloud/surfels.npy: its hash differs from the manifest",
-        f"{own}/streets.geojson: the file is missing, or is outside the bundle",
-        f"{own}/views.npy: it has {(own / 'views.npy').stat().st_size} bytes instead of {(own / 'views.npy').stat().st_size + 1}",
+        f"{own}/cloud/surfels.npy: the hash does not match the manifest",
+        f"{own}/streets.geojson: missing, or outside the bundle",
+        f"{own}/views.npy: {(own / 'views.npy').stat().st_size} bytes instead of {(own / 'views.npy').stat().st_size + 1}",
     ]
 
 
@@ -115,7 +115,7 @@ def test_a_manifest_of_another_format_is_named(own):
         (lambda c: {"T_map_place": c.T_map_place * SKEWED}, r"places\.npy: 12 poses are not rigid transforms"),
         (lambda _: {"place_street": np.array([2] * 6 + [1, 1, 2, 2, 2, 2], np.int32)},
          r"places\.npy: 6 places are outside the streets that they name"),
-        (lambda _: {"statistics": np.zeros(3)}, r"voxels\.npy: it holds float64"),
+        (lambda _: {"statistics": np.zeros(3)}, r"voxels\.npy: unexpected type float64"),
     ],
 )  # fmt: skip
 def test_contents_that_contradict_each_other_are_told(content, tmp_path, change, message):

@@ -153,12 +153,12 @@ def test_a_polygon_far_from_the_drive_is_refused(small_map, small_dataset, tmp_p
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is no JSON"),
-        ("[]", "is no geometry"),
-        ('{"type": "Point", "coordinates": [1, 2]}', "holds Point, not a polygon"),
-        ('{"type": "FeatureCollection", "features": []}', "holds nothing, not a polygon"),
+        ("{", "is not valid JSON"),
+        ("[]", "not a valid geometry"),
+        ('{"type": "Point", "coordinates": [1, 2]}', "contains Point, not a polygon"),
+        ('{"type": "FeatureCollection", "features": []}', "contains nothing, not a polygon"),
         ('{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [1, 0], [0, 1], [0, 0]]]}', "crosses itself"),
-        ('{"type": "Polygon", "coordinates": [[[0, 0], [1]]]}', "is no geometry"),
+        ('{"type": "Polygon", "coordinates": [[[0, 0], [1]]]}', "not a valid geometry"),
     ],
 )
 def test_what_is_no_polygon_is_refused(tmp_path, text, message):
@@ -231,7 +231,7 @@ def test_a_street_that_contradicts_the_maps_is_refused_before_the_work(small_map
     streets["features"][0]["properties"]["name"] = "Another street"
     (folder / "streets.geojson").write_text(json.dumps(streets))
     told = []
-    with pytest.raises(BundleError, match="both have a street"):
+    with pytest.raises(BundleError, match="both maps have a street"):
         update_map(
             small_map, Dataset(folder), tmp_path / "m", threads=1, report=lambda *event: told.append(event)
         )  # fmt: skip
@@ -271,7 +271,7 @@ def test_a_drive_too_far_from_the_map_is_refused(half_maps, halves, tmp_path, mo
     poses = halves[1].survey_poses()
     poses[:, 1, 3] += 300_000.0
     monkeypatch.setattr(halves[1], "survey_poses", lambda: poses)
-    with pytest.raises(DatasetError, match=r"scan \d+ lies 300 km from the middle of the map"):
+    with pytest.raises(DatasetError, match=r"scan \d+ is 300 km from the middle of the map"):
         update_map(half_maps[0], halves[1], tmp_path / "m", threads=1)
 
 

@@ -176,7 +176,7 @@ def holder(tmp_path):
 
 
 def test_a_second_build_at_once_is_refused_and_names_the_first(holder, small_dataset, encoder_file, tmp_path):
-    with pytest.raises(BundleError, match=f"process {holder.pid} is building it already"):
+    with pytest.raises(BundleError, match=f"process {holder.pid} already builds this map"):
         build_map(small_dataset, encoder_file, tmp_path / "m", SETTINGS, threads=1)
     assert not (tmp_path / "m").exists()
 

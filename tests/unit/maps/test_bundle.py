@@ -70,7 +70,7 @@ def test_other_content_has_another_version(content_of: Callable[..., BundleConte
 
 
 def test_an_existing_path_is_refused(content: BundleContent, bundle_copy: Path) -> None:
-    with pytest.raises(BundleError, match="something of that name already"):
+    with pytest.raises(BundleError, match="already exists; choose another --out or pass --overwrite"):
         write_bundle(bundle_copy, content)
 
 
@@ -139,10 +139,10 @@ def test_a_killed_writer_leaves_nothing_under_the_final_name(tmp_path: Path) -> 
     ("changed", "message"),
     [
         ({"rows_seen": np.ones(3, np.bool_)}, "rows_seen has 3 entries for 8 rows"),
-        ({"view_place": np.full(48, 12, np.int32)}, "a place that is not there"),
+        ({"view_place": np.full(48, 12, np.int32)}, "a view refers to a missing place"),
         ({"place_street": np.full(12, 3, np.int32)}, "not among the 3"),
         ({"descriptors": np.full((48, 16), np.nan, np.float32)}, "not finite"),
-        ({"T_map_place": np.tile(2.0 * np.eye(4), (12, 1, 1))}, "a pose is not finite, stretches"),
+        ({"T_map_place": np.tile(2.0 * np.eye(4), (12, 1, 1))}, "a pose is not finite, scales"),
         ({"parameters": {}}, "lidar_height_m"),
         ({"name": "a/b"}, "name"),
         ({"name": ""}, "name"),

@@ -63,8 +63,8 @@ def test_a_map_that_says_it_is_not_calibrated_has_no_calibration():
 
 @pytest.mark.parametrize(
     ("text", "what"),
-    [(text, "it is no JSON") for text in (b"", b"{", b"\xff\xfe", b"\x00", b"[" * 100_000)]
-    + [(text, "it does not say whether the map is calibrated") for text in (
+    [(text, "not valid JSON") for text in (b"", b"{", b"\xff\xfe", b"\x00", b"[" * 100_000)]
+    + [(text, "the field calibrated is missing or not a boolean") for text in (
         b"{}", b"[]", b"null", b"false", b'"calibrated"', b'{"calibrated": null}', b'{"calibrated": 0}', b'{"calibrated": "false"}')]
     + [(b'{"calibrated": true, "why": "x"}', "features: Field required")],
 )  # fmt: skip
@@ -81,7 +81,9 @@ def test_a_calibration_of_another_number_of_features_is_refused(document, featur
 
 
 def test_thresholds_that_do_not_rise_are_refused(document):
-    refused(document | {"thresholds": document["thresholds"][::-1]}, "thresholds must come by rising false-accept rate")
+    refused(
+        document | {"thresholds": document["thresholds"][::-1]}, "thresholds must be sorted by rising false-accept rate"
+    )
 
 
 def test_a_calibration_without_thresholds_is_refused(document):

@@ -48,13 +48,14 @@ def known(one_surfel: Pair, points, start, **options):
 def test_the_variance_is_that_of_the_range_where_the_ray_meets_the_surface(
     one_surfel, points_at, start_at, measured_m, there_m, ratio
 ):
-    """By the third power of the ratio: with it, weight times residual is odd in the error of 1 / range."""
+    """The variance is scaled by the cube of the ratio. Then weight times residual is an odd function of the error of 1 / range."""
     found = known(one_surfel, points_at([[measured_m, 0, 0]], sigma=0.2), start_at(np.eye(3), [-there_m, 0, 0]))
     assert found == pytest.approx(1 / (0.04 * ratio**3), rel=1e-4)
 
 
 def test_only_what_the_ray_brings_is_scaled_and_only_as_far_as_it_meets_the_surface(one_surfel, points_at, start_at):
-    """The ray (4, 3, 0) / 5 measures 5 m and meets the wall at 4 m: of sigma 0.5 it brings 0.4 across, times 0.8^3; 0.3 are rough."""
+    """The ray (4, 3, 0) / 5 measures 5 m and meets the wall at 4 m. Sigma 0.5 gives 0.4 across the wall, and its variance is scaled by
+    0.8^3. The roughness of 0.3 is not scaled."""
     start = start_at(np.eye(3), [-3.2, -2.8, 0])
     found = known(one_surfel, points_at([[4, 3, 0]], sigma=0.5), start, surface=0.3)
     assert found == pytest.approx(1 / (0.16 * 0.8**3 + 0.09), rel=1e-4)

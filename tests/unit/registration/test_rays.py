@@ -253,5 +253,5 @@ def test_a_turn_is_that_of_its_vector(vector, size):
 
 @pytest.mark.parametrize("patch", [0, -1, 17])
 def test_patches_that_the_kernel_has_no_room_for_are_refused(patch):
-    with pytest.raises(ValueError, match=f"patch: {patch} is not from 1 to 16"):
+    with pytest.raises(ValueError, match=f"patch: {patch} must be 1 to 16"):
         RaySettings(patch=patch)

@@ -16,7 +16,8 @@ from model_training.reporting.charts import (
     series_of,
     side_by_side,
 )
-from model_training.reporting.pictures import FARTHEST_M, depth_bgr
+from model_training.reporting.pictures import depth_bgr
+from service.imaging.view_grid import MAX_RANGE_M
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -110,6 +111,6 @@ def test_sets_are_drawn_while_there_are_colours_for_them(answers_of):
 
 
 def test_depth_that_was_not_measured_is_grey_and_near_is_brighter_than_far():
-    picture = depth_bgr(np.array([[0.0, 2.0, np.nan, FARTHEST_M]], np.float32).repeat(2, axis=0), width=4)
+    picture = depth_bgr(np.array([[0.0, 2.0, np.nan, MAX_RANGE_M]], np.float32).repeat(2, axis=0), width=4)
     assert (picture[0, [0, 2]] == 128).all()
     assert int(picture[0, 1].sum()) > int(picture[0, 3].sum())

@@ -75,5 +75,5 @@ def test_no_answer_is_counted_with_the_farthest():
         "up to 0.5 m": 1,
         "up to 1 m": 1,
         "up to 5 m": 1,
-        "farther off": 2,
+        "over 5 m": 2,
     }

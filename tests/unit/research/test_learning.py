@@ -90,12 +90,12 @@ def test_a_run_with_drops_goes_on_after_the_first_rests(tmp_path: Path) -> None:
 def test_a_folder_of_other_settings_is_refused(tmp_path: Path) -> None:
     Training(tmp_path, {"rate": 0.1}, budget_s=1.0)
 
-    with pytest.raises(DatasetError, match="is of other settings; remove"):
+    with pytest.raises(DatasetError, match="has other settings; remove"):
         Training(tmp_path, {"rate": 0.2}, budget_s=1.0)
 
 
 def test_there_is_no_best_state_before_the_first_point(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"holds no best\.pt yet"):
+    with pytest.raises(DatasetError, match=r"has no best\.pt yet"):
         Training(tmp_path, {}, budget_s=1.0).best()
 
 

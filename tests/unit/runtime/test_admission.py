@@ -98,7 +98,7 @@ def test_what_was_cancelled_while_it_waited_is_not_kept(blocked: tuple[Admission
 def test_a_closed_pool_refuses() -> None:
     admission = Admission(threads=1, queue=0)
     admission.close()
-    with pytest.raises(BusyError, match="shutting down"):
+    with pytest.raises(BusyError, match="the service is stopping"):
         admission.submit(lambda: None)
 
 

@@ -35,10 +35,10 @@ def test_anything_else_is_refused(tmp_path, presented):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "no key in it"), ("# none\n", "no key in it"), ("robot", "line 1"), (f"ok {A}\nrobot {B[:-1]}", "line 2"),
+        ("", "the key file is empty"), ("# none\n", "the key file is empty"), ("robot", "line 1"), (f"ok {A}\nrobot {B[:-1]}", "line 2"),
         (f"robot {A.upper()}", "line 1"), (f"a robot {A}", "line 1"), (f"rob/ot {A}", "line 1"), (f"{A} robot", "line 1"),
         (f"one {A}\ntwo {A}", "line 2"), (f"one {A} admin", "line 1"), (f"one {A} operator too", "line 1"), (f"one {A}\none {B}", "line 2"),
-        ("x" * (2**20 + 1), "over"),
+        ("x" * (2**20 + 1), "the key file exceeds 1 MiB"),
     ],
 )  # fmt: skip
 def test_a_file_that_is_none_is_named_with_its_line(tmp_path, text, told):

@@ -32,17 +32,17 @@ def test_the_only_map_needs_no_name(bundle_path: Path) -> None:
 
 
 def test_an_unknown_map_is_refused_with_the_mounted_ones(two_maps: Path) -> None:
-    with pytest.raises(UnknownMapError, match="no map 'west'; mounted: north, south"):
+    with pytest.raises(UnknownMapError, match="map 'west' not found; mounted maps: north, south"):
         MapRegistry.open([two_maps]).get("west")
 
 
 def test_with_several_maps_a_name_is_needed(two_maps: Path) -> None:
-    with pytest.raises(UnknownMapError, match="names none; mounted: north, south"):
+    with pytest.raises(UnknownMapError, match="names none; mounted maps: north, south"):
         MapRegistry.open([two_maps]).get(None)
 
 
 def test_the_same_version_twice_is_refused(bundle_path: Path, bundle_copy: Path) -> None:
-    with pytest.raises(BundleError, match=r"both version .* of 'tiny'"):
+    with pytest.raises(BundleError, match=r"have the same version .* of 'tiny'"):
         MapRegistry.open([bundle_path, bundle_copy])
 
 
@@ -111,7 +111,9 @@ def test_the_same_version_from_another_folder_takes_its_place(versions: list[Loc
     assert registry.versions("tiny") == (again, versions[0])
 
 
-@pytest.mark.parametrize(("name", "version", "told"), [("west", "x", "mounted: tiny"), ("tiny", "x", "no version 'x'")])
+@pytest.mark.parametrize(
+    ("name", "version", "told"), [("west", "x", "mounted maps: tiny"), ("tiny", "x", "version 'x' of 'tiny' not found")]
+)
 def test_what_is_not_open_cannot_serve(versions: list[Localizer], name: str, version: str, told: str) -> None:
     registry = MapRegistry(versions[:1])
     with pytest.raises(UnknownMapError, match=told):
@@ -133,7 +135,7 @@ def test_unmounting_lets_the_newest_of_the_others_serve(versions: list[Localizer
             registry.get(name)
 
 
-@pytest.mark.parametrize(("make", "message"), [(False, "no such folder"), (True, "no manifest.json in it")])
+@pytest.mark.parametrize(("make", "message"), [(False, "folder not found"), (True, "manifest.json is missing")])
 def test_a_path_without_a_bundle_is_refused(tmp_path: Path, make: bool, message: str) -> None:
     if make:
         (tmp_path / "x").mkdir()
@@ -142,7 +144,7 @@ def test_a_path_without_a_bundle_is_refused(tmp_path: Path, make: bool, message:
 
 
 def test_no_path_at_all_is_refused() -> None:
-    with pytest.raises(BundleError, match="no map to serve"):
+    with pytest.raises(BundleError, match="no map bundle given"):
         MapRegistry.open([])
 
 
@@ -156,5 +158,5 @@ def test_an_encoder_that_is_none_stops_the_start(content_of: Callable[..., Bundl
 
 def test_a_dataset_given_as_a_bundle_is_named(tmp_path: Path) -> None:
     (tmp_path / "dataset.json").write_text("{}")
-    with pytest.raises(BundleError, match="is a dataset, not a map bundle: run `streetfix build-map"):
+    with pytest.raises(BundleError, match="a dataset, not a map bundle; run `streetfix build-map"):
         MapRegistry.open([tmp_path])

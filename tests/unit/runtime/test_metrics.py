@@ -47,6 +47,18 @@ def test_an_answer_is_counted_with_its_stages(engine: Engine, parts_of: Parts) -
     assert not any(name.startswith("streetfix_confidence") for name, _ in found)  # this map is not calibrated
 
 
+def test_features_out_of_the_range_of_the_calibration_are_counted(engine: Engine, parts_of: Parts) -> None:
+    parts = parts_of()
+    located = engine.localize(
+        query_from(parsed(parts["request"], LocalizeRequest), rgb=parts["rgb"], depth=parts["depth"])
+    )
+    for outside in ((("front", 5.0), ("points", -4.5)), (("front", 4.1),), ()):
+        engine.metrics.answered(replace(located.answer, extrapolated=outside), located.bundle, frames=1)
+    found = values(engine)
+    assert found["streetfix_extrapolated_total", (("feature", "front"), ("map", "tiny"))] == 2
+    assert found["streetfix_extrapolated_total", (("feature", "points"), ("map", "tiny"))] == 1
+
+
 def test_an_error_is_no_answer(engine: Engine, parts_of: Parts) -> None:
     parts = parts_of()
     query = query_from(parsed(parts["request"], LocalizeRequest), rgb=b"nothing", depth=parts["depth"])

@@ -183,6 +183,9 @@ def test_an_answer_that_is_not_finite_does_not_leave_the_core(
         "candidates.0.registered.scale": replace(
             good, candidates=(replace(first, registered=replace(first.registered, scale=math.inf)),)
         ),
+        "candidates.0.scores.similarity": replace(
+            good, candidates=(replace(first, scores={**first.scores, "similarity": math.nan}),)
+        ),
         "neighbours.1.position_m": replace(
             good, neighbours=(good.neighbours[0], replace(good.neighbours[1], position_m=np.array([0, np.inf, 0])))
         ),

@@ -56,7 +56,7 @@ def test_a_folder_on_the_way_that_may_not_be_entered_is_told(mounted: Path, monk
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "stat", refused)
-    with pytest.raises(KeysError, match="may not enter a folder"):
+    with pytest.raises(KeysError, match="has no access to a folder"):
         KeyRing.open(mounted)
 
 

@@ -61,7 +61,7 @@ def test_a_link_that_is_turned_counts_as_a_change(path: Path) -> None:
     assert loaded.times == 2
 
 
-@pytest.mark.parametrize("error", [KeysError("no key in it"), OSError("broken")])
+@pytest.mark.parametrize("error", [KeysError("the key file is empty"), OSError("broken")])
 def test_what_cannot_be_used_is_logged_once_and_tried_again_when_it_changes(
     path: Path, caplog: pytest.LogCaptureFixture, error: Exception
 ) -> None:

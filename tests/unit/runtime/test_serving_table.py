@@ -174,7 +174,9 @@ def test_versions_of_one_moment_are_in_one_order_for_all(memory: Any, other_memo
     assert mounted(joined(other_memory, 0, b, a)) == ("bb", ["bb", "aa"])
 
 
-@pytest.mark.parametrize(("name", "number", "told"), [("x", "v1", "mounted: m"), ("m", "v9", "open: v2, v1")])
+@pytest.mark.parametrize(
+    ("name", "number", "told"), [("x", "v1", "mounted maps: m"), ("m", "v9", "mounted versions: v2, v1")]
+)
 def test_what_is_not_mounted_cannot_be_chosen(memory: Any, name: str, number: str, told: str) -> None:
     table = joined(memory, 0, V1, V2)
     with pytest.raises(UnknownMapError, match=told):

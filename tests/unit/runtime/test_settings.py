@@ -161,7 +161,7 @@ def test_a_misspelt_line_of_the_file_is_refused_with_the_nearest_name(file: Path
 )
 def test_an_allowed_host_that_is_no_name_is_refused(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     monkeypatch.setenv("STREETFIX_ALLOWED_HOSTS", value)
-    with pytest.raises(RequestError, match=r"allowed_hosts.*no host name"):
+    with pytest.raises(RequestError, match=r"allowed_hosts.*not a valid host name"):
         load_settings()
 
 

@@ -159,7 +159,7 @@ def test_written_poses_are_the_true_ones_without_the_error(city, plan):
 
 
 def test_a_street_that_is_not_there_is_refused_with_those_that_are(city, plan):
-    with pytest.raises(DatasetError, match=r"no street 'x' here; there are: 1, 2"):
+    with pytest.raises(DatasetError, match=r"unknown street 'x'; choose from: 1, 2"):
         driven(city, plan.model_copy(update={"streets": ("x",)}), 1.0)
 
 

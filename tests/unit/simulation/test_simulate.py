@@ -221,17 +221,26 @@ def test_more_queries_than_room_are_refused_with_both_counts(plan_of, tmp_path, 
     [
         ({"lidar": "hdl_65"}, "lidar: 'hdl_65'"),
         ({"survey_condition": "hail"}, "survey_condition: 'hail'"),
-        ({"streets": ("77",)}, "no street '77'"),
+        ({"streets": ("77",)}, "unknown street '77'"),
         ({"queries": (QueryPlan(name="a", traversal=1, depths=("laser",)),)}, "depth: 'laser'"),
         ({"queries": (QueryPlan(name="a", traversal=1, condition="hail"),)}, "condition: 'hail'"),
-        ({"queries": (QueryPlan(name="a", traversal=1), QueryPlan(name="a", traversal=2))}, "one name"),
+        ({"queries": (QueryPlan(name="a", traversal=1), QueryPlan(name="a", traversal=2))}, "have the same name"),
         ({"queries": (QueryPlan(name="a", traversal=1, per_class=True),)}, "--city paper"),
-        ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, aside_m=1.0),)}, "aside_m: 1 would do nothing"),
-        ({"queries": (QueryPlan(name="a", traversal=1, on_track=True, heading_deg=0),)}, "heading_deg: 0 would"),
-        ({"queries": (QueryPlan(name="a", traversal=0, parked_changed=1.0),)}, "parked_changed: 1 would do nothing"),
+        (
+            {"queries": (QueryPlan(name="a", traversal=1, on_track=True, aside_m=1.0),)},
+            "aside_m: 1 has no effect with 'a'",
+        ),
+        (
+            {"queries": (QueryPlan(name="a", traversal=1, on_track=True, heading_deg=0),)},
+            "heading_deg: 0 has no effect",
+        ),
+        (
+            {"queries": (QueryPlan(name="a", traversal=0, parked_changed=1.0),)},
+            "parked_changed: 1 has no effect with 'a'",
+        ),
         (
             {"queries": (QueryPlan(name="a", traversal=1, step_m=3.0),)},
-            "step_m: 3 would do nothing, since 'a' has no sequence",
+            "step_m: 3 has no effect with 'a', which has no sequence",
         ),
     ],
 )

@@ -79,7 +79,7 @@ def test_a_street_within_others_is_left_out_and_told():
     collection = collection_of(
         [street_of("a", 0, 0, 50, 50), street_of("b", 10, 10, 20, 20), street_of("c", 80, 80, 80.5, 80.5)]
     )
-    assert collection.dropped == ("b lies wholly within other streets", "c covers less than 1 m2")
+    assert collection.dropped == ("b is completely inside other streets", "c covers less than 1 m2")
 
 
 def test_a_straight_edge_keeps_only_its_corners():
@@ -105,14 +105,14 @@ def test_an_id_that_two_streets_bring_is_refused():
 
 
 def test_ground_of_less_than_a_metre_asks_whether_it_is_in_degrees():
-    with pytest.raises(DatasetError, match=r"no street covers any ground.*are the coordinates degrees"):
+    with pytest.raises(DatasetError, match=r"no street covers any area.*if the coordinates are degrees"):
         collection_of([street_of("a", 9.99, 48.4, 9.991, 48.401)])
 
 
 def test_a_file_that_is_there_stays_unless_it_may_go(tmp_path):
     path, document = tmp_path / "streets.geojson", collection_of([street_of("a", 0, 0, 9, 9)]).document
     path.write_text("mine")
-    with pytest.raises(DatasetError, match="is there; give --replace"):
+    with pytest.raises(DatasetError, match="exists; pass --replace"):
         write_streets(path, document)
     assert path.read_text() == "mine"
     assert len(write_streets(path, document, replace=True)) == 1

@@ -72,30 +72,30 @@ def test_what_is_left_out_is_counted_with_the_reason(geojson, ulm):
     read = read_geojson(path, frame=MapFrame(ulm))
     assert read.unnamed == 1
     assert [reason.split(",")[0] for reason in read.dropped] == [
-        "1 features have no name", "1 features are of the kind Point", "1 features lie more than 50 km from the map's origin",
+        "1 features have no name", "1 features have the type Point", "1 features are more than 50 km from the map's origin",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("features", "said"),
     [
-        ([("Point", [0, 0], NAMED)], "no feature is a named polygon or centre line .1 features are of the kind Point"),
+        ([("Point", [0, 0], NAMED)], "no feature is a named polygon or centre line .1 features have the type Point"),
         ([("Polygon", SQUARE, {})], "1 features have no name"),
-        ([], "no FeatureCollection with features"),
-        ([("LineString", LINE, NAMED | {"width": 0})], r"features\[0\].properties.width: '0' is no width"),
-        ([("LineString", LINE, NAMED | {"width": "wide"})], "'wide' is no width"),
+        ([], "not a FeatureCollection with features"),
+        ([("LineString", LINE, NAMED | {"width": 0})], r"features\[0\].properties.width: '0' is not a width"),
+        ([("LineString", LINE, NAMED | {"width": "wide"})], "'wide' is not a width"),
         (
             [("Polygon", SQUARE, NAMED | {"id": "a"})] * 2,
-            r"features\[1\].properties.id: 'a' is that of features\[0\] too",
+            r"features\[1\].properties.id: 'a' is also the id of features\[0\]",
         ),
-        ([("Polygon", SQUARE, NAMED | {"section": "middle"})], "'middle' is neither beginning, end nor null"),
-        ([("Polygon", SQUARE, {"name": 4})], "properties.name: '4' is no text"),
-        ([("Polygon", [[[0, 0], [1, 1]]], NAMED)], r"features\[0\].geometry: its coordinates make no Polygon"),
-        ([("LineString", [["a", 0], [1, 1]], NAMED)], "its coordinates make no LineString"),
-        ([("LineString", [[0, 0]], NAMED)], "its coordinates make no LineString"),
-        ([("LineString", None, NAMED)], "cover no ground"),
-        ([("LineString", [[5, 5], [5, 5]], NAMED)], "cover no ground"),
-        ([("Polygon", [[[0, 0], [9, 0], [9, 1e308], [0, 0]]], NAMED)], "lie more than"),
+        ([("Polygon", SQUARE, NAMED | {"section": "middle"})], "'middle' is not beginning, end or null"),
+        ([("Polygon", SQUARE, {"name": 4})], "properties.name: '4' is not a text"),
+        ([("Polygon", [[[0, 0], [1, 1]]], NAMED)], r"features\[0\].geometry: its coordinates are not a valid Polygon"),
+        ([("LineString", [["a", 0], [1, 1]], NAMED)], "its coordinates are not a valid LineString"),
+        ([("LineString", [[0, 0]], NAMED)], "its coordinates are not a valid LineString"),
+        ([("LineString", None, NAMED)], "cover no area"),
+        ([("LineString", [[5, 5], [5, 5]], NAMED)], "cover no area"),
+        ([("Polygon", [[[0, 0], [9, 0], [9, 1e308], [0, 0]]], NAMED)], "are more than"),
     ],
 )
 def test_a_defective_collection_is_refused_by_file_and_feature(geojson, features, said):

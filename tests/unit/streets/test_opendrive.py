@@ -167,7 +167,7 @@ def test_a_map_elsewhere_on_the_earth_is_refused(xodr, road, ulm):
 
 @pytest.mark.parametrize(
     ("header", "said"),
-    [("", "geoReference is missing"), ("<geoReference>here</geoReference>", "'here' is no projection")],
+    [("", "geoReference is missing"), ("<geoReference>here</geoReference>", "'here' is not a projection")],
 )
 def test_a_missing_or_unknown_projection_is_refused_with_the_remedy(xodr, road, ulm, header, said):
     with pytest.raises(DatasetError, match=f"{said}.*--frame map"):
@@ -175,14 +175,17 @@ def test_a_missing_or_unknown_projection_is_refused_with_the_remedy(xodr, road, 
 
 
 DEFECTS = [
-    (lambda _: "", "it has no <road>"),
-    (lambda road: road(1).replace("<line/>", ""), "road 1: a <geometry> holds nothing"),
-    (lambda road: road(1, "<bezier/>"), "road 1: a <geometry> holds bezier"),
+    (lambda _: "", "the file has no <road>"),
+    (lambda road: road(1).replace("<line/>", ""), "road 1: a <geometry> has nothing"),
+    (lambda road: road(1, "<bezier/>"), "road 1: a <geometry> has bezier"),
     (lambda road: road(1).replace("geometry", "other"), "road 1: planView has no <geometry>"),
-    (lambda road: road(1).replace('x="0.0"', ""), "road 1: <geometry> lacks the attribute 'x'"),
+    (lambda road: road(1).replace('x="0.0"', ""), "road 1: <geometry> has no attribute 'x'"),
     (lambda road: road(1, x=float("nan")), "road 1: <geometry>: x is 'nan', not a number"),
     (lambda road: road(1, y=1e300), "road 1: <geometry>: y is '1e\\+300'"),
-    (lambda road: road(1).replace('d="0"', 'd="9e7"'), "road 1: its planView or lanes make no surface: a coordinate"),
+    (
+        lambda road: road(1).replace('d="0"', 'd="9e7"'),
+        "road 1: its planView or lanes do not form a surface: a coordinate",
+    ),
     (lambda road: road(1, length=0), "road 1: its length of 0 m"),
     (lambda road: road(1, length=1e6), "road 1: its length of 1e\\+06 m"),
     (lambda road: road(1).replace('geometry s="0"', 'geometry s="-9e7"'), "<geometry>: s is -9e\\+07"),

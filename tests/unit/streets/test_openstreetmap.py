@@ -97,7 +97,7 @@ def test_what_is_no_openstreetmap_is_refused(tmp_path, read, text):
 
 
 def test_a_missing_file_is_named(tmp_path, read):
-    with pytest.raises(DatasetError, match=r"none\.osm: there is no such file"):
+    with pytest.raises(DatasetError, match=r"none\.osm: file not found"):
         read(tmp_path / "none.osm")
 
 

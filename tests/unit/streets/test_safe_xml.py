@@ -22,14 +22,14 @@ def test_elements_attributes_and_text_are_read(file):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("road network", "not whole XML"),
-        ("", "not whole XML"),
-        ("<a><b/>", "not whole XML"),
-        (b"\x00\xff\xfe", "not whole XML"),
-        ("<other/>", "its outermost element is <other>, not <a>"),
+        ("road network", "not valid XML"),
+        ("", "not valid XML"),
+        ("<a><b/>", "not valid XML"),
+        (b"\x00\xff\xfe", "not valid XML"),
+        ("<other/>", "its root element is <other>, not <a>"),
         (BOMB, "line 1: a document type"),
         ('<!DOCTYPE a SYSTEM "file:///etc/passwd"><a/>', "a document type"),
-        ("<a>&undefined;</a>", "not whole XML"),
+        ("<a>&undefined;</a>", "not valid XML"),
     ],
 )
 def test_what_is_not_plain_xml_is_refused_by_name(file, text, said):

@@ -32,7 +32,7 @@ def test_centre_lines_become_streets_of_the_dataset(run, geojson, dataset, stree
     out = run("geojson", geojson(LINE), "--dataset", folder, "--width", "10", "--section-length", "60")
     assert [street.name for street in streets_in(folder).features] == ["Beginning of High Street", "End of High Street"]
     assert "1 streets, 2 polygons, 2 of them sections" in out
-    assert "1 of 2 places of the survey lie in a street" in out
+    assert "1 of 2 places of the survey are in a street" in out
 
 
 def test_an_opendrive_map_without_names_says_how_many(run, xodr, road, dataset, streets_in):
@@ -67,7 +67,7 @@ def test_streets_that_miss_the_survey_are_told(run, geojson, dataset):
 def test_streets_that_are_there_stay_unless_they_may_go(run, geojson, dataset):
     folder = dataset((50, 0))
     run("geojson", geojson(LINE), "--dataset", folder)
-    with pytest.raises(DatasetError, match="give --replace"):
+    with pytest.raises(DatasetError, match="exists; pass --replace"):
         run("geojson", geojson(LINE), "--dataset", folder)
     run("geojson", geojson(LINE), "--dataset", folder, "--replace")
 
@@ -81,12 +81,12 @@ def test_degrees_in_a_georeferenced_dataset_are_metres_where_told_so(run, geojso
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("shapefile",), "kind: 'shapefile' is not known; there is: geojson, opendrive, osm"),
-        (("geojson", "--frame", "utm"), "frame: 'utm' is not known"),
-        (("geojson", "--lanes", "bus"), "lanes: 'bus' is not known"),
-        (("geojson", "--sections", "thirds"), "sections: 'thirds' is not known"),
-        (("geojson", "--width", "0"), "width: 0 is no length in metres"),
-        (("geojson", "--section-length", "nan"), "section_length: nan is no length"),
+        (("shapefile",), "kind: 'shapefile' is not valid; choose one of: geojson, opendrive, osm"),
+        (("geojson", "--frame", "utm"), "frame: 'utm' is not valid; choose one of"),
+        (("geojson", "--lanes", "bus"), "lanes: 'bus' is not valid; choose one of"),
+        (("geojson", "--sections", "thirds"), "sections: 'thirds' is not valid; choose one of"),
+        (("geojson", "--width", "0"), "width: 0 is not a length in metres"),
+        (("geojson", "--section-length", "nan"), "section_length: nan is not a length"),
         (("geojson", "--frame", "wgs84"), "georeference is null.*or give --frame map"),
         (("osm",), "georeference is null"),
     ],

@@ -58,10 +58,10 @@ def test_the_mean_is_a_run_like_any_other(runs, pack_folder, tmp_path):
 
 
 def test_what_has_no_mean_is_refused_and_nothing_written(runs, pack_folder, tmp_path):
-    with pytest.raises(DatasetError, match="different shapes"):
+    with pytest.raises(DatasetError, match="must have the same shape"):
         average(runs / "first", runs / "other", [pack_folder], tmp_path / "mean")
     with pytest.raises(DatasetError, match=r"checkpoint\.pt"):
         average(runs / "first", tmp_path, [pack_folder], tmp_path / "mean")
-    with pytest.raises(DatasetError, match="holds a run already"):
+    with pytest.raises(DatasetError, match="already contains a run"):
         average(runs / "first", runs / "second", [pack_folder], runs / "other")
     assert not (tmp_path / "mean").exists()

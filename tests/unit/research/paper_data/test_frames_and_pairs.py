@@ -52,12 +52,12 @@ def test_a_stopped_run_goes_on_and_ends_with_the_same_frames(folder: Path, tmp_p
 
 
 def test_a_folder_of_other_frames_is_refused(folder: Path) -> None:
-    with pytest.raises(DatasetError, match="is of other frames; remove"):
+    with pytest.raises(DatasetError, match="belongs to other frames; remove"):
         make_frames(folder, TOTAL + 1)
 
 
 def test_an_unfinished_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="holds no finished frames"):
+    with pytest.raises(DatasetError, match="has no complete frames"):
         Frames.open(tmp_path)
 
 

@@ -36,5 +36,5 @@ def test_any_total_is_kept_and_every_class_has_a_frame(total: int) -> None:
 
 
 def test_fewer_frames_than_classes_are_refused() -> None:
-    with pytest.raises(ValueError, match="15 frames cannot be shared out over 16 classes"):
+    with pytest.raises(ValueError, match="15 frames cannot be distributed over 16 classes"):
         in_proportion(15)

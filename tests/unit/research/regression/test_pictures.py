@@ -63,5 +63,5 @@ def test_a_square_is_kept_back_whole_or_not_at_all(pairs_in_hall):
 
 def test_pairs_of_one_square_cannot_be_kept_back(pairs_in_hall):
     pairs = pairs_in_hall(3)
-    with pytest.raises(DatasetError, match="too near"):
+    with pytest.raises(DatasetError, match="too close together"):
         watched_rows(replace(pairs, T_map_camera=np.tile(pairs.T_map_camera[:1], (3, 1, 1))))

@@ -153,5 +153,5 @@ def test_the_map_cloud_is_made_once(small_dataset, tmp_path):
 def test_without_small_gicp_the_extra_is_named(query, hall, monkeypatch):
     points, T_map_camera, _ = query
     monkeypatch.setitem(sys.modules, "small_gicp", None)
-    with pytest.raises(ExtraMissingError, match=r"\.\[odometry\]"):
+    with pytest.raises(ExtraMissingError, match=r"\.\[mapping\]"):
         by_icp(hall, points, T_map_camera)

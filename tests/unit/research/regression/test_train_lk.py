@@ -49,5 +49,5 @@ def test_wrong_poses_are_off_as_far_as_asked():
 
 def test_a_map_of_another_city_teaches_nothing(pairs_in_hall, hall, tmp_path):
     far = MapCloud(hall.points_map + 1e4)
-    with pytest.raises(DatasetError, match="meets the map"):
+    with pytest.raises(DatasetError, match="overlaps the map"):
         train_lk(pairs_in_hall(), far, tmp_path / "run", SMALL, budget_s=1.0)
