@@ -5,10 +5,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
-Drawn = UInt8[NDArray[np.uint8], "H W 3"]
+from service.imaging.view_grid import MAX_RANGE_M
 
-#: Larger depths get the colour of this one, so that differences of near depths stay visible.
-FARTHEST_M = 40.0
+Drawn = UInt8[NDArray[np.uint8], "H W 3"]
 
 
 def png_of(rgb: Drawn) -> bytes:
@@ -24,12 +23,13 @@ def png_of(rgb: Drawn) -> bytes:
 def depth_picture(depth_m: Float32[NDArray[np.float32], "H W"]) -> Drawn:
     """Return a depth image in the Turbo colour map on a square-root scale: near red, far blue, black without a measurement.
 
-    All images have the same scale, so that two can be compared.
+    All images have the same scale, so that two can be compared. Depths beyond ``MAX_RANGE_M`` get its colour, so that
+    differences of near depths stay visible.
 
     Args:
         depth_m: depth, m; 0 without a measurement.
     """
-    nearness = 1.0 - np.sqrt(np.clip(depth_m / FARTHEST_M, 0, 1))
+    nearness = 1.0 - np.sqrt(np.clip(depth_m / MAX_RANGE_M, 0, 1))
     coloured = cv2.applyColorMap(np.rint(255 * nearness).astype(np.uint8), cv2.COLORMAP_TURBO)
     coloured[depth_m <= 0] = 0
     return np.ascontiguousarray(coloured[..., ::-1])

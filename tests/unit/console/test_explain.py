@@ -1,4 +1,4 @@
-"""What the machine saw, of an answer that is known."""
+"""Intermediate images of an answer that is known."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -12,10 +12,10 @@ import pytest
 
 from service.console.explain import POINT_BYTES, Explanation, camera_over, explain, mapped_depth
 from service.console.message import explanation_message
-from service.console.pictures import FARTHEST_M, depth_picture
+from service.console.pictures import depth_picture
 from service.contract import schema
 from service.contract.convert import parsed, query_from
-from service.imaging.view_grid import ViewGrid
+from service.imaging.view_grid import MAX_RANGE_M, ViewGrid
 from service.localization.refine import RefineSettings
 from service.runtime.engine import Engine
 from service.runtime.settings import Settings
@@ -102,7 +102,7 @@ def test_scale_and_disparity_offset_are_taken_out(
 
 
 def test_depth_is_red_near_blue_far_and_black_where_unknown() -> None:
-    ((near, far, further, unknown),) = depth_picture(np.array([[1.0, FARTHEST_M, 99.0, 0.0]], np.float32)).astype(int)
+    ((near, far, further, unknown),) = depth_picture(np.array([[1.0, MAX_RANGE_M, 99.0, 0.0]], np.float32)).astype(int)
     assert near[0] > near[2]
     assert far[2] > far[0]
     assert np.array_equal(far, further)

@@ -44,7 +44,7 @@ def test_the_truth_is_told(folder: Path) -> None:
 
 @pytest.mark.parametrize("name", ["two", "../one", "", "one/rgb"])
 def test_a_name_that_is_not_in_the_list_is_unknown(folder: Path, name: str) -> None:
-    with pytest.raises(UnknownSampleError, match="there are: one"):
+    with pytest.raises(UnknownSampleError, match="known samples: one"):
         Samples.open(folder).picture(name, "rgb")
 
 
@@ -59,11 +59,11 @@ def test_a_link_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("files", "told"),
     [
-        ({"rgb.jpg": None}, "no rgb picture"),
-        ({"request.json": b"{"}, "cannot be read as JSON"),
-        ({"request.json": None}, "cannot be read as JSON"),
+        ({"rgb.jpg": None}, "no rgb image"),
+        ({"request.json": b"{"}, "not readable JSON"),
+        ({"request.json": None}, "not readable JSON"),
         ({"request.json": b'{"camera": {}}'}, "Field required"),
-        ({"truth.json": b"[]"}, "mend the file"),
+        ({"truth.json": b"[]"}, "correct the file"),
     ],
 )
 def test_an_incomplete_pair_is_refused_by_name(folder: Path, files: dict[str, Any], told: str) -> None:
