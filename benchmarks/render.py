@@ -9,6 +9,8 @@ import matplotlib
 
 from benchmarks import decisions
 from benchmarks.figures import write_figures
+from benchmarks.kitti.published import NOTE as PUBLISHED_NOTE
+from benchmarks.kitti.published import published_lines
 from benchmarks.report import REPORTS, ROOT, write_report
 
 matplotlib.use("Agg")
@@ -59,6 +61,15 @@ def _section(name: str, report: dict[str, Any]) -> list[str]:
     lines += ["| row | value | 95 % interval | n | bar | | run | |", "|---|---|---|---|---|---|---|---|"]
     lines += [_line(row, numbers[row["run"]]) for row in rows]
     lines += _conditions({row["id"]: row["value"] for row in rows})
+    if PUBLISHED_NOTE in notes:
+        lines += ["", *published_lines({row["id"]: row["value"] for row in rows}, notes[PUBLISHED_NOTE])]
+    if notes.get("missing"):
+        lines += [
+            "",
+            "The machine of the last run lacks these recordings:",
+            "",
+            *(f"- {each}" for each in notes["missing"]),
+        ]
     remarks = [f"- `{row['id']}`: {text}" for row in rows for text in _remarks(row)]
     lines += ["", *remarks, ""] if remarks else [""]
     picture = _plot(name, rows)

@@ -224,10 +224,10 @@ WHY_MISSED: dict[str, Reason] = {
         "the median of three rounds is less than 1 % above the best peer's; latencies of single rounds differ by more",
     ),
     "request.files_before_engine": Reason(
-        7.0,
+        8.0,
         "the request now comes over a socket, so the HTTP protocol's file counts too. It limits what httptools does not: heads, chunk "
-        "sizes, pipelined requests and slow heads. Without a socket the six others were counted. Each of them has one task: host and "
-        "key, route, body, memory and queue, fields, conversion",
+        "sizes, pipelined requests and slow heads. The request id has a file that REST and gRPC share. The six others have one task each: "
+        "host and key, route, body, memory and queue, fields, conversion",
     ),
     "request.files_in_core": Reason(
         52,

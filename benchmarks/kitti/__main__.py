@@ -21,6 +21,7 @@ from benchmarks.kitti.protocol import (
     in_the_frame_of,
     place_similarities,
 )
+from benchmarks.kitti.published import NOTE, PUBLISHED_R1
 from benchmarks.kitti.sources import LOOPS, OTHER_DAY, Drive, drives_below, missing
 from benchmarks.report import ROOT, Report
 from model_training.datasets.dataset import Dataset
@@ -35,12 +36,6 @@ from service.maps.reader import MapBundle
 
 QUERIES = "recorded"
 EVERY_SCAN_M = 0.05  # small, so that every scan is a place unless the vehicle stands still
-#: Table of RangeBEV (arXiv 2502.11742): R@1 within 10 m in percent, trained on KITTI's other sequences. The report
-#: keeps it as a note.
-PUBLISHED_R1 = {
-    "(LC)2": (31, 23, 40, 40, 53, 38), "VXP": (24, 18, 33, 30, 44, 24), "I2P-Rec": (45, 28, 48, 44, 63, 46),
-    "ModaLink": (90, 70, 90, 86, 97, 87), "CMVM": (93, 77, 91, 89, 98, 91), "RangeBEV": (99, 95, 99, 97, 100, 98),
-}  # fmt: skip
 
 
 def main() -> None:
@@ -79,7 +74,7 @@ def main() -> None:
         if mapped in maps and asked in maps:
             _other_day(report, mapped, asked, shared, maps)
     report.notes["missing"] = missing(drives)
-    report.notes["published_r1_10m_percent_00_02_05_06_07_08"] = {name: list(row) for name, row in PUBLISHED_R1.items()}
+    report.notes[NOTE] = {name: list(row) for name, row in PUBLISHED_R1.items()}
     print(report.write())
 
 

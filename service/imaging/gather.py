@@ -1,6 +1,7 @@
 """Resample a colour and a depth image to the cells of a view grid, in compiled code.
 
-Without compiled code, this step of a query would cost the most after decoding.
+Speed: a view takes a sixth of the time of NumPy (26 November 2026, decision 0148). In NumPy this step would cost the most of a
+retrieval after decoding (decision 0046).
 """
 
 import ctypes

@@ -4,6 +4,8 @@ Map views are level with the ground under the vehicle, so query views must be le
 stereo depth image shows it with much noise. So the ground plane is fitted under a prior: the direction of gravity or of the
 mounting, and the height of the camera (decisions 0005 and 0009). The height is given, or the usual one. If the plane of the
 usual height does not fit the image, other heights are tried (decision 0145).
+
+Speed: a fit in ``level.c`` takes a twelfth of the time of NumPy (26 November 2026, decision 0148).
 """
 
 import ctypes

@@ -1,4 +1,4 @@
-"""Decode 16-bit grey PNG, the native format of depth cameras, in less than half of the time of a general decoder.
+"""Decode 16-bit grey PNG, the native format of depth cameras, in two fifths of the time of OpenCV (decision 0148).
 
 libdeflate inflates all data at once, into a buffer of the size that the header allows. Compiled code reverses the row filters.
 OpenCV decodes every other kind of PNG (interlaced, other samples). Both give the same pixels (a test compares them).

@@ -1,0 +1,4 @@
+"""Answer a query: retrieval, registration, confidence, decision, answer.
+
+Entry: ``localizer.Localizer.localize``.
+"""

@@ -1,6 +1,8 @@
 """Call the compiled registration kernel (``kernel.c``) through ctypes.
 
 The library uses no Python API, so one build serves every Python version. The global interpreter lock is released while it runs.
+
+Speed: a solver step takes a sixth of the time of NumPy over all starts at once (26 November 2026, decision 0148).
 """
 
 import ctypes

@@ -2,6 +2,8 @@
 
 The disparity error of a triangulating camera does not depend on range. So its range error grows with the square of the range.
 The image itself shows how large the error is. On a plane the inverse depth is linear in the pixel, so its second difference is noise.
+
+Speed: ``points.c`` takes a third of the time of NumPy for the blocks, and half for the noise (26 November 2026, decision 0148).
 """
 
 import ctypes

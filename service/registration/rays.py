@@ -5,6 +5,9 @@ its ray with the map does not depend on its noise. The error of a triangulating 
 share errors, because of block matching or a car that has moved. Each patch of the image has one unknown for this correlated error.
 
 Decision 0098 measures the method. docs/how_it_works.md gives the equation ("rays").
+
+Speed: ``rays.c`` takes a twenty-fifth of the time of NumPy to cast the rays, and a sixth for a step of the adjustment (26 November
+2026, decision 0148).
 """
 
 import ctypes

@@ -119,7 +119,7 @@ def test_what_was_made_is_used_again_and_the_command_it_names_works(
 def test_another_plan_in_the_same_folder_is_refused(arguments: list[str], once: str) -> None:
     done = run([*arguments, "--seed", "5", "--once"])
     assert done.returncode == 1
-    assert "holds the simulation of another plan" in done.stderr
+    assert "contains the simulation of another plan" in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -153,4 +153,4 @@ def test_real_frames_are_asked_each_with_its_own_camera(encoder_of: Callable[...
     assert re.search(r"^│ 000001 │ (000001|000107) ", done.stdout, re.MULTILINE)
     assert re.search(r"^[01] of 1 first places right$", done.stdout, re.MULTILINE)
     elsewhere = run([*arguments, "--real", str(tmp_path)])
-    assert (elsewhere.returncode, "was imported from elsewhere" in elsewhere.stderr) == (1, True)
+    assert (elsewhere.returncode, "was imported from another source" in elsewhere.stderr) == (1, True)

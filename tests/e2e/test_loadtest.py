@@ -120,7 +120,7 @@ def test_what_cannot_be_done_is_said(service: dict[str, Any], dataset: Path, tmp
     url = ("--url", service["url"])
     for arguments, told in (
         ((*url, "--dataset", str(tmp_path)), "dataset.json"),
-        ((*url, "--dataset", str(dataset), "--queries", "north"), "it has drive"),
+        ((*url, "--dataset", str(dataset), "--queries", "north"), "the dataset has: drive"),
         ((*url, "--dataset", str(dataset), "--rate", "1", "--concurrency", "1"), "give one of them"),
         ((*url, "--dataset", str(dataset), "--rate", "0"), "must be positive"),
         ((*url, "--dataset", str(dataset), "--pid", "4194303"), "no such process"),

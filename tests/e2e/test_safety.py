@@ -179,7 +179,7 @@ def test_check_says_what_would_be_served_and_leaves(bundle_path: Path, tmp_path:
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
     assert '"threads": 3' in done.stdout
-    assert re.search(r"map tiny \w+: opens and answers\nkeys of 1 callers\n$", done.stdout)
+    assert re.search(r"map tiny \w+: opens and answers\nkeys: 1\n$", done.stdout)
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "manifest.json").write_text("{")
     refused_ = subprocess.run(

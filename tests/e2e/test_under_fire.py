@@ -132,7 +132,7 @@ def test_a_service_that_leaves_says_so_first_and_still_answers(start: Any, parts
         while (ready := client.get("/readyz")).status_code == 200:
             assert time.monotonic() < until
         assert (ready.status_code, ready.json()["code"]) == (503, "not-ready")
-        assert "leaving" in ready.json()["detail"]
+        assert "stopping" in ready.json()["detail"]
         assert client.get("/livez").status_code == 200
         assert post(client, parts_of()).status_code == 200
     assert service.process.wait(30) == 0

@@ -67,7 +67,7 @@ def test_diagnoses_carry_what_an_operator_looks_for(robot: Robot) -> None:
     assert published is not None
     assert dict(published.diagnosis.values) == {
         "status": "LOCALIZED", "confidence": "0.950", "street": "End", "map": "tiny@abc",
-        "camera_height": "0.31 m, given", "latency_ms": "500", "asked": "1", "answered": "1",
+        "camera_height": "0.31 m, given", "calibration": "unknown", "latency_ms": "500", "asked": "1", "answered": "1",
         "published": "1", "failed": "0", "dropped": "0", "rate_hz": "0.00",
     }  # fmt: skip
 

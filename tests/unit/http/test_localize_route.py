@@ -41,7 +41,7 @@ def test_the_answer_has_the_contracts_form(client: httpx.Client, parts_of: Parts
     assert response.status_code == 200
     assert list(answer) == [
         "status", "confidence", "street", "pose", "vehicle_pose", "geopose", "hypotheses", "spread", "reasons", "neighbours",
-        "camera_height", "map", "timings_ms",
+        "camera_height", "calibration", "extrapolated", "map", "timings_ms",
     ]  # fmt: skip
     assert (answer["status"], answer["confidence"], answer["geopose"]) == ("LOCALIZED", None, None)
     assert answer["street"] | {"vote": 1} == {

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.native import plain
 from service.geometry.camera import PinholeCamera
 from service.geometry.rigid import R_BODY_OPTICAL, rotation_x, rotation_y, rotation_z
 from service.imaging import level as module
@@ -117,34 +118,6 @@ def test_the_nominal_level_is_a_rotation_whose_third_row_is_up():
     np.testing.assert_allclose(R[2], -down, atol=1e-12)
 
 
-def plain_fit(depth_m, camera, R, height_m, height_std_m):
-    """The fit as NumPy says it."""
-    own = camera.scaled_to(depth_m.shape[1], depth_m.shape[0])
-    step = max(1, depth_m.shape[1] // module.STEP_PIXELS)
-    v, u = (
-        each.reshape(-1) for each in np.mgrid[step // 2 : depth_m.shape[0] : step, step // 2 : depth_m.shape[1] : step]
-    )
-    z = depth_m[v, u].astype(np.float64)
-    measured = (z > module.NEAR_M) & (z < module.REACH_M)
-    rays = np.stack([(u - own.cx) / own.fx, (v - own.cy) / own.fy, np.ones(len(u))], axis=1)
-    points = (z[measured, None] * rays[measured]) @ R.T
-    prior = np.diag([1 / module.TILT_PRIOR_RAD**2, 1 / module.TILT_PRIOR_RAD**2, 1 / height_std_m**2])
-    mean = solution = np.array([0.0, 0.0, -height_m])
-    near = points[points[:, 2] < -0.3 * height_m]
-    design, z = np.column_stack([near[:, :2], np.ones(len(near))]), near[:, 2]
-    reach = np.hypot(near[:, 0], near[:, 1])
-    certainty = 1.0 / ((module.NOISE_M + module.NOISE_PER_M * reach) ** 2 * module.CORRELATED)
-    for band_m, band_slope, above in module.BANDS:
-        off, band = z - design @ solution, band_m + band_slope * reach
-        keep = (off > -band) & (off < above * band)
-        if not keep.any():
-            break
-        weighted = design * np.where(keep, certainty, 0.0)[:, None]
-        solution = np.linalg.solve(weighted.T @ design + prior, weighted.T @ z + prior @ mean)
-    off, band = z - design @ solution, module.BANDS[-1, 0] + module.BANDS[-1, 1] * reach
-    return [*solution, measured.sum(), (np.abs(off) <= band).sum(), (off < -3 * band).sum()]
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1), pitch_deg=st.floats(-8, 8), roll_deg=st.floats(-8, 8), noise=st.floats(0, 0.3),
@@ -157,7 +130,8 @@ def test_the_compiled_fit_says_what_plain_numpy_says(seed, pitch_deg, roll_deg, 
     depth_m *= rng.normal(1, noise, depth_m.shape).astype(np.float32)
     depth_m[rng.random(depth_m.shape) < holes] = rng.choice([0.0, np.nan, np.inf, -5.0, 1e30])
     found = module._fit_ground(depth_m, camera, R_BODY_OPTICAL, 1.5, std_m)
-    np.testing.assert_allclose(found, plain_fit(depth_m, camera, R_BODY_OPTICAL, 1.5, std_m), rtol=1e-7, atol=1e-9)
+    expected = plain.fit_ground(depth_m, camera, R_BODY_OPTICAL, 1.5, std_m)
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("height_m", [0.2, 0.3, 0.45, 0.8, 1.2, 1.5, 1.7, 2.0, 2.5, 3.0, 3.6])

@@ -1,10 +1,11 @@
 // The whole page: its layout, and the messages between its parts.
 import { AnswerPanel } from './answer/answer_panel';
+import { CHECKING, checkFocalLength, needsCheck, textOf, withFocalFactor } from './query/focal_length';
 import { QueryPanel } from './query/query_panel';
 import { bodyFrom, requestFrom, type Query } from './query/query';
 import { samplesOfMap } from './query/samples_of_map';
 import { cloudFrom, placesFrom, queryPointsFrom } from './binary';
-import type { MapEntry, SamplePair } from './contract';
+import type { Answer, LocalizeRequest, MapEntry, SamplePair } from './contract';
 import { button, element } from './element';
 import iconAddress from './icon.svg';
 import { Legend } from './map/legend';
@@ -223,6 +224,7 @@ export class ConsolePage {
       this.#answer.show(explanation, query.rgb.blob, query.truth, performance.now() - began);
       this.#map.showAnswer({ answer: explanation.answer, camera: request.camera, truth: query.truth }, queryPointsFrom(explanation.points));
       this.#showState('good', 'serving');
+      if (needsCheck(explanation.answer)) void this.#checkFocalLength(query, request, explanation.answer, turn);
     } catch (error) {
       if (turn !== this.#queries) return;
       this.#map.clearAnswer();
@@ -231,6 +233,18 @@ export class ConsolePage {
     } finally {
       if (turn === this.#queries) this.#query.busy = false;
     }
+  }
+
+  /** Send the query twice more, with fx and fy halved and doubled, and show the result below the answer. A later query ends it. */
+  async #checkFocalLength(query: Query, request: LocalizeRequest, answer: Answer, turn: number): Promise<void> {
+    this.#answer.showCheck(CHECKING);
+    const check = await checkFocalLength(
+      (factor) => this.#service.localize(bodyFrom(query, withFocalFactor(request, factor))),
+      () => turn === this.#queries,
+    );
+    if (check === null) return;
+    const { text, found } = textOf(answer, check);
+    this.#answer.showCheck(text, found);
   }
 
   #mapName(): string | null {

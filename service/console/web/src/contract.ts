@@ -75,6 +75,9 @@ export interface Answer {
   reasons: Reason[];
   neighbours: Neighbour[];
   camera_height: CameraHeight | null;
+  /** extrapolated: a confidence feature lies outside the range of the calibration data, so the confidence may be wrong. */
+  calibration: 'in_range' | 'extrapolated' | null;
+  extrapolated: Record<string, number>;
   map: MapVersion;
   timings_ms: { decode: number; fuse: number; encode: number; search: number; register: number; total: number };
 }

@@ -1,5 +1,5 @@
 // The service's REST interface. The key stays in this tab: in memory and in `sessionStorage`, so that a reload keeps it.
-import type { Explanation, LastAnswer, MapEntry, SamplePair, StreetFeature } from './contract';
+import type { Answer, Explanation, LastAnswer, MapEntry, SamplePair, StreetFeature } from './contract';
 
 const KEY = 'streetfix-key';
 
@@ -71,6 +71,10 @@ export class Service {
 
   explain(body: FormData): Promise<Explanation> {
     return this.#json<Explanation>('v1/explain', { method: 'POST', body });
+  }
+
+  localize(body: FormData): Promise<Answer> {
+    return this.#json<Answer>('v1/localize', { method: 'POST', body });
   }
 
   serve(map: string, version: string): Promise<MapEntry> {

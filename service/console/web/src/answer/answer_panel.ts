@@ -24,6 +24,7 @@ const STAGES = ['decode', 'fuse', 'encode', 'search', 'register'] as const;
 export class AnswerPanel {
   readonly element = element('div', { class: 'panel', 'aria-live': 'polite' });
   readonly #images = new IntermediateImages();
+  readonly #check = element('p', { class: 'check' });
 
   constructor() {
     this.element.append(
@@ -39,8 +40,10 @@ export class AnswerPanel {
   show(explanation: Explanation, rgb: Blob, truth: Truth | null, elapsedMs: number): void {
     const { answer } = explanation;
     this.#images.show(rgb, explanation);
+    this.showCheck('');
     this.element.replaceChildren(
       this.#head(answer, truth),
+      this.#check,
       answer.pose === null ? this.#why(answer) : '',
       answer.pose === null ? this.#spread(answer) : this.#pose(answer, answer.pose),
       answer.hypotheses.length > (answer.pose === null ? 0 : 1) ? this.#hypotheses(answer) : '',
@@ -48,6 +51,12 @@ export class AnswerPanel {
       this.#neighbours(answer),
       this.#times(answer, elapsedMs),
     );
+  }
+
+  /** Show the state or the result of the check of the focal length; `found`: it found an error. */
+  showCheck(text: string, found = false): void {
+    this.#check.textContent = text;
+    this.#check.classList.toggle('found', found);
   }
 
   fail(error: unknown): void {
@@ -108,7 +117,7 @@ export class AnswerPanel {
       rows.push(['σ heading', degrees(answer.spread.heading_std_deg)]);
       rows.push(['weight of hypotheses', percent(answer.spread.hypotheses_weight)]);
     }
-    rows.push(...heightRow(answer));
+    rows.push(...extrapolatedRow(answer), ...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Possible positions'), facts(rows));
   }
@@ -124,7 +133,7 @@ export class AnswerPanel {
       rows.push(['σ on the ground', `${metres(ellipse.major)} × ${metres(ellipse.minor)}`]);
       rows.push(['σ heading', degrees((180 / Math.PI) * Math.sqrt(covariance[35] ?? 0))]);
     }
-    rows.push(...heightRow(answer));
+    rows.push(...extrapolatedRow(answer), ...heightRow(answer));
     rows.push(['map', `${answer.map.name} ${answer.map.version.slice(0, 8)}`]);
     return element('section', {}, element('h2', {}, 'Pose'), facts(rows));
   }
@@ -183,6 +192,12 @@ export class AnswerPanel {
       element('p', { class: 'hint' }, `${milliseconds(times.total)} in the service, ${milliseconds(elapsedMs)} from sending to the answer`),
     );
   }
+}
+
+/** Features outside the range of the calibration data: there the confidence may be wrong. */
+function extrapolatedRow({ extrapolated }: Answer): [string, string][] {
+  const features = Object.entries(extrapolated).map(([name, size]) => `${name} ${size > 0 ? '+' : '−'}${Math.abs(size).toFixed(1)} σ`);
+  return features.length === 0 ? [] : [['confidence is extrapolated', features.join(', ')]];
 }
 
 function heightRow({ camera_height }: Answer): [string, string][] {
