@@ -123,7 +123,7 @@ def test_what_cannot_be_done_is_said(service: dict[str, Any], dataset: Path, tmp
         ((*url, "--dataset", str(dataset), "--queries", "north"), "the dataset has: drive"),
         ((*url, "--dataset", str(dataset), "--rate", "1", "--concurrency", "1"), "give one of them"),
         ((*url, "--dataset", str(dataset), "--rate", "0"), "must be positive"),
-        ((*url, "--dataset", str(dataset), "--pid", "4194303"), "no such process"),
+        ((*url, "--dataset", str(dataset), "--pid", "4194303"), "process not found"),
         (("--url", "http://127.0.0.1:9", "--dataset", str(dataset)), "no request was answered"),
     ):
         done = load(*arguments)
