@@ -33,6 +33,11 @@ class Size:
     pairs: int = PAPER_PAIRS
     test_images: int | None = None
 
+    @property
+    def spacing_m(self) -> float:
+        """Distance between the places of the map, metres. With fewer test images than the paper's, the map is sparse too."""
+        return 1.0 if self.test_images is None else 10.0
+
 
 def made_minutes(folder: Path) -> float:
     """Return the wall time between a folder's first and last file in minutes, pauses included.

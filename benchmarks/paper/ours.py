@@ -188,16 +188,23 @@ def _answers(data: PaperData, encoder: Path) -> dict[str, PlaceAnswers]:
 
 
 def bundle_of(data: PaperData, encoder: Path) -> MapBundle:
-    """Build the map of the comparison's survey at 1 m, once for each encoder and version of the code.
+    """Build the map of the comparison's survey, once for each encoder, spacing and version of the code.
 
     Args:
         data: shared data.
         encoder: ONNX file of the encoder.
     """
-    name = f"{data.dataset.folder.name}-{Encoder.open(encoder).sha256[:12]}-{code_hash(*MAPPING)}"
+    spacing_m = data.size.spacing_m
+    name = f"{data.dataset.folder.name}-{spacing_m:g}-{Encoder.open(encoder).sha256[:12]}-{code_hash(*MAPPING)}"
     folder = data.work / "maps" / name
     if not folder.exists():
         folder.parent.mkdir(parents=True, exist_ok=True)
         with bars() as report:
-            build_map(data.dataset, encoder, folder, BuildSettings(name="paper-city"), report=report)
+            build_map(
+                data.dataset,
+                encoder,
+                folder,
+                BuildSettings(name="paper-city", spacing_m=spacing_m, between_m=3 * spacing_m),
+                report=report,
+            )
     return MapBundle.open(folder)

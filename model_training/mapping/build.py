@@ -63,9 +63,7 @@ def build_map(
         BundleError: ``out`` exists and ``overwrite`` is False, or another process is building it.
     """
     if out.exists() and not overwrite:  # refuse before the work, not after it
-        raise BundleError(
-            f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
-        )
+        raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
     if not re.fullmatch(NAME, settings.name):
         raise DatasetError(
             f"name: {settings.name!r} cannot name a map; give --name of letters, digits, '.', '_' and '-'", field="name"

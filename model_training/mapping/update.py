@@ -66,9 +66,7 @@ def update_map(
             LiDAR sees. The polygon file is not valid. None of the new places lies in the area to replace.
     """
     if out.exists() and not overwrite:
-        raise BundleError(
-            f"{out}: there is something of that name already; choose another, or overwrite it", field="out"
-        )
+        raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
     bundle = MapBundle.open(old)
     _require_frame(dataset, bundle)
     area = None if replace_area is None else polygon_of(replace_area)
