@@ -11,16 +11,16 @@
 #define UNKNOWNS 8 /* translation, rotation (left increment about the reference), log scale, disparity offset */
 
 typedef struct {
-    double R[9], t[3];     /* T_map_camera */
+    double R[9], t[3]; /* T_map_camera */
     double fx, fy, cx, cy; /* of the small image, px */
     int64_t width, height;
 } View;
 
 typedef struct {
-    double radius;       /* radius of a surfel's disc, m */
+    double radius; /* radius of a surfel's disc, m */
     double nearest, reach; /* least and largest depth that counts, m */
-    double behind;       /* discs up to this depth behind the first one may be the same surface, m */
-    double grazing;      /* least cosine between normal and line of sight; discs seen flatter are ignored */
+    double behind; /* discs up to this depth behind the first one may be the same surface, m */
+    double grazing; /* least cosine between normal and line of sight; discs seen flatter are ignored */
 } Discs;
 
 /* A surfel in the camera's axes, and the range of pixels that it may cover. The caller provides the memory. */
@@ -223,17 +223,17 @@ WIDE void streetfix_meet(const Surfel *surfels, const int32_t *numbers, int64_t 
 }
 
 typedef struct {
-    double about[3];        /* centre of rotation, surfels' frame, m */
-    double scale, offset;   /* of the measured depth: 1 / z = scale / true z - offset x unit */
-    double unit;            /* inverse depth per unit of the offset, 1/(px m): 1 / (focal length x baseline) */
-    double noise;           /* standard deviation of an inverse depth, 1/m */
-    double surface;         /* standard deviation of the map's surfaces along a ray, m */
-    double robust;          /* width of the robust kernel, in standard deviations: there a pixel keeps a quarter of its weight */
-    double shared;          /* standard deviation of the error that the pixels of a patch share, 1/m */
-    double moved;           /* standard deviation of the distance that a dynamic object may have moved, m */
-    double nearest, reach;  /* least and largest depth that counts, m */
-    double grazing;         /* least |normal . ray| of a ray with z = 1 */
-    int64_t patch;          /* edge of a patch, px */
+    double about[3]; /* centre of rotation, surfels' frame, m */
+    double scale, offset; /* of the measured depth: 1 / z = scale / true z - offset x unit */
+    double unit; /* inverse depth per unit of the offset, 1/(px m): 1 / (focal length x baseline) */
+    double noise; /* standard deviation of an inverse depth, 1/m */
+    double surface; /* standard deviation of the map's surfaces along a ray, m */
+    double robust; /* width of the robust kernel, in standard deviations: there a pixel keeps a quarter of its weight */
+    double shared; /* standard deviation of the error that the pixels of a patch share, 1/m */
+    double moved; /* standard deviation of the distance that a dynamic object may have moved, m */
+    double nearest, reach; /* least and largest depth that counts, m */
+    double grazing; /* least |normal . ray| of a ray with z = 1 */
+    int64_t patch; /* edge of a patch, px */
 } Asked;
 
 /* Rows of a pixel: derivatives of the model by the unknowns (0 .. 7), residual (8), derivative by the patch's shared error (9). */
