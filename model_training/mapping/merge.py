@@ -46,7 +46,7 @@ def merge_maps(
             ``overwrite`` is False.
     """
     if out.exists() and not overwrite:
-        raise BundleError(f"{out} already exists; choose another --out or pass --overwrite", field="out")
+        raise BundleError(f"{out}: already exists; choose another --out, or pass --overwrite", field="out")
     a, b = MapBundle.open(first), MapBundle.open(second)
     report("merge", 1, 4)
     one, other = content_of(a), content_of(b)
